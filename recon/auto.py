@@ -52,14 +52,14 @@ class Score:
         at: number of its method.
         method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
-        own: the same of views that it was made from, their mean.
+        residual_seen: the same of views that it was made from, their mean.
         hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
     """
 
     at: int
     method: Method
     residuals: F64
-    own: float = math.inf
+    residual_seen: float = math.inf
     hides: Callable[[], bool] = lambda: False
 
     @property
@@ -68,15 +68,15 @@ class Score:
         return float(self.residuals.mean())
 
     @property
-    def follows(self) -> float:
+    def overfit(self) -> float:
         """By what factor it misses views held out by more than its own: above 1 it follows the noise of its own."""
-        return max(1.0, self.residual / self.own) if self.own > 0 else 1.0
+        return max(1.0, self.residual / self.residual_seen) if self.residual_seen > 0 else 1.0
 
     @property
-    def error(self) -> float:
-        """The residual times `follows`: line integrals average over the noise that a volume follows, so that views
+    def penalised(self) -> float:
+        """The residual times `overfit`: line integrals average over the noise that a volume follows, so that views
         held out say too little of it (docs/exploration.md)."""
-        return self.residual * self.follows
+        return self.residual * self.overfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class Auto:
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
     @property
-    def spare(self) -> Method | None:
+    def longer_fit(self) -> Method | None:
         """A fit with more sweeps, tried where the fit is not taken, and preferred to all others.
 
         A fit chooses its sweeps by views that it knows already, which asks for too few where it is far off.
@@ -114,7 +114,7 @@ class Auto:
     def methods(self) -> tuple[Method, ...]:
         """All, by preference."""
         first, *others = self.candidates
-        return self.candidates if self.spare is None else (first, self.spare, *others)
+        return self.candidates if self.longer_fit is None else (first, self.longer_fit, *others)
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         """The result of the chosen method; its settings say `chosen_method` and `chosen_because`.
@@ -140,7 +140,7 @@ class Auto:
         part, where = part_of(problem)
         if part is None:
             return 0, where
-        at, residuals = predicts_best(part, self.methods, control, None if self.spare is None else 1)
+        at, residuals = predicts_best(part, self.methods, control, None if self.longer_fit is None else 1)
         if at is None:
             return 0, residuals
         return at, f"residual of views held out, {where}: {residuals}"
@@ -213,7 +213,7 @@ def predicts_best(
     best, hiding = best_of(scores)
     told = {s.at: " (hides structure)" if s.at in hiding else "" for s in scores}
     listed = [
-        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g}, {s.follows:.2f} of own views"
+        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views)"
         f"{told[s.at]}"
         for s in sorted(scores, key=lambda s: s.residual)
     ]
@@ -225,15 +225,15 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, list[int]]:
     """The score to prefer: of those that are level the first that hides nothing; and those that hide.
 
     Level with the smallest residual are those within two of its standard errors (by its scatter over the views) and
-    4 %, and likewise with the smallest error. The residual alone prefers a volume that lost some noise, and with it a
+    4 %, and likewise by the penalised residual. The residual alone prefers a volume that lost some noise, and with it a
     thin crack, which few rays see; and FISTA-TV to a fit that it finished, though from the fit it comes nearer to the
-    sample (0.1 to 2.6 dB). The error alone prefers what is smooth.
+    sample (0.1 to 2.6 dB). The penalised one alone prefers what is smooth.
     """
     least = min(scores, key=lambda s: s.residual)
     level = [
         score
         for score in sorted(scores, key=lambda s: s.at)
-        if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_error), _error)
+        if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
     ]
     hiding: list[int] = []
     for score in level if len(level) > 1 else ():
@@ -243,8 +243,8 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, list[int]]:
     return least, hiding
 
 
-def _error(score: Score) -> float:
-    return score.error
+def _penalised(score: Score) -> float:
+    return score.penalised
 
 
 def _is_level(score: Score, least: Score, value: Callable[[Score], float]) -> bool:

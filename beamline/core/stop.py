@@ -77,7 +77,7 @@ class PauseRequest:
     def beam_back(self) -> None:
         self._beam = ""
 
-    def take_doubt(self) -> float:
+    def take_unlit_since(self) -> float:
         """The time since which frames may have had no beam, asked once; inf where all had."""
         with self._lock:
             doubt, self._doubt = self._doubt, math.inf

@@ -157,7 +157,7 @@ def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
         with named_on_failure(work):
             work.mkdir()
         code, stderr = _run(_command(options, row.scan, work), work / "stderr.txt", pass_on)
-        state = _WITH_VOLUME.get(code, "failed")
+        state = _WITH_VOLUME.get(code, "failed") if (work / VOLUME).is_file() else "failed"
         if state != "failed":
             with named_on_failure(place):
                 work.replace(place)
@@ -165,7 +165,7 @@ def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
         remove(work)
     residual = last.get("residual_held_out", last.get("residual"))
     said = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
-    message = "" if state == "done" else said or f"its process ended with code {code}"
+    message = "" if state == "done" else said or f"no volume: its process ended with code {code}"
     return replace(
         row, state=state, seconds=clock.now() - began, method=str(last.get("method", "")), residual=residual,
         message=message,

@@ -114,8 +114,8 @@ def state_of(run: Path) -> State:
     with suppress(OSError), (run / EVENTS).open(encoding="utf-8") as lines:
         for line in lines:
             with suppress(ValueError):  # a line that is just being written
-                if line.startswith('{"event": "state"'):
-                    state = State(json.loads(line)["state"])
+                if line.startswith('{"event": "state"') and "source" not in (said := json.loads(line)):
+                    state = State(said["state"])  # without those of the live reconstruction
     return state
 
 

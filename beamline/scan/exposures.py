@@ -203,7 +203,7 @@ class Exposures:
         """Wait while the scan is paused. Returns the trigger to go on with: `i`, or the first one since there may have
         been no beam; its frame and those after it are taken again."""
         self._wait_while_paused()
-        since = self._supervision.pause.take_doubt()
+        since = self._supervision.pause.take_unlit_since()
         doubtful = [trigger for trigger, (_, time) in taken.rows.items() if time + block.exposure > since]
         if not doubtful or block.kind is FrameKind.DARK:
             return i

@@ -14,12 +14,12 @@ import numpy as np
 
 from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, plan_of, resolved_yaml
-from beamline.config.monitor import configured_checks, policies
+from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.machine import free_memory
 from beamline.instrument import connect
 from beamline.instrument.connect import Instrument, camera_settings
-from beamline.monitor.check import Policy, ScanContext
+from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.watch import Monitor
 from beamline.monitor.watch import start as start_monitor
@@ -93,23 +93,12 @@ def dry_run(settings: Config) -> DryRun:
 
 
 def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Timeline:
-    """The timeline with what the operator should know of policies that it cannot carry out, and of the live volume."""
-    remarks = [*worked.remarks, *_held_late(worked, config)]
+    """The timeline with what the operator should know of the live volume."""
+    remarks = [*worked.remarks]
     method = config.recon.method
     if config.recon.live and method != AUTO and streams(method):
         remarks.append(live_need(shape, worked.views.n, free_memory()))
     return replace(worked, remarks=tuple(remarks))
-
-
-def _held_late(worked: Timeline, config: Config) -> list[str]:
-    pausing = [check for check, policy in policies(config.monitor).items() if policy is Policy.PAUSE]
-    if not pausing or len(worked.views.trains) != 1:
-        return []
-    before = "before views are taken again" if config.monitor.retake else "not at all"
-    return [
-        f"monitor.policy {', '.join(pausing)}: a fly scan is held between its passes; this has one, so that it is held "
-        f"{before}; use scan.mode: step, or the policy stop"
-    ]
 
 
 def refuse_violations(worked: Timeline) -> None:

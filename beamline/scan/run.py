@@ -43,7 +43,7 @@ from drivers.manual import Ask
 SAFE = "Stage stopped, shutter closed; the last frames are being written"
 """Message of the state `finishing`."""
 
-LAST_ROUND = 4.0
+ASK_LIVE_AFTER = 4.0
 """Real s from the request to stop a scan to the one to its live reconstruction for the volume that it has, so that this
 is there within 10: what the scan takes to end counts."""
 
@@ -150,11 +150,11 @@ def _refuse_stop(stop: StopRequest) -> None:
         raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
 
 
-def gives_up(stop: StopRequest, useless: bool) -> Callable[[], bool]:
+def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     """Whether the live reconstruction of a scan that has ended should end with the volume that it has: after an abort,
-    a stop that comes now, LAST_ROUND after that of the scan (not where its views were enough), or with a `useless`
+    a stop that comes now, ASK_LIVE_AFTER after that of the scan (not where its views were enough), or with a `useless`
     file, which is broken or has no projections."""
-    last = math.inf if stop.enough else LAST_ROUND if stop.stopping else 0.0
+    last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
 
     def ends() -> bool:
         return useless or stop.aborting or (stop.stopping and stop.seconds >= last)
@@ -258,7 +258,7 @@ class _Run:
         self.emit("scan_done", {**asdict(result), "status": status})
         if follower is not None:
             useless = unfinished is not None or isinstance(error, ReferencesError)
-            recon = follower.finish(gives_up(self.stop, useless), lambda: self.stop.aborting)
+            recon = follower.finish(live_should_end(self.stop, useless), lambda: self.stop.aborting)
             result = replace(result, recon=recon)
         if error is not None:
             raise error

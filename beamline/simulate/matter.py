@@ -9,7 +9,7 @@ import numpy as np
 
 from simulators.light.beam import Beam, Tube
 from simulators.light.materials import Material, Reals, of_formula
-from simulators.light.palette import known
+from simulators.light.palette import known, known_names
 from simulators.light.spectrum import Spectrum, light
 
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
@@ -37,7 +37,8 @@ def in_beam(name: str, beam: str) -> tuple[Reals, Reals]:
     Args:
         name: as in `delta_beta`; of a formula in 1/mm at 1 g/cm3.
         beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1"; or a text file of two columns, keV and
-            weight (without regard to its unit, the detector's response within it).
+            weight (without regard to its unit, the detector's response within it). A filter needs its density: it is
+            one of the materials that scenes know.
 
     Raises:
         ValueError: what is wrong with either.
@@ -47,7 +48,7 @@ def in_beam(name: str, beam: str) -> tuple[Reals, Reals]:
         filters = dict(part.split("=") for part in tube[2].split(",")[1:])
         source = Beam(0.0, tube=Tube(float(tube[1]), {of: float(mm) for of, mm in filters.items()}))
         thickness = _DEEP / float(material.attenuation(float(tube[1]) / 2))
-        found = light(source, [material.attenuation], thickness, lambda of: _material(of).attenuation)
+        found = light(source, [material.attenuation], thickness, lambda of: _filter(of).attenuation)
     else:
         try:
             table = np.loadtxt(beam, ndmin=2)
@@ -57,6 +58,13 @@ def in_beam(name: str, beam: str) -> tuple[Reals, Reals]:
             raise ValueError(f"{beam} must hold two columns, keV and weight, 0 or more, and not all weights 0")
         found = Spectrum.of(table[:, 0], table[:, 1])
     return material.attenuation(found.energies), found.weights
+
+
+def _filter(name: str) -> Material:
+    found = known(name)
+    if found is None:
+        raise ValueError(f"the filter {name!r} has no known density; expected one of {', '.join(known_names())}")
+    return found
 
 
 def _material(name: str) -> Material:

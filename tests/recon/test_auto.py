@@ -178,9 +178,12 @@ def test_no_ray_of_the_middle_rows_leaves_their_box() -> None:
 def test_of_two_that_predict_alike_the_one_that_follows_its_noise_is_not_taken() -> None:
     """0.9 of the other's residual, but 1.8 times what it leaves in its own views, where the other leaves as much."""
     scatter = np.array([-0.01, 0.01])
-    honest, follower = Score(0, Fbp(), 1.0 + scatter, own=1.0), Score(1, Fbp(), 0.9 + scatter, own=0.5)
+    honest, follower = (
+        Score(0, Fbp(), 1.0 + scatter, residual_seen=1.0),
+        Score(1, Fbp(), 0.9 + scatter, residual_seen=0.5),
+    )
     assert best_of([honest, follower])[0].at == 0
-    assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, own=0.85)])[0].at == 1
+    assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, residual_seen=0.85)])[0].at == 1
 
 
 @dataclass(frozen=True, eq=False)

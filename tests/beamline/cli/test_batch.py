@@ -91,6 +91,7 @@ def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, mo
             (log.parent / "recon.h5.partial").touch()
             raise KeyboardInterrupt
         done.append(line[len(BatchOptions([], None, folder).command)])
+        (log.parent / "recon.h5").touch()
         return 0, ""
 
     monkeypatch.setattr(batch, "_run", run)
@@ -106,6 +107,13 @@ def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_ke
     assert row.state == "poor"
     assert "--max-residual" in row.message
     assert Path("out/scan/recon.h5").is_file()
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_recipe_that_makes_no_volume_is_a_failure(folder: Path) -> None:
+    Path("recipe.yaml").write_text("axis: try:19:20:0.5\n")
+    assert beamline("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out").exit_code == 5
+    assert _table(folder / "out")["scan"]["state"] == "failed"
 
 
 @pytest.mark.parametrize(

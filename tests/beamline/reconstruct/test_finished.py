@@ -100,7 +100,9 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
     for said in ("R²-Gaussian", "FBP", "beamline recon scan.h5", "12 of 45 views"):
         assert said in page
-    assert page.count("data:image/png;base64,") == 4  # slices, quality, projection, sinogram; the axis was given
+    assert (
+        page.count("data:image/png;base64,") == 6
+    )  # slices in two windows, profile, quality, projection, sinogram; the axis was given
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from pathlib import Path
@@ -120,3 +121,12 @@ def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
     with pytest.raises(ConfigError, match="does not answer"):
         tell(tmp_path, Verb.PAUSE)
     assert list((tmp_path / "control").iterdir()) == []
+
+
+def test_the_state_is_that_of_the_scan_not_of_its_live_reconstruction(tmp_path: Path) -> None:
+    lines = [
+        {"event": "state", "state": "paused", "message": ""},
+        {"event": "state", "state": "finishing", "source": "recon"},
+    ]
+    (tmp_path / "events.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    assert state_of(tmp_path) is State.PAUSED

@@ -39,17 +39,6 @@ def test_a_coarse_stage_is_planned_on_its_counts() -> None:
     assert any("257.143 counts" in remark for remark in worked.timeline.remarks)
 
 
-def test_a_pause_that_one_pass_cannot_make_is_told() -> None:
-    def said(*overrides: str) -> list[str]:
-        worked = dry_run(shipped("simulated", "monitor.policy.stuck=pause", *overrides)).timeline
-        return [remark for remark in worked.remarks if "held" in remark]
-
-    (remark,) = said()
-    assert "monitor.policy stuck" in remark and "held not at all" in remark
-    assert "held before views are taken again" in said("monitor.retake=true")[0]
-    assert said("scan.mode=step") == said("scan.angles={scheme: interlaced, views: 360, passes: 2}") == []
-
-
 def test_what_a_live_volume_takes_is_told() -> None:
     def said(name: str, *overrides: str) -> list[str]:
         return [remark for remark in dry_run(shipped(name, *overrides)).timeline.remarks if "live volume" in remark]

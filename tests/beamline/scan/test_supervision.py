@@ -84,7 +84,7 @@ def test_too_little_beam_pauses_until_there_has_been_enough_for_a_while(
         guard(BeamReading(value, "mA", 10.0 * i))
         seen.append(bool(pause.reason))
     assert seen == [bool(one) for one in paused]
-    assert (pause.take_doubt(), pause.take_doubt()) == (since, math.inf)
+    assert (pause.take_unlit_since(), pause.take_unlit_since()) == (since, math.inf)
 
 
 def test_a_pause_that_was_asked_for_outlasts_the_beam() -> None:

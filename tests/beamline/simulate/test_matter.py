@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import xraylib
 
-from beamline.simulate.matter import delta_beta
+from beamline.simulate.matter import delta_beta, in_beam
 
 
 @pytest.mark.parametrize(("name", "formula"), [("water", "H2O"), ("SiO2", "SiO2"), ("Al", "Al"), ("LiCoO2", "LiCoO2")])
@@ -21,3 +22,12 @@ def test_what_is_no_material_is_said() -> None:
         delta_beta("bone", 20.0)
     with pytest.raises(ValueError, match="tabulated from"):
         delta_beta("Al", 2000.0)
+
+
+def test_a_filter_needs_a_density() -> None:
+    with pytest.raises(ValueError, match=r"the filter 'Sn' has no known density; expected one of LiCoO2, .*Al, Cu"):
+        in_beam("Fe2O3", "60kV,Sn=0.5")
+    harder, softer = (
+        np.average(seen, weights=light) for seen, light in map(in_beam, ("Al", "Al"), ("60kV,Cu=1", "60kV"))
+    )
+    assert harder < softer

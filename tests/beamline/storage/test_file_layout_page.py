@@ -31,8 +31,11 @@ from tests.beamline.storage.conftest import StandingClock
 
 PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encoding="utf-8")
 SCAN = TwoCylinders(shape=(4, 40), pixel_size_mm=0.5)
-NOT_OF_EVERY_RUN = {"scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.live.png", "recon.log", "report.html"}
-"""Of simulated scans and of the live reconstruction, whose own tests name them."""
+NOT_OF_EVERY_RUN = {
+    "scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.live.png", "recon.log", "report.html", "watchdog.log",
+    "control/",
+}  # fmt: skip
+"""Of simulated scans, the live reconstruction and the watchdog, whose own tests name them; and of a scan that runs."""
 
 
 def rows(title: str) -> list[list[str]]:
