@@ -160,14 +160,20 @@ class Auto:
 
 
 def predicts_best(
-    part: ReconProblem, methods: Sequence[Method], control: RunControl, spare: int | None = None
+    part: ReconProblem,
+    methods: Sequence[Method],
+    control: RunControl,
+    spare: int | None = None,
+    order: Sequence[int] | None = None,
 ) -> tuple[int | None, str]:
     """Which of the methods predicts best what one of eight views shows that it has not seen; all residuals in words.
 
     None where `control` ends the trials before two are done; one that it cuts short is not judged.
 
     Args:
+        methods: by preference.
         spare: one that is tried only where one after it would be taken.
+        order: in which they are tried; None: by preference.
 
     Raises:
         ValueError: no method takes these views or data.
@@ -201,7 +207,7 @@ def predicts_best(
             seconds = control.now() - begin
             control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
 
-    regular = [at for at in range(len(methods)) if at != spare]
+    regular = [at for at in order or range(len(methods)) if at != spare]
     for at in regular:
         attempt(at)
     if spare is not None and scores and best_of(scores)[0].at > spare:
@@ -217,7 +223,7 @@ def predicts_best(
         f"{told[s.at]}"
         for s in sorted(scores, key=lambda s: s.residual)
     ]
-    late = [methods[at].name for at in regular if at > max(s.at for s in scores)] if stopped() else []
+    late = [methods[at].name for at in regular[len(scores) + len(refused) :]] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
 
 

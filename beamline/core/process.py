@@ -71,7 +71,9 @@ class ChildProcess:
             errors="replace",
             env=environment,
             start_new_session=True,  # POSIX
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),  # Windows
+            # Windows; without a window of its own a child ends with the console that is closed.
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+            | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
         )
         if behind:
             with suppress(psutil.Error):  # it has ended already, or the system does not allow it

@@ -14,6 +14,7 @@ from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Event, Sink
 from beamline.core.files import named_on_failure, remove, whole_file
 from beamline.core.process import ChildProcess, json_object
+from beamline.storage.writer_lock import WriterLock, held
 from drivers.clock import Clock
 
 State = Literal["waiting", "done", "poor", "failed"]
@@ -83,6 +84,17 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
     """
     folder = options.folder
     _begin(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+    if held(folder / RECIPE):
+        raise DataError(f"Another batch works in {folder}. Wait for its end, or name another folder.")
+    lock = WriterLock(folder / RECIPE)
+    try:
+        return _run_all(options, sink, clock)
+    finally:
+        lock.release()
+
+
+def _run_all(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
+    folder = options.folder
     rows = _rows(options.scans, _read(folder))
     _write(folder, rows)
     begun, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
@@ -104,9 +116,15 @@ def names_of(scans: Sequence[Path]) -> list[str]:
     parts = [(*path.resolve().parent.parts[1:], path.stem) for path in scans]
     names = [own[-1] for own in parts]
     for depth in range(2, max(map(len, parts), default=0) + 1):
-        shared = {name for name in names if names.count(name) > 1}
-        names = ["_".join(own[-depth:]) if name in shared else name for own, name in zip(parts, names, strict=True)]
-    return [f"{name}_{n}" if names.count(name) > 1 else name for n, name in enumerate(names)]
+        shared = _shared(names)
+        names = ["_".join(own[-depth:]) if one else name for own, name, one in zip(parts, names, shared, strict=True)]
+    return [f"{name}_{n}" if one else name for n, (name, one) in enumerate(zip(names, _shared(names), strict=True))]
+
+
+def _shared(names: Sequence[str]) -> list[bool]:
+    """Whether each name is also another's, on a disk that does not tell upper from lower case."""
+    folded = [name.casefold() for name in names]
+    return [folded.count(name) > 1 for name in folded]
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
@@ -133,8 +151,8 @@ def _rows(scans: Sequence[Path], known: Sequence[Row]) -> list[Row]:
     old = {row.scan for row in known}
     new = [path for path in scans if str(path.resolve()) not in old]
     names = names_of([*(Path(row.scan) for row in known), *new])[len(known) :]
-    taken = {row.name for row in known}
-    free = [f"{name}_{len(known) + n}" if name in taken else name for n, name in enumerate(names)]
+    taken = {row.name.casefold() for row in known}
+    free = [f"{name}_{len(known) + n}" if name.casefold() in taken else name for n, name in enumerate(names)]
     return [*known, *(Row(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
 
 
@@ -152,6 +170,8 @@ def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
             sink(Event(event, float(data.pop("time", clock.now())), {**data, "scan": row.scan}))
 
     place, work = options.folder / row.name, options.folder / f".{row.name}.partial"
+    if (place / VOLUME).is_file():
+        return replace(row, state="done", seconds=0.0, message="made by a call that ended before it wrote its row")
     remove(work)  # of a batch that was killed
     try:
         with named_on_failure(work):

@@ -209,10 +209,12 @@ def _chosen(
         return by_curves, f"{expected}the scan has too few rows for a trial in this time"
     count = default_count(Grid.of_field(part.geometry, part.geometry.sample_pitch))
     trial = RunControl(_until(control, control.now() + _TRIAL_SLACK * seconds), now=control.now)
-    at, residuals = predicts_best(part, [plan.method(c, count) for c in tried], trial)
+    liked = sorted(tried, key=lambda c: list(plan.methods).index(c.method))
+    order = [liked.index(c) for c in tried]
+    at, residuals = predicts_best(part, [plan.method(c, count) for c in liked], trial, order=order)
     if at is None:
         return plan.preferred(plan.choices()), f"{expected}too little time"
-    return plan.choices(name=tried[at].method)[0], f"residual of views held out, {where}: {residuals}"
+    return plan.choices(name=liked[at].method)[0], f"residual of views held out, {where}: {residuals}"
 
 
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:

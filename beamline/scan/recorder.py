@@ -73,6 +73,7 @@ class Recorder:
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
+        self._retaken = 0
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
         low, high = WAITING_FRAMES
@@ -142,7 +143,7 @@ class Recorder:
     @property
     def retaken(self) -> int:
         """Views that were taken again."""
-        return len(self._replaced)
+        return self._retaken
 
     @property
     def _alarmed(self) -> set[int]:
@@ -226,6 +227,7 @@ class Recorder:
             self._triggers[frame.index] = frame.trigger
         if frame.replaces >= 0:
             self._replaced.add(frame.replaces)
+            self._retaken += frame.kind is FrameKind.PROJECTION
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:

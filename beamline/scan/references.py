@@ -36,6 +36,9 @@ class ReferenceLog:
         elif frame.kind is FrameKind.PROJECTION and len(self._views) < VIEWS:
             self._views.append(Reference.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin))
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
+        if frame.replaces >= 0:
+            for known in (*self._groups, self._views):
+                known[:] = [one for one in known if one.row != frame.replaces]
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
         """What is wrong with the groups so far, by the name of the group; a sentence or more each.

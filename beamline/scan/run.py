@@ -139,9 +139,11 @@ def run_scan(
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
             run = _Run(config, instrument, ready, folder, stop, emit, began)
             stack.enter_context(obeying(folder, stop, run.pause))
+            guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
-                stack.enter_context(watched(folder, emit))
-            return run.go(live, afterwards, release=connected.close)
+                guarded.enter_context(watched(folder, emit))
+            guarded.callback(connected.close)
+            return run.go(live, afterwards, release=guarded.close)
 
 
 def _refuse_stop(stop: StopRequest) -> None:

@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -21,7 +22,6 @@ from beamline.core.process import ChildProcess
 from beamline.instrument.connect import shutter_of
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from drivers.clock import Clock, SystemClock
-from drivers.errors import DeviceError
 
 PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
 BETWEEN = 0.5  # s between attempts
@@ -36,7 +36,10 @@ def watched(folder: Path, emit: Emit) -> Iterator[None]:
         Path(os.devnull).open("w") as nowhere,
         ChildProcess(command, nowhere, lambda line: ready.set(), tether=True) as process,
     ):
-        if not ready.wait(READY_WITHIN) or not process.running:
+        deadline = time.monotonic() + READY_WITHIN
+        while not ready.wait(BETWEEN) and process.running and time.monotonic() < deadline:
+            pass
+        if not ready.is_set() or not process.running:
             emit("warning", {"message": "The watchdog does not run: a scan that is killed leaves the shutter open."})
         yield
 
@@ -65,7 +68,7 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
     while True:
         try:
             step()
-        except DeviceError as error:
+        except Exception as error:  # whatever it is, the next step must be tried
             if clock.now() > deadline:
                 say(f"{error} LOOK AT THE INSTRUMENT before anybody goes near the beam.")
                 return False
@@ -83,7 +86,8 @@ def main(folder: Path) -> None:
     sys.stdin.read()
 
     def say(text: str) -> None:
-        with (folder / WATCHDOG_LOG).open("a", encoding="utf-8") as log:
+        # A full disk, or a folder that is gone, must not keep the stage turning.
+        with suppress(OSError), (folder / WATCHDOG_LOG).open("a", encoding="utf-8") as log:
             log.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}  {text}\n")
 
     say("The process of the scan has died.")

@@ -12,6 +12,7 @@ import pytest
 from beamline.cli import batch as command
 from beamline.reconstruct import batch
 from beamline.reconstruct.batch import BatchOptions, Row, names_of, run_batch
+from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
 from tests.beamline.cli.small_scan import SCAN, beamline, left
@@ -74,6 +75,23 @@ def test_all_scans_by_one_recipe_and_what_is_left_by_a_second_call(folder: Path)
     assert "another recipe" in other.output
 
 
+@pytest.mark.usefixtures("in_this_process")
+def test_a_result_whose_row_was_not_written_is_kept_and_two_batches_do_not_share_a_folder(folder: Path) -> None:
+    Path("recipe.yaml").write_text("method: fbp\n")
+    given = ("batch", "scan.h5", "--config", "recipe.yaml", "-o", "out")
+    assert beamline(*given).exit_code == 0
+    (folder / "out" / "batch.csv").write_text("name,scan,state,seconds,method,residual,message\n")
+    before = (folder / "out" / "scan" / "recon.h5").stat().st_mtime_ns
+    assert beamline(*given).exit_code == 0
+    assert (folder / "out" / "scan" / "recon.h5").stat().st_mtime_ns == before
+    assert _table(folder / "out")["scan"]["state"] == "done"
+    other = WriterLock(folder / "out" / "recipe.yaml")
+    refused = beamline(*given)
+    other.release()
+    assert refused.exit_code == 5
+    assert "Another batch works in out" in refused.output
+
+
 def test_a_folder_of_something_else_is_refused(folder: Path) -> None:
     (folder / "out").mkdir()
     result = beamline("batch", "scan.h5", "-o", "out")
@@ -123,6 +141,7 @@ def test_a_recipe_that_makes_no_volume_is_a_failure(folder: Path) -> None:
         (("/x/run1/scan.h5", "/x/run2/scan.h5", "/x/c.h5"), ["run1_scan", "run2_scan", "c"]),
         (("/1/r/s.h5", "/2/r/s.h5"), ["1_r_s", "2_r_s"]),
         (("/x/s.h5", "/x/s.tif"), ["x_s_0", "x_s_1"]),
+        (("/a/Tooth.h5", "/b/tooth.h5"), ["a_Tooth", "b_tooth"]),  # one folder on some disks
     ],
 )  # fmt: skip
 def test_names_tell_files_apart(paths: tuple[str, ...], names: list[str]) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from beamline.config.load import config_folder, load
 from beamline.config.references import reference_limits
 from beamline.core.errors import ConfigError, ReferencesError
 from beamline.core.events import Event
+from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits
+from beamline.scan.references import ReferenceLog
 from beamline.scan.run import State, run_scan
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate
-from drivers.frame import FrameKind
+from drivers.frame import Frame, FrameKind
 from tests.beamline import fakes
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
@@ -116,3 +119,20 @@ def test_limits_are_typed_and_have_the_defaults_of_the_judge() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             load(path, [word], {})
+
+
+def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:
+    log, counts = ReferenceLog(8), np.full((16, 16), 200, np.uint16)
+
+    def add(row: int, kind: FrameKind, level: int, replaces: int = -1) -> None:
+        pixels = counts + np.uint16(level)
+        frame = Frame(pixels, kind, row, row, row, 0.0, float(row), 0.05, replaces)
+        log.add(frame, digest(pixels))
+
+    for row in range(3):
+        add(row, FrameKind.DARK, 0)
+    for row, level in ((3, 20000), (4, 50), (5, 20000)):
+        add(row, FrameKind.FLAT, level)
+    assert log.faults(ReferenceLimits()) != {}
+    add(6, FrameKind.FLAT, 20000, replaces=4)
+    assert log.faults(ReferenceLimits()) == {}

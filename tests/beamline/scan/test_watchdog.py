@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from beamline.config.load import config_folder, load, resolved_yaml
+from beamline.config.load import Config, config_folder, load, resolved_yaml
+from beamline.scan import watchdog
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from beamline.scan.watchdog import watched
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
+from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.registry import WIRES
 from tests.beamline.ball_scan import COMMON
@@ -25,7 +29,7 @@ from pathlib import Path
 from beamline.config.load import load
 from beamline.instrument.connect import shutter_of, stage_alone
 from beamline.scan.watchdog import watched
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
 folder, by_hand = Path(sys.argv[1]), []
 config = load(folder / "config.resolved.yaml", environment={})
 with watched(folder, lambda event, data: None), stage_alone(config) as stage:
@@ -71,3 +75,21 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Pa
         with watched(tmp_path, lambda event, data: told.append(event)):
             pass
         assert told == [] and not log.exists()
+
+
+def test_what_cannot_be_said_or_done_keeps_no_other_step_from_being_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / WATCHDOG_LOG).mkdir()  # a log that cannot be written
+    (tmp_path / CONFIG).write_text(resolved_yaml(load(config_folder() / "instrument.yaml", (), {})))
+    made: list[bool] = []
+
+    def safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
+        say("The stage was told to stop.")
+        made.append(watchdog._insist(lambda: 1 / 0, VirtualClock(), say, "never"))  # type: ignore[arg-type, return-value]
+        return True
+
+    monkeypatch.setattr(watchdog, "make_safe", safe)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    watchdog.main(tmp_path)
+    assert made == [False]
