@@ -15,6 +15,8 @@ class ManualShutter:
     where the state changes.
     """
 
+    by_hand = True
+
     def __init__(self, ask: Ask, name: str = "shutter") -> None:
         self.name = name
         self._ask = ask

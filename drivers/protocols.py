@@ -254,9 +254,10 @@ class Camera(Protocol):
 
 
 class Shutter(Protocol):
-    """Beam shutter. Darks need it closed."""
+    """Beam shutter. Darks need it closed. `by_hand`: somebody is asked to move it."""
 
     name: str
+    by_hand: bool
 
     def open(self) -> None: ...
 

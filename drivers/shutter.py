@@ -24,6 +24,8 @@ class OutputShutter:
         DeviceRefused: a settling time that is negative or not finite.
     """
 
+    by_hand = False
+
     def __init__(
         self,
         output: DigitalOutput,

@@ -133,8 +133,7 @@ class Auto:
     def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
         """Which of the methods to take, and why."""
         wider = [n for n, method in enumerate(self.methods) if method.traits.any_grid]
-        some = _of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
-        if wider and leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry):
+        if wider and is_wider(problem):
             name = self.methods[wider[0]].name
             return wider[0], f"the sample is wider than the field, and only {name} models what is beyond it"
         part, where = part_of(problem)
@@ -157,6 +156,12 @@ class Auto:
 
     def work(self, n_views: int, binning: int) -> float:
         return sum(method.work(n_views, binning) for method in self.candidates)
+
+
+def is_wider(problem: ReconProblem) -> bool:
+    """Whether the sample leaves the field, by some of the views: only methods with the trait `any_grid` model that."""
+    some = _of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
+    return leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry)
 
 
 def predicts_best(

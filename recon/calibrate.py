@@ -20,6 +20,7 @@ from recon.splatting.initialise import MATTER, default_count, density_unit, firs
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
+from recon.voxels.held_out_weight import choice_sweeps
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.tv import TotalVariationProx, difference_weights
@@ -77,7 +78,8 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     high = geometry.rows(0, min(_SWEPT_ROWS, geometry.detector_shape[0]))
     some = Grid.of_field(high, high.sample_pitch)
     sweep = sweep_seconds(high, some, now) * grid.shape[0] / some.shape[0]
-    return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds, sweep)
+    trials = choice_sweeps(geometry) * sweep if math.isfinite(sweep) else 0.0
+    return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds, sweep, trials)
 
 
 def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:

@@ -10,53 +10,33 @@ from beamline.config.models import Storage
 from beamline.core.errors import ConfigError
 from beamline.scan.control import Verb, running, tell
 
-_RUN = click.argument("run", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
+_EXIT_CODES = "Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error."
 
 
-@click.command()
-@_RUN
-def pause(run: Path | None) -> None:
-    """Pause the scan in the folder RUN (the running one of ./runs): the stage stands, the shutter closes, and no view
-    is lost or taken twice. `beamline resume` goes on.
+def _command(verb: Verb, help_text: str) -> click.Command:
+    """The command of a verb; `help_text` begins its help."""
 
-    Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error.
-    """
-    _tell(run, Verb.PAUSE)
+    @click.command(verb.value, help=f"{help_text}\n\n{_EXIT_CODES}")
+    @click.argument("run", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
+    def send(run: Path | None) -> None:
+        run = run or _only(Path(Storage.model_fields["folder"].default))
+        click.echo(f"{run}: {tell(run, verb)}")
 
-
-@click.command()
-@_RUN
-def resume(run: Path | None) -> None:
-    """Let the paused scan in the folder RUN (the running one of ./runs) go on.
-
-    Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error.
-    """
-    _tell(run, Verb.RESUME)
+    return send
 
 
-@click.command()
-@_RUN
-def stop(run: Path | None) -> None:
-    """Stop the scan in the folder RUN (the running one of ./runs) cleanly, as the first Ctrl-C does.
-
-    Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error.
-    """
-    _tell(run, Verb.STOP)
-
-
-@click.command()
-@_RUN
-def abort(run: Path | None) -> None:
-    """Abort the scan in the folder RUN (the running one of ./runs) at once, as the second Ctrl-C does.
-
-    Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error.
-    """
-    _tell(run, Verb.ABORT)
-
-
-def _tell(run: Path | None, verb: Verb) -> None:
-    run = run or _only(Path(Storage.model_fields["folder"].default))
-    click.echo(f"{run}: {tell(run, verb)}")
+pause = _command(
+    Verb.PAUSE,
+    "Pause the scan in the folder RUN (the running one of ./runs): the stage stands, the shutter closes, and no view "
+    "is lost or taken twice. `beamline resume` goes on.",
+)
+resume = _command(Verb.RESUME, "Let the paused scan in the folder RUN (the running one of ./runs) go on.")
+stop = _command(
+    Verb.STOP, "Stop the scan in the folder RUN (the running one of ./runs) cleanly, as the first Ctrl-C does."
+)
+abort = _command(
+    Verb.ABORT, "Abort the scan in the folder RUN (the running one of ./runs) at once, as the second Ctrl-C does."
+)
 
 
 def _only(runs: Path) -> Path:

@@ -17,6 +17,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.text import printable
+from beamline.scan.resume import recover_run
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
@@ -97,17 +98,20 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
 @click.argument("file", type=_PATH)
 @json_option
 def recover(file: Path, as_json: bool) -> None:
-    """Make an ordinary scan file of FILE, whose writer died, in its place.
+    """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
 
     Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is.
     """
     with terminated_like_interrupted(), json_events(as_json) as sinks:
-        done = recover_scan(file)
+        found, left_out = recover_run(file) if file.is_dir() else ([recover_scan(file)], [])
+        for said in left_out:
+            click.echo(f"Warning: {said}", err=True)
         for sink in sinks:
-            sink(Event("done", SystemClock().now(), vars(done)))
+            for done in found:
+                sink(Event("done", SystemClock().now(), vars(done)))
     if not as_json:
-        click.echo(done.said())
+        click.echo("\n".join(done.said() for done in found))
 
 
 def _count(n: int, word: str) -> str:

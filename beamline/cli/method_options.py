@@ -101,8 +101,16 @@ def method_with(name: str, options: Mapping[str, Any]) -> Method:
 
 
 def options_of_a_method(ctx: click.Context) -> list[str]:
-    """Those of the options of methods that the user gave."""
-    return [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    """Those of the options of methods that the user gave; any method resumes a partial volume."""
+    given = [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
+    return [name for name in given if name != "resume" or not resumes_slabs(ctx.params["resume"])]
+
+
+def resumes_slabs(path: Path | None) -> bool:
+    """Whether the file of --resume is a partial volume."""
+    from beamline.storage.writers.partial_volume import is_partial  # here: help needs none of it
+
+    return path is not None and is_partial(path)
 
 
 def takers(option: str) -> tuple[str, ...]:
@@ -227,7 +235,8 @@ _OPTIONS = (
     click.option(
         "--resume",
         type=click.Path(path_type=Path, dir_okay=False),
-        help="Continue the fit from this checkpoint of the same data and options.",
+        help="Continue the fit from this checkpoint, or make the slabs that this partial volume lacks: with the same "
+        "data and options.",
     ),
     _ITERATIONS,
     _TV_WEIGHT,

@@ -7,7 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from click.core import ParameterSource
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
     "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume", "follow",
-    "unfinished", "truth", "angles", "angle_rows", "darks", "flats",
+    "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats",
 )  # fmt: skip
 """Options that are of one scan or one call, not of a recipe."""
 _NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint")
@@ -61,17 +61,18 @@ def _scalar(value: Any) -> str:
     return text if _PLAIN.fullmatch(text) else json.dumps(text)
 
 
-def repeating(ctx: click.Context, argument: Path, output: Path) -> str:
+def repeating(ctx: click.Context, argument: Path, output: Path, without: Collection[str] = ()) -> str:
     """The command line that does the same again, from any folder: with absolute paths, and an output of its own.
 
     Args:
         argument: the file that the command is about.
         output: of this call; the line names another one, as nothing is overwritten.
+        without: options that will not work again.
     """
     again = f"{output.stem}_again{output.suffix}"
     words = ["beamline", str(ctx.info_name), *_leading(ctx), str(argument.resolve())]
     for option, value in given(ctx).items():
-        if option.name in _NOT_REPEATED:
+        if option.name in _NOT_REPEATED or option.name in without:
             continue
         if option.is_flag:
             on = str(value).lower() in ("true", "1", "yes", "on", "y", "t")

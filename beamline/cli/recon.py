@@ -22,11 +22,12 @@ from beamline.cli.method_options import (
     method_with,
     options_of_a_method,
     refuse_contradictions,
+    resumes_slabs,
 )
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
 from beamline.cli.recipe import Repeatable, config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import LogLines, Terminal, results
+from beamline.cli.terminal import LogLines, Terminal, counting, results
 from beamline.core.errors import QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out, while_it_works
 from beamline.core.files import named_on_failure, refuse_existing, whole_file
@@ -40,6 +41,7 @@ from recon.methods import DEFAULT, names
 if TYPE_CHECKING:
     from beamline.reconstruct.axis_trials import AxisRange
     from beamline.reconstruct.options import ReconOptions
+    from beamline.reconstruct.region import Region
 
 
 def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
@@ -62,6 +64,30 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     if match is None or not float(match[1]) > 0:
         raise click.BadParameter(f"{value!r} is no size; expected a number and K, M, G or T, such as 8G")
     return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
+
+
+def cluster_of(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
+    """Workers, `local:N` or an address."""
+    if value is not None:
+        from beamline.reconstruct.cluster import check_cluster  # here: help needs none of it
+
+        try:
+            check_cluster(value)
+        except ValueError as error:
+            raise click.BadParameter(str(error)) from error
+    return value
+
+
+def region_of(ctx: click.Context, param: click.Parameter, value: str | None) -> Region | None:
+    """A box of voxels, `z0:z1,y0:y1,x0:x1`."""
+    if value is None:
+        return None
+    from beamline.reconstruct.region import Region  # here: help needs none of it
+
+    try:
+        return Region.parse(value)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from error
 
 
 @click.command(cls=Repeatable)
@@ -128,6 +154,20 @@ def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
 )
 @click.option(
+    "--cluster",
+    metavar="local:N|tcp://HOST:PORT",
+    callback=cluster_of,
+    help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, or "
+    "those of a scheduler.",
+)
+@click.option(
+    "--roi",
+    metavar="Z0:Z1,Y0:Y1,X0:X1",
+    callback=region_of,
+    help="Box of voxels to write, of the volume that the same options give without this one. It is made of the rows "
+    "that show it; fbp makes these voxels alone.",
+)
+@click.option(
     "--write-config",
     type=click.Path(path_type=Path),
     help="Write the options of this call as a recipe to this file (-: print it), and do nothing else.",
@@ -160,6 +200,8 @@ def recon(
     enough_gain: float | None,
     unfinished: bool,
     memory: int | None,
+    cluster: str | None,
+    roi: Region | None,
     dry: bool,
     write_config: Path | None,
     log: Path | None,
@@ -171,7 +213,8 @@ def recon(
 
     Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
     and a report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or
-    iterations stops with the volume reached so far (exit code 4), the second discards it.
+    iterations stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs keeps those
+    that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
     """
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.finished import reconstruct_file
@@ -196,6 +239,9 @@ def recon(
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")
     if memory is not None and (follow or budget is not None):
         raise click.UsageError("--memory does not go with --follow or --budget, which hold everything in memory.")
+    partial = resume if resumes_slabs(resume) else None
+    if partial is not None and follow:
+        raise click.UsageError(f"--resume {resume} holds slabs of a finished scan; it does not go with --follow.")
     if dry and (follow or budget is not None):
         raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
@@ -204,8 +250,14 @@ def recon(
         {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume, "--log": log}
     )
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
+    if cluster is not None and (follow or budget is not None):
+        raise click.UsageError("--cluster does not go with --follow or --budget, which hold everything in memory.")
+    if roi is not None and (follow or truth is not None or tried is not None):
+        raise click.UsageError("--roi does not go with --follow, --truth or --axis try.")
     if tried is not None and follow:
         raise click.UsageError("--axis try is for a finished scan: it needs all views.")
+    if tried is not None and (dry or log is not None):
+        raise click.UsageError("--axis try does not go with --dry-run or --log: it writes a picture of slices only.")
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=source,
@@ -214,7 +266,7 @@ def recon(
         method=method_with(method, {**settings, "filter": ramp}),
         budget=budget,
         quality=quality,
-        checkpoints=CheckpointOptions(checkpoint, resume),
+        checkpoints=CheckpointOptions(checkpoint, None if partial else resume),
         device=device,
         filter=ramp,
         seed=seed,
@@ -222,9 +274,14 @@ def recon(
         unfinished=unfinished,
         enough=enough,
         memory=memory,
-        command=repeating(context, file, output),
+        region=roi,
+        cluster=cluster,
+        partial=partial,
+        command=repeating(context, file, output, () if partial is None else ("resume",)),
         recipe=recipe_text(context, method),
     )
+    if roi is not None and max_residual is not None and options.method.traits.direct:
+        raise click.UsageError("--max-residual needs the whole volume, of which fbp with --roi makes a part.")
     if write_config is not None:
         _write_recipe(write_config, options.recipe)
         return
@@ -300,7 +357,8 @@ def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: boo
 
     last: list[Event] = []
     with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
-        try_axes(options, wanted, path, fan_out(last.append, *(sinks or [terminal])), SystemClock())
+        sink, clock = fan_out(last.append, *(sinks or [terminal])), SystemClock()
+        try_axes(options, wanted, path, sink, clock, counting("axes", sink, clock))
     if not as_json:
         done = last[-1].data
         scores = "\n".join(f"  {col:>8}  {score:.4f}" for col, score in done["scores"].items())

@@ -14,7 +14,7 @@ from typing import TypedDict
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import config_argument, json_option, set_option
+from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.config.load import Config, load, plan_of
 from beamline.core.errors import AlarmError
@@ -26,6 +26,7 @@ from beamline.instrument.connect import describe
 from beamline.instrument.operator import ask_operator
 from beamline.scan.live_process import LiveCommand, finished_command, follow_command, live_plan
 from beamline.scan.preflight import dry_run, refuse_violations
+from beamline.scan.resume import ResumableRun, open_for_resume
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
 from beamline.storage.flag_legend import counted
@@ -38,7 +39,7 @@ _SAID_WITHIN = 0.2  # s
 
 
 @click.command()
-@config_argument
+@click.argument("file", metavar="[CONFIG]", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--dry-run", "dry", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
 )
@@ -51,8 +52,23 @@ _SAID_WITHIN = 0.2  # s
     type=click.Path(path_type=Path, file_okay=False),
     help="Folder for the folders of runs. Default: storage.folder of CONFIG.",
 )
-def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_json: bool, output: Path | None) -> None:
-    """Run the scan in CONFIG.
+@click.option(
+    "--resume",
+    "run",
+    metavar="RUN",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Take the missing views of the run in this folder, which ended early, with its own configuration.",
+)
+def scan(
+    file: Path | None,
+    dry: bool,
+    overrides: tuple[str, ...],
+    no_live: bool,
+    as_json: bool,
+    output: Path | None,
+    run: Path | None,
+) -> None:
+    """Run the scan in CONFIG, or go on with one that ended early (--resume RUN).
 
     Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, SIGTERM or a terminal that is
     closed stops the scan cleanly; the second Ctrl-C aborts it. The file is readable in either case.
@@ -61,16 +77,25 @@ def scan(file: Path, dry: bool, overrides: tuple[str, ...], no_live: bool, as_js
     error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, or darks or flats a
     fault, 130 aborted, or interrupted before the first frame.
     """
-    with json_events(as_json) as json_sinks:
-        config = load(file, overrides)
+    if file is None and run is None:
+        raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
+    if run is not None and (output is not None or (overrides and file is None)):
+        raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
+    with json_events(as_json) as json_sinks, ExitStack() as held:
+        config = None if file is None else load(file, overrides)
+        series = None if run is None else held.enter_context(open_for_resume(run, config))
+        config = series.config if series else config
+        assert config is not None
+        for said in series.left_out if series else ():
+            click.echo(f"Warning: {said}", err=True)
         if dry:
-            _dry_run(config, json_sinks)
+            _dry_run(config, output, series, json_sinks)
             return
         stop = StopRequest()
         with stop_signals(stop), Terminal(sys.stderr) as terminal:
             sinks: list[Sink] = [terminal, *json_sinks]
             result = run_scan(
-                config, output, sinks, stop, **_commands(config, no_live),
+                config, series or output, sinks, stop, **_commands(config, no_live, joins_parts=series is not None),
                 ask=lambda request: terminal.ask(request, ask_operator),
             )  # fmt: skip
     if not as_json:
@@ -95,8 +120,8 @@ def _faults(result: RunResult) -> list[str]:
     return [*said, *result.reference_faults]
 
 
-def _dry_run(config: Config, json_sinks: Sequence[Sink]) -> None:
-    worked = dry_run(config)
+def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sinks: Sequence[Sink]) -> None:
+    worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.views)
     if not json_sinks:
         click.echo("\n".join(worked.lines()))
     refuse_violations(worked.timeline)
@@ -109,12 +134,15 @@ class _Commands(TypedDict, total=False):
     afterwards: LiveCommand
 
 
-def _commands(config: Config, no_live: bool) -> _Commands:
+def _commands(config: Config, no_live: bool, joins_parts: bool) -> _Commands:
     """How the scan is reconstructed: while it runs, when it is complete, or not at all."""
     if no_live or not config.recon.live:
         return {}
     if config.recon.method == AUTO or not streams(config.recon.method):
         click.echo(f"{config.recon.method} needs the complete scan: the volume comes after it.", err=True)
+        return {"afterwards": finished_command(config)}
+    if joins_parts:
+        click.echo("The views are in several files: the volume comes when they are joined.", err=True)
         return {"afterwards": finished_command(config)}
     _, camera, _ = describe(config)
     return {"live": follow_command(config, live_plan(camera.shape, plan_of(config).angles.size, free_memory()))}

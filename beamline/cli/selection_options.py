@@ -13,7 +13,7 @@ import click
 
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
-from recon.base.choices import FEW_PHOTONS, Noise, Rings
+from recon.base.choices import FEW_PHOTONS, FlatFields, Noise, Rings
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Hardening, Phase, Selection
@@ -111,6 +111,8 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         accept_references=rest.pop("references") == "accept",
         noise=rest.pop("noise"),
         rings=rest.pop("rings"),
+        flat_fields=rest.pop("flat_fields"),
+        use_current=rest.pop("ring_current") == "use",
         gain=rest.pop("gain"),
         phase=_phase(rest),
         hardening=_hardening(rest.pop("hardening")),
@@ -262,6 +264,21 @@ _AFTER = (
         help="log: line integrals are logarithms of counts; counts: they carry the likelihood of the photons counted, "
         f"with weights, which few photons need; auto: counts where a pixel of the open beam has fewer than "
         f"{FEW_PHOTONS}.",
+    ),
+    click.option(
+        "--flat-fields",
+        type=click.Choice(get_args(FlatFields)),
+        default="groups",
+        show_default=True,
+        help="groups: a view's flat is interpolated between the means of groups of flats; dynamic: the mean of all, "
+        "with the components of their changes that the view shows, for a beam that moves (4 flats or more).",
+    ),
+    click.option(
+        "--ring-current",
+        type=click.Choice(["ignore", "use"]),
+        default="ignore",
+        show_default=True,
+        help="use: views and flats are divided by the current of each frame in the file (control/data of NXtomo).",
     ),
     click.option(
         "--rings",

@@ -81,6 +81,8 @@ class Terminal:
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
             self._show("frames", event.data["n"], event.data["of"], copied(event.data))
+        elif event.event == "progress" and event.data.get("stage") == "axes":
+            self._show("axes", event.data["n"], event.data["of"], copied(event.data, "axes"))
         elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study", "batch"):
             what = "scans" if event.data["stage"] == "batch" else "trials"
             self._show(what, event.data["n"], event.data["of"], trials(event.data, what))
@@ -145,9 +147,9 @@ def rates(data: Mapping[str, Any]) -> str:
     return f"{data['n']}/{data['of']}  {speed}  {_clock_time(data['eta_s'])} left"
 
 
-def copied(data: Mapping[str, Any]) -> str:
-    """n/N, frames/s and the time left, of a `progress` event of a copy or an energy scan."""
-    return f"{data['n']}/{data['of']}  {data['per_s']:.1f} frames/s  {_clock_time(data['eta_s'])} left"
+def copied(data: Mapping[str, Any], what: str = "frames") -> str:
+    """n/N, frames/s and the time left, of a `progress` event of a copy, an energy scan or trials of axes."""
+    return f"{data['n']}/{data['of']}  {data['per_s']:.1f} {what}/s  {_clock_time(data['eta_s'])} left"
 
 
 def trials(data: Mapping[str, Any], what: str = "trials") -> str:
@@ -177,7 +179,7 @@ def fit(data: Mapping[str, Any]) -> str:
 
 
 def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]:
-    """A listener that says how far the frames are, a few times a second."""
+    """A listener that says how far a stage of the work is, a few times a second."""
     began, said = clock.now(), -math.inf
 
     def listen(n: int, total: int) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum, auto
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -165,6 +168,17 @@ class ChildProcess:
                 self._silent_since = time.monotonic()
                 self._on_line(line)
         self._on_end()
+
+
+def with_our_path() -> dict[str, str]:
+    """Our environment, for a child process that imports what we import."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+def last_line(log: Path) -> str:
+    """The last line that a process wrote to a file; "" where it wrote none."""
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else ""
 
 
 def json_object(line: str) -> dict[str, Any] | None:

@@ -48,40 +48,53 @@ class ScanAborted(ScanStopped):
 
 
 class PauseRequest:
-    """A request to pause a scan, from any thread: until somebody resumes it, or until there is beam again."""
+    """A request to pause a scan, from any thread: until somebody resumes it, or until what holds it back is over."""
 
     def __init__(self) -> None:
-        self._asked = self._beam = ""
-        self._doubt, self._lock = math.inf, threading.Lock()
+        self._by_operator = ""
+        self._held_by: dict[str, str] = {}
+        self._unlit_since, self._lock = math.inf, threading.Lock()
 
     @property
     def reason(self) -> str:
         """Why the scan should wait, and what ends that; "" where it should not."""
-        return self._asked or self._beam
+        return self._by_operator or next(iter([*self._held_by.values()]), "")
+
+    @property
+    def ends_by_itself(self) -> bool:
+        """The causes are the disk alone: nobody is needed to end the pause."""
+        return not self._by_operator and self._held_by.keys() <= {"space", "backlog"}
 
     def pause(self, reason: str = "the operator asked for it") -> None:
-        self._asked = (
+        self._by_operator = (
             f"{reason.rstrip('.')}. Enter or `beamline resume` goes on, Ctrl-C or `beamline stop` ends the scan"
         )
 
     def resume(self) -> None:
-        """End the pause that was asked for; one for want of beam goes on."""
-        self._asked = ""
+        """End the pause that was asked for; one for want of beam or disk goes on."""
+        self._by_operator = ""
 
     def no_beam(self, reason: str, since: float) -> None:
         """There is none, and may have been none since that time (s since the Unix epoch)."""
         with self._lock:
-            self._doubt = min(self._doubt, since)
-        self._beam = reason
+            self._unlit_since = min(self._unlit_since, since)
+        self.hold("beam", reason)
 
     def beam_back(self) -> None:
-        self._beam = ""
+        self.release("beam")
+
+    def hold(self, by: str, reason: str) -> None:
+        """Pause until the same cause is released."""
+        self._held_by[by] = reason
+
+    def release(self, by: str) -> None:
+        self._held_by.pop(by, None)
 
     def take_unlit_since(self) -> float:
         """The time since which frames may have had no beam, asked once; inf where all had."""
         with self._lock:
-            doubt, self._doubt = self._doubt, math.inf
-        return doubt
+            since, self._unlit_since = self._unlit_since, math.inf
+        return since
 
 
 class StopRequest:
@@ -96,12 +109,12 @@ class StopRequest:
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self._stop = self._abort = self._enough = False
-        self._reason, self._now, self._asked = "", now, 0.0
+        self._reason, self._now, self._requested_at = "", now, 0.0
 
     def stop(self, reason: str = "the operator asked for it") -> None:
         """End cleanly: pending frames and missing references are still acquired, the stage returns."""
         self._reason = self._reason or reason
-        self._asked = self._asked or self._now()
+        self._requested_at = self._requested_at or self._now()
         self._stop = True
 
     def stop_as_enough(self, reason: str) -> None:
@@ -112,7 +125,7 @@ class StopRequest:
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
         self._reason = reason
-        self._asked = self._asked or self._now()
+        self._requested_at = self._requested_at or self._now()
         self._abort = True
         self._stop = True
 
@@ -129,7 +142,7 @@ class StopRequest:
     @property
     def seconds(self) -> float:
         """Real s since the first request; 0 without one."""
-        return self._now() - self._asked if self._stop else 0.0
+        return self._now() - self._requested_at if self._stop else 0.0
 
     @property
     def aborting(self) -> bool:

@@ -136,13 +136,14 @@ def _rehearse(camera: SimulatedOrcaQuest) -> None:
         raise ConfigError(f"simulation.scene cannot be exposed: {error}. Nothing was started.") from error
 
 
-def clock_of(kind: str | Speed) -> Clock:
-    """The simulation's clock: real, virtual or faster."""
-    from simulators.devices.clock import ScaledClock, VirtualClock
+def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
+    """The simulation's clock: real, virtual or faster. The last two start at `not_before` (s since the Unix epoch) or
+    later."""
+    from simulators.devices.clock import VIRTUAL_START, ScaledClock, VirtualClock
 
     if isinstance(kind, Speed):
-        return ScaledClock(SystemClock(), kind.speed)
-    return VirtualClock() if kind == "virtual" else SystemClock()
+        return ScaledClock(SystemClock(), kind.speed, not_before)
+    return VirtualClock(max(VIRTUAL_START, not_before)) if kind == "virtual" else SystemClock()
 
 
 def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:

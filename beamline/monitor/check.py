@@ -78,6 +78,7 @@ class ScanContext:
         saturation: the count from which a pixel is saturated.
         pixels: of a frame.
         period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
+        stored: views that are in an earlier file of the scan.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
         model: line integrals that a volume has at an angle in radians, float32 [row, col] means of cells of so many
@@ -97,6 +98,7 @@ class ScanContext:
     saturation: float
     pixels: int
     period: float | None = None
+    stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None
     model: Callable[[float, int], Cells] | None = None

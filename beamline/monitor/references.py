@@ -223,7 +223,7 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault
         return None
     light = np.stack([(flat.blocks - _offset(darks)) / _seconds(flat) for flat in flats])
     mean = light.mean(axis=0)
-    lit = mean > UNLIT * np.nanpercentile(mean, BRIGHT)
+    lit = mean > max(0.0, UNLIT * float(np.nanpercentile(mean, BRIGHT)))
     if not lit.any():
         return None
     ratio = light[:, lit] / mean[lit]

@@ -45,9 +45,10 @@ class Timing:
             return Look(state)
         after = TimingState(frame.trigger, frame.framestamp, frame.time)
         steps = frame.trigger - state.trigger
-        if steps > 1:
-            advice = f"{steps - 1} trigger{'s' if steps > 2 else ''} before this one exposed no frame, or it was lost."
-            return Look(after, Flag(self.name, Level.INFO, frame.index, steps - 1, 0, advice))
+        lost = steps - 1 - sum(view in context.stored for view in range(state.trigger + 1, frame.trigger))
+        if lost > 0:
+            advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
+            return Look(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or 0 <= frame.framestamp <= state.framestamp:
             return Look(after)  # armed anew, for another pass or after a pause
         score = (frame.time - state.time) / context.period - steps

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,7 @@ class ScanPlan:
         darks, flats: reference frames.
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
         retake_share: of the views, how many with an alarm of the monitor are taken again at most; 0: none.
+        stored: views that need not be taken: earlier files of the same scan have them.
     """
 
     angles: NDArray[np.float64]
@@ -58,6 +60,7 @@ class ScanPlan:
     flats: FieldPlan
     scheme: str
     retake_share: float = 0.0
+    stored: frozenset[int] = frozenset()
 
     @property
     def retakes(self) -> int:
@@ -72,28 +75,35 @@ class Block:
     Attributes:
         kind: what the frames show.
         mode: how they are triggered.
-        first_row: file row of the block's first frame.
+        first_trigger: of the block's first frame, within the whole plan.
         angles: float64 [frame] radians at whole counts, the angles that each row will carry (NaN in darks and flats
             until acquisition fills in where the stage stands).
         exposure, period: s.
         trains: for FLY, one pulse train a pass (interlaced plans need several); their n add up to the block's.
         speed: rad/s during the pulses (FLY).
         taxi: radians of run-up before the first and after the last pulse (FLY).
+        stored: frames of the block, counted within it, that are not taken.
     """
 
     kind: FrameKind
     mode: Mode
-    first_row: int
+    first_trigger: int
     angles: NDArray[np.float64]
     exposure: float
     period: float
     trains: tuple[TriggerTrain, ...] = ()
     speed: float = 0.0
     taxi: float = 0.0
+    stored: frozenset[int] = frozenset()
 
     @property
     def n(self) -> int:
         return int(self.angles.size)
+
+    @property
+    def left(self) -> int:
+        """Frames to take."""
+        return self.n - len(self.stored)
 
 
 @dataclass(frozen=True)
@@ -128,7 +138,12 @@ class Timeline:
 
     @property
     def n_frames(self) -> int:
-        return sum(block.n for block in self.blocks)
+        return sum(block.left for block in self.blocks)
+
+    @property
+    def first_rows(self) -> list[int]:
+        """File row of the first frame of each block."""
+        return [0, *accumulate(block.left for block in self.blocks[:-1])]
 
     @property
     def views(self) -> Block:

@@ -45,4 +45,4 @@ def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:
     """The block that takes these views again, in their order: each stands for the exposure of the view."""
     angles = views.angles[triggers] + middle_of_exposure(views)[triggers]
     period = views.exposure if views.trains else views.period
-    return Block(FrameKind.PROJECTION, Mode.STEP, views.first_row + views.n, angles, views.exposure, period)
+    return Block(FrameKind.PROJECTION, Mode.STEP, views.first_trigger + views.n, angles, views.exposure, period)

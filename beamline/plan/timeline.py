@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +17,7 @@ from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.retake import Retake, retake_block, spread
 from beamline.plan.triggers import Flight, Scale, plan_flight
 from drivers.frame import FrameKind
-from drivers.protocols import CameraTiming, StageLimits
+from drivers.protocols import CameraTiming, StageLimits, TriggerTrain
 
 BYTES_PER_PIXEL, BYTES_PER_BLOCK = 2, 4  # uint16 frames, float32 previews
 
@@ -70,7 +72,7 @@ def work_out(
         reach=_reach(views),
         blur_px=speed * plan.exposure,
         skew_px=speed * camera.row_period * (camera.shape[0] - 1),
-        total_bytes=row_bytes * sum(block.n for block in blocks),
+        total_bytes=row_bytes * sum(block.left for block in blocks),
         retake_bytes=row_bytes * plan.retakes,
         retake_seconds=retake_seconds,
         free_bytes=free_bytes,
@@ -107,15 +109,40 @@ def move_seconds(distance: float, speed: float, acceleration: float) -> float:
     return distance / speed + speed / acceleration
 
 
-def pass_ends(block: Block) -> list[tuple[float, float]]:
-    """Where each pass of a fly block starts and stops: its first and last angle, `taxi` further out. Radians."""
-    ends, at = [], 0
-    for train in block.trains:
-        first, last = float(block.angles[at]), float(block.angles[at + train.n - 1])
-        out = math.copysign(block.taxi, last - first)
-        ends.append((first - out, last + out))
-        at += train.n
-    return ends
+@dataclass(frozen=True)
+class Pass:
+    """A pass of a fly block: its first trigger within the block, its pulses, and where the stage starts and stops."""
+
+    first: int
+    train: TriggerTrain
+    start: float
+    end: float
+
+
+def passes(block: Block) -> list[Pass]:
+    """The passes of a fly block: each train, in several pieces where frames in it are stored.
+
+    The stage starts and stops `taxi` beyond the first and the last angle.
+    """
+    return [flown for first, train in _firsts(block.trains) for flown in _pieces(block, first, train)]
+
+
+def _firsts(trains: Iterable[TriggerTrain]) -> Iterator[tuple[int, TriggerTrain]]:
+    first = 0
+    for train in trains:
+        yield first, train
+        first += train.n
+
+
+def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[Pass]:
+    end = first + train.n
+    out = math.copysign(block.taxi, float(block.angles[end - 1] - block.angles[first]))
+    stored = sorted(i for i in block.stored if first <= i < end)
+    for before, after in pairwise((first - 1, *stored, end)):
+        if (n := after - before - 1) > 0:
+            pulses = TriggerTrain(train.start + (before + 1 - first) * train.interval, train.interval, n)
+            angles = block.angles[before + 1 : after]
+            yield Pass(before + 1, pulses, float(angles[0]) - out, float(angles[-1]) + out)
 
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float) -> float:
@@ -125,12 +152,12 @@ def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle
         return (block.n - 1) * block.period + tail
     seconds, at = 0.0, 0.0
     if block.mode is Mode.FLY:
-        for start, stop in pass_ends(block):
-            seconds += move_seconds(start - at, stage.max_speed, stage.acceleration)
-            seconds += move_seconds(stop - start, block.speed, stage.acceleration)
-            at = stop
+        for flown in passes(block):
+            seconds += move_seconds(flown.start - at, stage.max_speed, stage.acceleration)
+            seconds += move_seconds(flown.end - flown.start, block.speed, stage.acceleration)
+            at = flown.end
         return seconds + tail
-    for i, angle in enumerate(block.angles.tolist()):
+    for i, angle in enumerate(np.delete(block.angles, list(block.stored)).tolist()):
         ready = move_seconds(angle - at, stage.max_speed, stage.acceleration) + settle
         seconds += max(block.period, camera.min_period, tail + ready) if i else ready
         at = angle
@@ -165,14 +192,14 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     counts = flight.counts() if flight else np.rint((plan.angles - scale.origin) / scale.per_count).astype(np.int64)
     angles = scale.angles(counts)
     if flight is None:
-        return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period)
+        return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period, stored=plan.stored)
     # A pulse generator's speed is a whole number of counts a second, so the period becomes one that this gives.
     rate = max(1, round(flight.interval / plan.period))
     speed, period = rate * abs(scale.per_count), flight.interval / rate
     step, before = (n * abs(scale.per_count) for n in (flight.step, stage.run_up * flight.interval + flight.step))
     taxi = max(taxi_angle(speed, stage.acceleration, step), before)
     return Block(
-        FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, period, flight.trains, speed=speed, taxi=taxi
+        FrameKind.PROJECTION, Mode.FLY, row, angles, plan.exposure, period, flight.trains, speed, taxi, plan.stored
     )
 
 
@@ -183,7 +210,7 @@ def _half_width(camera: CameraTiming, axis_col: float | None) -> float:
 
 def _reach(views: Block) -> tuple[float, float]:
     """The smallest and the largest angle that the stage would be sent to."""
-    ends = np.array(pass_ends(views)).ravel() if views.trains else views.angles
+    ends = np.array([(flown.start, flown.end) for flown in passes(views)]) if views.trains else views.angles
     return float(ends.min()), float(ends.max())
 
 
@@ -197,7 +224,7 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
 
 
 def _return(views: Block, stage: StageLimits) -> float:
-    last = pass_ends(views)[-1][1] if views.trains else float(views.angles[-1])
+    last = passes(views)[-1].end if views.trains else float(views.angles[-1])
     return move_seconds(last, stage.max_speed, stage.acceleration)
 
 
@@ -213,16 +240,16 @@ def describe(
     lines = [
         f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
     ]
-    for block in timeline.blocks:
-        last = block.first_row + block.n - 1
+    for block, row in zip(timeline.blocks, timeline.first_rows, strict=True):
         seconds = block_seconds(block, stage, camera, plan.settle)
         lines.append(
-            f"{block.first_row:>6}-{last:<6}  {block.kind.name.lower():<10}  {block.n:>6}  {block.mode:<6}  "
+            f"{row:>6}-{row + block.left - 1:<6}  {block.kind.name.lower():<10}  {block.left:>6}  {block.mode:<6}  "
             f"{block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  {_angles(block.angles)}"
         )
     views = timeline.views
     rows, cols = camera.shape
-    facts = [("views", f"{views.n}, {plan.scheme} angles, {plan.mode} scan")]
+    stored = f" ({len(views.stored)} of them stored)" if views.stored else ""
+    facts = [("views", f"{views.n}{stored}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:
         passes = f" in each of {len(views.trains)} passes" if len(views.trains) > 1 else ""
         facts += [

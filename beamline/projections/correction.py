@@ -11,9 +11,16 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.text import spans
+from beamline.core.text import count, spans
 from beamline.projections.phase import filter_of
-from beamline.projections.read import open_beam, photons_of, read_binned, read_references
+from beamline.projections.read import (
+    current_scale,
+    open_beam,
+    photons_of,
+    read_binned,
+    read_references,
+    with_dynamic_flats,
+)
 from beamline.projections.selection import Selection, rows_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
@@ -50,6 +57,7 @@ class ScanCorrection:
                 )
             selection = replace(selection, noise="log")
         self._source, self._selection, self._warn = source, selection, warn
+        self._current_factor = current_scale(source) if selection.use_current else None  # [frame], by the ring current
         wide, _ = self._widened(None)
         self._n_references = _count_references(source)
         self._references: References | None = None
@@ -59,8 +67,11 @@ class ScanCorrection:
         if source.quantity == "counts":
             groups = reference_groups(source)
             used = groups if selection.accept_references else groups.good()
-            self._references = read_references(source, used, wide, self.binning, not selection.use_flags)
+            self._references = read_references(source, used, wide, selection)
+            if selection.flat_fields == "dynamic":
+                self._references = with_dynamic_flats(source, used, self._references, wide, selection)
             self._tell_damaged(np.concatenate([*used.darks, *used.flats]))
+            self._tell_parts_without_flats(self._references)
             self.photons = photons_of(source, used, self._references, self.rows, selection)
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
@@ -161,6 +172,24 @@ class ScanCorrection:
         return None if part is None else self._retrieved(part, None)
 
     @property
+    def flats(self) -> str:
+        """What was done about changes of the beam, in words; empty where nothing was asked."""
+        said = []
+        if self._current_factor is not None:
+            currents = 1 / self._current_factor[self._source.image_key == FrameKind.PROJECTION]
+            said.append(
+                f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
+            )
+        if self._references is not None and self._references.dynamic is not None:
+            parts = len(self._references.dynamic.parts)
+            said.append(
+                f"Flats: {count(parts, 'component')} of their changes, weighed for each view (dynamic)."
+                if parts
+                else "Flats: they do not differ by more than noise; their mean is used."
+            )
+        return " ".join(said)
+
+    @property
     def noise(self) -> str:
         """How counts become line integrals, in words; empty where they are logarithms."""
         if self.photons is None or self._references is None:
@@ -205,6 +234,18 @@ class ScanCorrection:
             )
         return damaged
 
+    def _tell_parts_without_flats(self, references: References) -> None:
+        """A warning for each part of the scan whose views are corrected by the flats of another part."""
+        starts = self._source.part_starts
+        flats = [position for position, _ in references.flats]
+        for start, end in zip(starts, [*starts[1:], self._source.image_key.size], strict=True):
+            has_views = (self._source.image_key[start:end] == FrameKind.PROJECTION).any()
+            if has_views and not any(start <= position < end for position in flats):
+                self._warn(
+                    f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used: their "
+                    "views are corrected by the nearest flats of another part, though the beam may have changed."
+                )
+
     def _no_view(self) -> DataError:
         return DataError(
             f"{self._source.path}: none of the views chosen can be used: their pixels are not finite, or not those "
@@ -216,7 +257,7 @@ class ScanCorrection:
         first = self._widened(None)[0].start
         part = self._widened(rows)[0]
         within = slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
-        references = _narrowed(self._references, within)
+        references = self._references.rows(within)
         try:
             return Correction(references, self._selection.correction, photons=self.photons)
         except ValueError as error:
@@ -253,7 +294,7 @@ class ScanCorrection:
         try:
             views = None
             if frames.size:
-                views = correction.transmission(data, frames.astype(np.float64), frames)
+                views = self._transmission(correction, data, frames)
                 correction.survey(views)
             return self._retrieved(correction.line_integrals(views, last), rows)
         except UnlitViewsError as error:
@@ -266,9 +307,15 @@ class ScanCorrection:
 
     def _transmission(self, correction: Correction, data: NDArray[Any], frames: NDArray[np.int64]) -> Transmission:
         try:
-            return correction.transmission(data, frames.astype(np.float64), frames)
+            views = correction.transmission(data, frames.astype(np.float64), frames)
         except ValueError as error:
             raise self._refusal(error) from error
+        if self._current_factor is not None:
+            light = self._current_factor[frames].astype(np.float32)[:, None, None]
+            np.multiply(views.data, light, out=views.data)
+            if views.beam is not None:
+                np.divide(views.beam, light, out=views.beam)
+        return views
 
     def _refusal(self, error: ValueError) -> DataError:
         return DataError(f"{self._source.path} cannot be corrected: {error}")
@@ -276,10 +323,6 @@ class ScanCorrection:
 
 def _count_references(source: ScanSource) -> int:
     return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
-
-
-def _narrowed(references: References, rows: slice) -> References:
-    return References(references.dark[rows], tuple((position, flat[rows]) for position, flat in references.flats))
 
 
 def _joined(parts: list[Projections], data: NDArray[np.float32]) -> Projections:

@@ -1,4 +1,4 @@
-"""The worst of the flagged frames of a scan, as a report shows them, and the reason of every flag in words."""
+"""Flagged frames, darks and flats of a scan, as a report shows them, and the reason of every flag in words."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from beamline.monitor.check import Level
 from beamline.report.contact_sheet import FlaggedFrame
 from beamline.storage.flag_legend import FlagBit, FrameFlags
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import groups_of
 from drivers.frame import FrameKind
 from recon.base.binning import bin_views
 
@@ -47,6 +48,27 @@ def worst_frames(source: ScanSource, flags: FrameFlags, most: int = MOST) -> lis
     for turn in zip_longest(*(rows for rows in ranked if rows)):
         chosen += [row for row in turn if row is not None and row not in chosen]
     return [_frame(source, flags, row) for row in sorted(chosen[:most])]
+
+
+def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
+    """Means of darks, of the first and the last group of flats, and the ratio of these two, by title; binned.
+
+    At most four frames of a group are read. Empty for a scan without counts.
+    """
+    if source.quantity != "counts":
+        return {}
+    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
+    wanted = {"dark": darks[:1], "flats": flats[:1], "last flats": flats[1:][-1:]}
+    found = {}
+    for title, groups in wanted.items():
+        for group in groups:
+            mean = np.mean([_small(source.read([row])[0]) for row in group[:4]], axis=0, dtype=np.float32)
+            found[f"{title} (counts)"] = np.asarray(mean, np.float32)
+    if len(found) == len(wanted):
+        dark, first, last = found.values()
+        lit = first - dark > 0.1 * np.median(first - dark)
+        found["last flats / first"] = np.where(lit, (last - dark) / np.where(lit, first - dark, 1), np.nan)
+    return found
 
 
 def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list[int]:

@@ -26,17 +26,17 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
     """The curve of a scan's line integrals [view, row, col], and a sentence about it; None where none is to be used."""
     highest = max(float(view.max()) for view in views)
     if wanted.spectrum is not None:
-        curve, how = curve_of_spectrum(*wanted.spectrum, highest), f"of {wanted.said}"
+        curve, how = curve_of_spectrum(*wanted.spectrum, highest), f"of {wanted.description}"
     else:
         try:
             curve, explained = fitted(views, geometry)
         except NoCurveError as error:
             return None, f"Hardening: not determined by the views ({error}); none corrected."
         how = f"fitted on the views, of which one material explains {explained:.1%}"
-    meant = float(np.interp(highest, curve.seen, curve.meant))
-    if meant < (1 + _LEAST_SEEN) * highest:
+    corrected = float(np.interp(highest, curve.measured, curve.corrected))
+    if corrected < (1 + _LEAST_SEEN) * highest:
         return None, f"Hardening: none seen ({how}); none corrected."
-    return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {meant:.3g}."
+    return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
 
 
 def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
@@ -57,21 +57,21 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     n, rows, cols = views.shape
     factor = max(1, min(round(cols / _COLS), rows))
     some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
-    seen = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
+    measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
     small = geometry.select(some).binned(factor)
-    grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), seen, math.inf
+    grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
     for _ in range(_ROUNDS):
         volume = reconstruct(now, small, "fbp", grid=grid).volume.data
         air, matter = k_means(volume, 2)
         paths = project(Volume((volume > (air + matter) / 2).astype(np.float32), grid), small)
         clear = (paths == 0) | (paths > _RIM * grid.voxel_size)
-        curve, explained = curve_of_paths(seen[clear], paths[clear], highest)
-        meant = float(np.interp(highest, curve.seen, curve.meant))
-        settled = abs(meant - before) < _SETTLED * meant
-        before, now = meant, seen.copy()
+        curve, explained = curve_of_paths(measured[clear], paths[clear], highest)
+        corrected = float(np.interp(highest, curve.measured, curve.corrected))
+        settled = abs(corrected - before) < _SETTLED * corrected
+        before, now = corrected, measured.copy()
         curve.linearise(now)
         if settled:
-            uneven, after = _unevenness(seen), _unevenness(now)
+            uneven, after = _unevenness(measured), _unevenness(now)
             if after > uneven + _AS_EVEN:
                 raise NoCurveError(
                     f"corrected views agree less with each other: their mass varies by {after:.2%} instead of "

@@ -70,6 +70,7 @@ class PreparedProjections:
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
         rings: what was done about rings; empty where nothing was asked.
+        flats: what was done about changes of the beam; empty where nothing was asked.
         phase: what was done about phase; empty where nothing was asked.
         hardening: what was done about beam hardening; empty where nothing was asked.
         shares_of: `shares` of some rows [view, row, col], where line integrals lie on disk and these are made when
@@ -92,6 +93,7 @@ class PreparedProjections:
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
     rings: str = ""
+    flats: str = ""
     phase: str = ""
     hardening: str = ""
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
@@ -191,7 +193,9 @@ def prepare_projections(
         if cone_of(source, selection) is not None:
             axis_col = stated_axis(source)
         else:
-            axis_col, axis = _axis_beside_jumps(source, correction, usable, warn)
+            whole = selection.axis_rows
+            by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
+            axis_col, axis = _axis_beside_jumps(source, by, usable, warn)
     check_axis(source, axis_col)
     jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col)
     if jumps.said:
@@ -225,6 +229,7 @@ def prepare_projections(
         geometry=jumps.corrected(found.geometry, projections.view_ids),
         jumps=jumps.said,
         noise=correction.noise,
+        flats=correction.flats,
         phase=correction.phase,
         rings=rings,
         shares_of=shares_of,

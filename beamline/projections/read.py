@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,8 @@ from drivers.frame import FrameKind
 from recon.base.choices import FEW_PHOTONS
 from recon.prep.correct import References
 from recon.prep.counts import Photons, photon_transfer
+from recon.prep.defects import dead_pixels
+from recon.prep.dynamic_flats import find_dynamic_flats
 
 _BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 
@@ -53,20 +57,19 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def read_references(
-    source: ScanSource, groups: ReferenceGroups, rows: slice, binning: int, use_damaged: bool = False
-) -> References:
+def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> References:
     """Mean dark, and the mean of each group of flats with its place in the scan; both kinds must be there.
 
-    Frames that are damaged (see ScanSource) are left out, unless `use_damaged`. The light of flats with an exposure of
-    their own is scaled to the projections': dark + (flat - dark) * t / t_flat, where both are known. The dark is one
-    for all: the file's rules tell where it was exposed otherwise.
+    Frames that are damaged (see ScanSource) are left out, unless the selection uses all. The light of flats with an
+    exposure of their own is scaled to the projections': dark + (flat - dark) * t / t_flat, where both are known. The
+    dark is one for all: the file's rules tell where it was exposed otherwise.
 
     Raises:
         DataError: all frames of a kind are damaged.
     """
+    binning, use_damaged = selection.binning, not selection.use_flags
     dark = _mean(source, np.concatenate(groups.darks), rows, binning, None, use_damaged)
-    scale = light_scale(source.image_key, source.exposures)
+    scale = light_scale(source, selection.use_current)
     flats = []
     for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group], use_damaged)
@@ -78,20 +81,66 @@ def read_references(
             f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: their pixels are not those that "
             "were written, by their checksums. Use a good copy, or --flags ignore, which takes them as they are."
         )
-    return References(dark.astype(np.float32), tuple(flats))
+    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.part_starts.tolist()))
 
 
-def light_scale(image_key: NDArray[np.int32], exposures: NDArray[np.float64]) -> NDArray[np.float64]:
+def with_dynamic_flats(
+    source: ScanSource, groups: ReferenceGroups, references: References, rows: slice, selection: Selection
+) -> References:
+    """The same references with the components of all flats of these groups, which are read three times.
+
+    Raises:
+        ConfigError: there are too few flats.
+    """
+    frames = np.concatenate(groups.flats)
+    if selection.use_flags:
+        frames = np.setdiff1d(frames, list(source.damaged))
+    scale = light_scale(source, selection.use_current)
+
+    def flats() -> Iterator[NDArray[np.float32]]:
+        for frame in frames:
+            image = read_binned(source, np.array([frame]), rows, selection.binning)[0]
+            yield ((image - references.dark) * np.float32(scale[frame])).astype(np.float32)
+
+    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], selection.correction.hot_threshold)
+    try:
+        found = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
+    except ValueError as error:
+        raise ConfigError(f"--flat-fields dynamic: {source.path}: {error}. Leave it out.") from error
+    return replace(references, dynamic=found)
+
+
+def light_scale(source: ScanSource, use_current: bool = False) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
 
-    Args:
-        exposures: [frame] s, NaN where unknown. Of projections that differ the median counts.
+    Of projections that differ the median counts. With `use_current` also from its own ring current.
     """
-    views = exposures[image_key == FrameKind.PROJECTION]
+    scale = _to_median(source.exposures, source.image_key)
+    currents = source.currents if use_current else None
+    return scale if currents is None else scale * _to_median(currents, source.image_key)
+
+
+def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDArray[np.float64]:
+    """The median of the projections over each frame's own; 1 where one is unknown."""
+    views = values[image_key == FrameKind.PROJECTION]
     views = views[np.isfinite(views)]
     if views.size == 0:
-        return np.ones(exposures.size)
-    return np.where(np.isfinite(exposures), np.median(views) / exposures, 1.0)
+        return np.ones(values.size)
+    return np.where(np.isfinite(values), np.median(views) / values, 1.0)
+
+
+def current_scale(source: ScanSource) -> NDArray[np.float64]:
+    """By how much the light of each frame grows from its own ring current to the median of the projections'.
+
+    Raises:
+        ConfigError: the file has none for some view or flat.
+    """
+    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
+    currents = source.currents
+    if currents is None or not np.isfinite(currents[used]).all():
+        lacking = "no ring current" if currents is None else "no ring current for some views or flats"
+        raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
+    return _to_median(currents, source.image_key)
 
 
 def _mean(

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.storage.readers.base import ScanSource
+from recon.base.choices import FlatFields, Rings
 from recon.base.choices import Noise as Noise
-from recon.base.choices import Rings
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
@@ -44,12 +44,12 @@ class Hardening:
     """How beam hardening is corrected.
 
     Attributes:
-        said: the material and the beam as the user said them, for the record.
+        description: the material and the beam as the user said them, for the record.
         spectrum: the material's attenuation, in any unit, at the energies of the beam, and their shares of the detected
             light; None: the curve is fitted on the views.
     """
 
-    said: str
+    description: str
     spectrum: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
 
 
@@ -71,10 +71,14 @@ class Selection:
         accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
         noise: "log": line integrals are logarithms of counts; "counts": they and weights carry the likelihood of the
             counts; "auto": that where the open beam has few photons a pixel.
+        flat_fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components
+            of their changes that the view shows, see `recon.prep.dynamic_flats`.
+        use_current: views and flats are divided by the ring current that the file has for each frame.
         rings: how stripes are removed from line integrals, see `recon.prep.rings.remove_rings`.
         gain: counts a photon, of single pixels; None finds it by the flats.
         phase: None: it is not retrieved.
         hardening: None: it is not corrected.
+        axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
     """
 
     views: str = "all"
@@ -90,9 +94,12 @@ class Selection:
     accept_references: bool = False
     noise: Noise = "auto"
     rings: Rings = "none"
+    flat_fields: FlatFields = "groups"
+    use_current: bool = False
     gain: float | None = None
     phase: Phase | None = None
     hardening: Hardening | None = None
+    axis_rows: tuple[int, int] | None = None
 
 
 def choose_views(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -41,11 +42,16 @@ class AxisRange:
         return self.first + self.step * np.arange(np.floor((self.last - self.first) / self.step + 1e-9) + 1)
 
 
-def try_axes(options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock) -> None:
+def try_axes(
+    options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock, listen: Callable[[int, int], None]
+) -> None:
     """Reconstruct the middle row chosen by FBP with each axis and write the sheet; the event `done` says the scores.
 
     The score is the share of a slice below 0 within the circle that all views see: a wrong axis takes away beside
     edges what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
+
+    Args:
+        listen: is told the number of axes done, and of all.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -73,6 +79,7 @@ def try_axes(options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, c
             part = image[inside]
             score = -float(np.minimum(part, 0).sum()) / max(float(np.abs(part).sum()), 1e-30)
             trials.append(AxisTrial(col, score, image if i in kept else None))
+            listen(i + 1, columns.size)
     picture = axis_sheet(trials, f"{source.path.name}, row {first}")
     with whole_file(path) as partial, named_on_failure(path):
         partial.write_bytes(picture)

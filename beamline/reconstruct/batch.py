@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import csv
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Event, Sink
 from beamline.core.files import named_on_failure, remove, whole_file
-from beamline.core.process import ChildProcess, json_object
+from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.storage.writer_lock import WriterLock, held
 from drivers.clock import Clock
 
-State = Literal["waiting", "done", "poor", "failed"]
+RowState = Literal["waiting", "done", "poor", "failed"]
 
 TABLE, RECIPE, VOLUME = "batch.csv", "recipe.yaml", "recon.h5"
-_WITH_VOLUME: Mapping[int | None, State] = {0: "done", QualityError.exit_code: "poor"}
+_WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
+COMMAND = (sys.executable, "-m", "beamline.cli.main", "recon")
+"""What reconstructs the scan that is named next."""
 _OURS = ("done", "failed")  # events of a scan that become its row
 
 
@@ -41,7 +42,7 @@ class Row:
 
     name: str
     scan: str
-    state: State = "waiting"
+    state: RowState = "waiting"
     seconds: float | None = None
     method: str = ""
     residual: float | None = None
@@ -60,13 +61,11 @@ class BatchOptions:
         scans: files or folders, each once.
         recipe: file with the options of `beamline recon`; None: its defaults.
         folder: of the results, new or of an earlier call with the same recipe.
-        command: arguments that reconstruct a scan, before its name.
     """
 
     scans: Sequence[Path]
     recipe: Path | None
     folder: Path
-    command: Sequence[str] = field(default=(sys.executable, "-m", "beamline.cli.main", "recon"))
 
 
 def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
@@ -97,9 +96,9 @@ def _run_all(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
     folder = options.folder
     rows = _rows(options.scans, _read(folder))
     _write(folder, rows)
-    begun, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
+    start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
     for tried, n in enumerate(waiting):
-        spent = clock.now() - begun
+        spent = clock.now() - start
         progress = {"stage": "batch", "n": tried, "of": len(waiting), "label": rows[n].scan}
         left = spent / tried * (len(waiting) - tried) if tried else None
         sink(Event("progress", clock.now(), {**progress, "eta_s": left, "per_min": 60 * tried / max(spent, 1e-9)}))
@@ -194,17 +193,16 @@ def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
 
 def _command(options: BatchOptions, scan: str, work: Path) -> list[str]:
     recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
-    return [*options.command, scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
+    return [*COMMAND, scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
 
 
 def _run(command: Sequence[str], log: Path, on_line: Callable[[str], None]) -> tuple[int | None, str]:
     """The exit code of a command, and the last line of its stderr."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    with log.open("w", encoding="utf-8") as stderr, ChildProcess(command, stderr, on_line, environment) as process:
+    with log.open("w", encoding="utf-8") as stderr, ChildProcess(command, stderr, on_line, with_our_path()) as process:
         process.wait()
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    last = last_line(log)
     log.unlink()
-    return process.code, lines[-1] if lines else ""
+    return process.code, last
 
 
 def _read(folder: Path) -> list[Row]:
@@ -222,16 +220,12 @@ def _read(folder: Path) -> list[Row]:
 
 
 def _row(record: Mapping[str, str]) -> Row:
-    states: Mapping[str, State] = {state: state for state in get_args(State)}
+    results: Mapping[str, RowState] = {result: result for result in get_args(RowState)}
     numbers = {name: float(record[name]) if record[name] else None for name in ("seconds", "residual")}
     return Row(
-        record["name"],
-        record["scan"],
-        states[record["state"]],
-        method=record["method"],
-        message=record["message"],
+        record["name"], record["scan"], results[record["state"]], method=record["method"], message=record["message"],
         **numbers,
-    )
+    )  # fmt: skip
 
 
 def _write(folder: Path, rows: Sequence[Row]) -> None:

@@ -16,7 +16,7 @@ from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
 from recon.assess.plans import Choice, Speeds, best_steps, plans
 from recon.assess.time_model import duration_text
-from recon.auto import ROWS, part_of, predicts_best
+from recon.auto import ROWS, is_wider, part_of, predicts_best
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
@@ -29,7 +29,7 @@ from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
 from recon.splatting.splat import voxelize
 from recon.voxels.direct import has_direct_method
-from recon.voxels.held_out_weight import choice_sweeps
+from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choice_cost
 from recon.voxels.ordered_fista import subsets_of
 
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
@@ -100,7 +100,7 @@ class _Budget:
     now: Callable[[], float]
     methods: Mapping[str, Method]
     speeds: Speeds
-    largest: int
+    largest_binning: int
 
     @property
     def left(self) -> float:
@@ -117,7 +117,7 @@ class _Budget:
                 return [min(full, key=lambda choice: choice.seconds)]
         # What the measuring has used up leaves no time; the cheapest choice is the one for the shortest.
         left = max(share * self.left, sys.float_info.min)
-        return plans(left, self.speeds, self.largest, self.methods if name is None else [name])
+        return plans(left, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
     def preferred(self, found: Sequence[Choice]) -> Choice:
         """The first of the methods that is level with the one of which most is expected."""
@@ -137,6 +137,7 @@ def within(
     seed: int,
     control: RunControl,
     warn: Warn,
+    largest: int | None = None,
 ) -> Budgeted:
     """Reconstruct within `budget` seconds by the clock of `control`, the measuring included.
 
@@ -148,6 +149,8 @@ def within(
 
     Args:
         methods: to choose from, with measured curves, by preference; the choice sets their steps and Gaussians.
+            Iterations on voxels are none where the sample is wider than the field.
+        largest: binning; None: any.
 
     Raises:
         ValueError: the views cannot be reconstructed.
@@ -158,7 +161,10 @@ def within(
     unbinned = default_count(Grid.of_field(geometry, geometry.sample_pitch))  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}
-    plan = _Budget(budget, begin, now, taking, speeds, min(geometry.detector_shape))
+    modelled = {name: method for name, method in taking.items() if method.traits.any_grid or method.traits.direct}
+    if any(method.traits.any_grid for method in modelled.values()) and is_wider(_problem_of(prepared, seed)):
+        taking = modelled
+    plan = _Budget(budget, begin, now, taking, speeds, largest or min(geometry.detector_shape))
     spent = budget - plan.left
     found = plan.choices()
     choice, because = found[0], ""
@@ -177,7 +183,7 @@ def within(
     if over and math.isfinite(choice.gain):
         end = now() + choice.seconds
     if isinstance(method, R2):
-        result = _fitted(method, prepared, seed, end, control)
+        result = _fitted(method, prepared, seed, end, speeds.step, control)
     else:
         result = _run(method, prepared, seed, end, control)
     return Budgeted(result, prepared, choice, speeds, because, now() - begin)
@@ -187,12 +193,10 @@ def _chosen(
     plan: _Budget, found: Sequence[Choice], prepared: PreparedProjections, seed: int, control: RunControl
 ) -> tuple[Choice, str]:
     """The method that predicts views of some rows best, with the settings that the rest of the time suffices for."""
-    geometry = prepared.geometry
     listed = ", ".join(f"{c.method} {c.gain:.1f}" for c in found)
     expected = f"expected by other scans, dB above FBP: {listed}; nothing was tried: "
     by_curves = plan.preferred(found)
-    use = DataUse(prepared.ray_weights())
-    problem = ReconProblem(prepared.projections.data, geometry, Grid.matching(geometry), use, seed, "cpu")
+    problem = _problem_of(prepared, seed)
     # Those that take no time first, then the most promising ones, since the time may end before the last.
     tried = sorted((c for c in plan.choices(1 - _TRIAL) if c.binning == 1), key=lambda c: bool(c.counted))
     if len(tried) < 2:
@@ -217,6 +221,11 @@ def _chosen(
     return plan.choices(name=liked[at].method)[0], f"residual of views held out, {where}: {residuals}"
 
 
+def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
+    geometry, use = prepared.geometry, DataUse(prepared.ray_weights())
+    return ReconProblem(prepared.projections.data, geometry, Grid.matching(geometry), use, seed, "cpu")
+
+
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
     """The volume of a method on voxels by `end`."""
     use, control = DataUse(prepared.ray_weights()), replace(control, should_stop=_until(control, end))
@@ -224,8 +233,10 @@ def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, c
     return recon.reconstruct(data, geometry, method, seed=seed, use=use, control=control)
 
 
-def _fitted(method: R2, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
-    """A fit from as many Gaussians as the method says, which ends, finished and filled, by `end`."""
+def _fitted(
+    method: R2, prepared: PreparedProjections, seed: int, end: float, step: float, control: RunControl
+) -> Reconstruction:
+    """A fit from as many Gaussians as the method says, which ends, finished and filled, by `end`; `step`: s of one."""
     data, geometry, now = prepared.projections.data, prepared.geometry, control.now
     grid, field = Grid.matching(geometry), Grid.of_field(geometry, geometry.sample_pitch)
     assert isinstance(method.gaussians, int)
@@ -234,11 +245,12 @@ def _fitted(method: R2, prepared: PreparedProjections, seed: int, end: float, co
     slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
     voxelize(placed, slab)
     end -= (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
-    sweeps, finishing = finish_within(_FINISH_SHARE * (end - now()), geometry, grid, now)
+    left, best = end - now(), best_steps(method.name)
+    sweeps, finishing = finish_within(_FINISH_SHARE * left, left - best * step, geometry, grid, now)
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     fit = replace(
         method,
-        steps=best_steps(method.name),
+        steps=best,
         seconds=max(0.0, end - now() - finishing),
         gaussians=placed,
         finish=sweeps,
@@ -253,10 +265,13 @@ def _until(control: RunControl, end: float) -> Callable[[], bool]:
     return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
 
 
-def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Callable[[], float]) -> tuple[int, float]:
+def finish_within(
+    seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Callable[[], float]
+) -> tuple[int | None, float]:
     """Sweeps of a fit's finish that `seconds` suffice for, at most `SWEEPS`, and the seconds that they will take.
 
-    Fewer than two sweeps are none: what goes before them takes as long.
+    None: as many as views held out prefer, where the seconds `beside_steps` suffice for the most, and for the trials of
+    them. Fewer than two sweeps are none: what goes before them takes as long.
     """
     if seconds <= 0:
         return 0, 0.0
@@ -265,6 +280,9 @@ def finish_within(seconds: float, geometry: Geometry, grid: Grid, now: Callable[
         sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
     eigenvalue = _EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS)
     before = (eigenvalue + _FIRST_SWEEPS + choice_sweeps(geometry)) * sweep
+    asking = sweeps_choice_cost(geometry)
+    if asking and (most := before + (asking + MOST_SWEEPS) * sweep) <= min(seconds, beside_steps):
+        return None, most
     if not before + 2 * sweep <= seconds:
         return 0, 0.0
     sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,17 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
-from recon.splatting.settings import FitSettings
 
 _SHOWN = 40  # characters of a value that is told
 _BEFORE_KERNELS = {"setting kernel": Kernel.GAUSSIAN.value}  # of checkpoints that do not say
 
 
-def fit_origin(prepared: PreparedProjections, settings: FitSettings, others: Mapping[str, Value]) -> dict[str, Value]:
-    """Everything that decides what a step does: data (by a checksum), geometry and settings.
+def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
+    """Everything that decides what a step or a slab is: data (by a checksum), geometry and settings.
 
     Args:
         prepared: line integrals and geometry; those of views held out judge and decide nothing.
-        settings: of the fit.
+        settings: of the fit, or a method: a dataclass.
         others: seed, start and the like, by name.
     """
     data = np.ascontiguousarray(prepared.projections.data, np.float32)
@@ -61,13 +60,13 @@ def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[s
 def _told(one: Value, other: Value) -> str:
     a, b = np.asarray(one), np.asarray(other)
     if a.shape != b.shape:
-        return f"({a.size} values, {b.size} in the checkpoint)"
+        return f"({a.size} values, {b.size} in the file)"
     if a.size > 3:
         return f"({int((a != b).sum())} of {a.size} values)"
     words = [str(v.tolist()) for v in (a, b)]
     if max(map(len, words)) > _SHOWN:
         return "(other content)"
-    return f"({words[0]}, {words[1]} in the checkpoint)"
+    return f"({words[0]}, {words[1]} in the file)"
 
 
 @dataclass(frozen=True)
@@ -112,12 +111,7 @@ class CheckpointOptions:
             return None
         kept, reached = _whole(self.resume)
         older = {name: value for name, value in _BEFORE_KERNELS.items() if name in origin}
-        others = differences(origin, {**older, **kept.made_from})
-        if others:
-            raise DataError(
-                f"{self.resume} is of another fit: {_listed(others)}. Give the options that it was made with, or start "
-                "anew without --resume."
-            )
+        refuse_other(self.resume, origin, {**older, **kept.made_from}, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
                 f"--resume {self.resume} has {reached.step} steps behind it, more than the {steps} wanted: give at "
@@ -159,6 +153,12 @@ def _whole(path: Path) -> tuple[Checkpoint, FitState]:
     return kept, reached
 
 
-def _listed(differences: Sequence[str]) -> str:
-    shown = "; ".join(differences[:6])
-    return f"{shown}; and {len(differences) - 6} more" if len(differences) > 6 else shown
+def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], of: str) -> None:
+    """Raises DataError where a file was made from something else: which differences there are `of` what it holds."""
+    others = differences(now, before)
+    if others:
+        listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")
+        raise DataError(
+            f"{path} is of another {of}: {listed}. Give the options that it was made with, or start anew without "
+            "--resume. Nothing was touched."
+        )

@@ -68,6 +68,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     with options.source.open() as source:
         if cone_of(source, options.selection) is not None:
             raise DataError(f"{source.path}: --dry-run is for a parallel beam; this is a cone.")
+        options = options.around_region(source)
         allowed, needs = memory_of(options), needs_of(source, options)
         rows = needs.rows
         slabs = slabs_of(rows, rows, 0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,13 +16,16 @@ from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.budget import within
-from beamline.reconstruct.checkpoints import fit_origin
+from beamline.reconstruct.checkpoints import origin_of
+from beamline.reconstruct.cluster import connected, local_workers
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.progress import progress_events
+from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.region import Placed, placed
 from beamline.reconstruct.result import write_result
-from beamline.reconstruct.slabs import in_slabs, prepare_within
+from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
+from beamline.reconstruct.slabs import prepare_within
 from drivers.clock import Clock
 from recon.auto import Auto
 from recon.base.method import DataUse, Method, Progress, RunControl
@@ -43,16 +46,20 @@ def reconstruct_file(
     """Reconstruct a finished scan. Returns the metrics; the event `done` says the rest.
 
     A reconstruction that is stopped within `stop_scope` writes the volume so far, marked `ended_early`. One by a direct
-    method is interrupted like all else, with nothing written.
+    method is interrupted like all else, with nothing written; one in slabs keeps those that are finished.
 
     Raises:
         ConfigError, DataError: with nothing written.
+        ScanStopped: interrupted, with slabs to go on from.
     """
     started = clock.now()
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     check_device(options.device)
     _refuse_foreign(options)
+    if options.cluster is not None and not local_workers(options.cluster):
+        with connected(options.cluster):  # refused now, not when the scan has been corrected
+            pass
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:
@@ -64,9 +71,11 @@ def reconstruct_file(
                     "frames that are there with --unfinished."
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
-        facts = facts_of(source)
+        facts, options = facts_of(source), options.around_region(source)
         prepared, slabs = prepare_within(source, options, sink, clock, warn)
     selection = options.selection
+    if options.cluster is not None and not slabs:
+        warn("The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs.")
     if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
@@ -74,34 +83,45 @@ def reconstruct_file(
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
     compared = options.target.report is not None and not options.method.traits.direct
-    options.target.require_room(volume, (1 + compared) * volume if slabs else 0)
+    meanwhile = (options.partial is None) + compared if slabs else 0
+    options.target.require_room(volume, meanwhile * volume)
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
-    # A direct method has no volume so far: a signal interrupts it, and nothing is written.
-    with (never_stopped if options.method.traits.direct else stop_scope)() as stopped:
-        job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn)
-        if options.budget is not None:
-            outcome, prepared, factor = _within_budget(job, options.budget)
-            selection = replace(selection, binning=selection.binning * factor)
-        else:
-            outcome = _by_slabs(job, slabs) if slabs else _at_once(job)
-    if slabs and options.method.traits.direct and prepared.view_weights is not None:
-        # For the record: FBP takes all rays alike, and so do its figures.
-        outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
-        prepared = replace(prepared, view_weights=None)
-    truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
-    context = ReportContext(
-        facts, selection, options.command, options.seed, warn.messages, started, recipe=options.recipe
-    )
-    return write_result(outcome, prepared, truth, options.target, context, sink, clock)
+    region = None if options.region is None else placed(options.region, selection, prepared.geometry)
+    with keeping(options.partial_path) if slabs else nullcontext():
+        # A direct method and a slab have no volume so far: a signal interrupts them.
+        with (never_stopped if options.method.traits.direct or slabs else stop_scope)() as stopped:
+            job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
+            if options.budget is not None:
+                outcome, prepared, factor = _within_budget(job, options.budget)
+                selection = replace(selection, binning=selection.binning * factor)
+            else:
+                outcome = _by_slabs(job, slabs) if slabs else _at_once(job)
+        if slabs and options.method.traits.direct and prepared.view_weights is not None:
+            # For the record: FBP takes all rays alike, and so do its figures.
+            outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
+            prepared = replace(prepared, view_weights=None)
+        truth = None if wanted is None else fit_truth(wanted, outcome.volume.grid, selection.binning)
+        context = ReportContext(
+            facts,
+            selection,
+            options.command,
+            options.seed,
+            warn.messages,
+            started,
+            recipe=options.recipe,
+            region=region,
+        )
+        metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock)
+        del outcome  # Windows removes no file that is mapped
+    return metrics
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Send the event `recon_started`; before it, what was done to the views on request."""
-    for state in ("noise", "phase", "rings", "hardening"):
-        if message := getattr(prepared, state):
-            sink(Event("state", clock.now(), {"state": state, "message": message}))
+    done = {name: getattr(prepared, name) for name in ("flats", "noise", "phase", "rings", "hardening")}
+    corrections_done(done, sink, clock)
     data = {
         "file": options.source.path,
         "method": options.method.name,
@@ -147,10 +167,13 @@ class _Job:
     clock: Clock
     stop_latch: StopLatch
     warn: Warnings
+    region: Placed | None = None
 
     @property
     def grid(self) -> Grid:
-        return Grid.matching(self.prepared.geometry)
+        """Of the volume; a direct method takes the voxels of a region alone."""
+        grid = Grid.matching(self.prepared.geometry)
+        return self.region.of_rows(grid) if self.region is not None and self.options.method.traits.direct else grid
 
     def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
         return progress_events(self.sink, self.clock, seconds)
@@ -167,7 +190,14 @@ class _Job:
         """Run a method, with views held out if it takes any, until it ends or is stopped."""
         return self.run_on(method, self.prepared, self.grid, control)
 
-    def run_on(self, method: Method, prepared: PreparedProjections, grid: Grid, control: RunControl) -> Reconstruction:
+    def run_on(
+        self,
+        method: Method,
+        prepared: PreparedProjections,
+        grid: Grid,
+        control: RunControl,
+        reconstruct: Callable[..., Reconstruction] = recon.reconstruct,
+    ) -> Reconstruction:
         """Run a method on these views."""
         data, geometry = prepared.projections.data, prepared.geometry
         held_out: Sequence[int] = ()
@@ -180,7 +210,7 @@ class _Job:
         with self.refused(f" by {method.name}"):
             # Compilation must not count in the time of the run, nor in its estimate of the time left.
             warm_up(method, prepared.geometry, device=self.options.device)
-            return recon.reconstruct(
+            return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
                 use=DataUse(weights, held_out), control=control,
             )  # fmt: skip
@@ -212,7 +242,11 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
     def said(text: str) -> None:
         job.sink(Event("state", job.clock.now(), {"state": "slab", "message": text}))
 
-    result = in_slabs(job.run_on, job.prepared, options, slabs, control, said, job.warn)
+    with connected(options.cluster) if options.cluster is not None else nullcontext() as cluster:
+        workers = None
+        if cluster is not None:
+            workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
+        result = in_slabs(job.run_on, job.prepared, options, slabs, control, said, job.warn, workers)
     return job.outcome(result, job.stop_latch.stopped, _chosen(result))
 
 
@@ -238,7 +272,7 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
     if checkpoints.wanted:
         assert method.gaussians is None or isinstance(method.gaussians, int)
         others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
-        origin = fit_origin(prepared, method.fit, others)
+        origin = origin_of(prepared, method.fit, others)
         resume = checkpoints.begin(origin, steps, job.warn)
     keep = partial(checkpoints.write, origin, steps, job.warn)
     control = RunControl(
@@ -273,6 +307,8 @@ def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProj
         warm_up(one, job.prepared.geometry)
     control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
-        done = within(budget, job.prepared, methods, job.options.seed, control, job.warn)
+        done = within(
+            budget, job.prepared, methods, job.options.seed, control, job.warn, None if job.region is None else 1
+        )
     outcome = job.outcome(done.result, job.stop_latch.stopped, done.summary(budget), **done.settings(budget))
     return replace(outcome, seconds=done.seconds), done.prepared, done.choice.binning

@@ -26,7 +26,7 @@ from beamline.projections.selection import check_axis, geometry_of
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.progress import progress_events
+from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
@@ -52,8 +52,8 @@ class ScanFollower:
         self._axis = AxisSearch(source, options.selection, warn)
         self._correction: ScanCorrection | None = None
         self._parts: list[Projections] = []  # line integrals of the views taken: what the volume grows from
-        self._early: Projections | None = None  # the newest view, in the fit already, which waits for the next one
-        self._late = False  # darks or flats come after the views
+        self._newest: Projections | None = None  # in the fit already; corrected again when the next view is there
+        self._references_follow = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
         self._taken = 0  # frames that were corrected, or that are no views
@@ -74,7 +74,7 @@ class ScanFollower:
     @property
     def n_views_taken(self) -> int:
         """Views that have fed the fit."""
-        return sum(part.view_ids.size for part in self._parts) + (self._early is not None)
+        return sum(part.view_ids.size for part in self._parts) + (self._newest is not None)
 
     @property
     def has_volume(self) -> bool:
@@ -91,14 +91,13 @@ class ScanFollower:
             return grown
         if self._correction is None:
             blockers = correction_blockers(self.source, self._options.selection)
-            if not ended and (self._late or any(finding.rule == "references" for finding in blockers)):
+            if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
                 self._wait_for_references()
                 return grown
             refuse(self.source, blockers)
             self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
-            for state in ("noise", "phase"):
-                if message := getattr(self._correction, state):
-                    self._sink(Event("state", self._clock.now(), {"state": state, "message": message}))
+            done = {"noise": self._correction.noise, "phase": self._correction.phase}
+            corrections_done(done, self._sink, self._clock)
         if not self._axis.settled:
             self._settle_axis(self._correction, views, ended)
         if self.axis_col is None:
@@ -117,15 +116,15 @@ class ScanFollower:
         part = self._correction.feed(frames, last=last)
         if part is not None:
             self._parts.append(part)
-            data, views, early = part.data, part.view_ids, self._early
-            if early is not None:
-                if not np.array_equal(data[0], early.data[0]):
+            data, views, newest = part.data, part.view_ids, self._newest
+            if newest is not None:
+                if not np.array_equal(data[0], newest.data[0]):
                     self._fit.replace_newest(data[0])
-                data, views, self._early = data[1:], views[1:], None
+                data, views, self._newest = data[1:], views[1:], None
             if views.size:
                 self._fit.add_views(data, self.source.angles[views])
-        if self._early is None and (newest := self._correction.newest()) is not None:
-            self._early = newest
+        if self._newest is None and (newest := self._correction.newest()) is not None:
+            self._newest = newest
             self._fit.add_views(newest.data, self.source.angles[newest.view_ids])
 
     def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -144,10 +143,10 @@ class ScanFollower:
 
     def _wait_for_references(self) -> None:
         """Darks or flats that come after the views: all of them are there when the scan has ended, not before."""
-        if not self._late:
+        if not self._references_follow:
             message = "No darks or no flats before the views: the volume begins when the scan has ended"
             self._sink(Event("state", self._clock.now(), {"state": "waiting", "message": message}))
-        self._late = True
+        self._references_follow = True
 
     def _settle_axis(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
         """Look for the axis. Where it moves by much, the fit begins anew with all views; by little, it goes on."""
@@ -178,7 +177,7 @@ class ScanFollower:
         fit = options.streaming.stream(template, options.seed, self._clock.now)
         for part in self._parts:
             fit.add_views(part.data, self.source.angles[part.view_ids])
-        self._early = None
+        self._newest = None
         return fit
 
     def _correct_again(self, usable: UsableViews) -> None:
@@ -260,7 +259,7 @@ class ScanFollower:
         """
         usable = checked_views(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
-        if self._early is not None:  # it was stopped: no other view comes
+        if self._newest is not None:  # it was stopped: no other view comes
             self._feed(np.empty(0, np.int64), last=True)
         if usable.jumps.size:
             self._warn(

@@ -93,13 +93,13 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
 
 
 def measure(
-    volume: Volume, prepared: PreparedProjections, truth: Volume | None, mask: NDArray[np.int8] | None
+    volume: Volume, prepared: PreparedProjections | None, truth: Volume | None, mask: NDArray[np.int8] | None
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
-    With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. Always: the residual
-    in up to 16 of the views used, and in the views held out where there are any; of a detector with more than 2^17
-    pixels in bands of rows that have so many.
+    With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. With views: the
+    residual in up to 16 of the views used, and in the views held out where there are any; of a detector with more than
+    2^17 pixels in bands of rows that have so many.
     """
     values: dict[str, float] = {}
     if truth is not None:
@@ -108,6 +108,8 @@ def measure(
         values["nrmse"] = metrics.nrmse(truth.data, volume.data)
     if mask is not None:
         values["snr"], values["cnr"] = metrics.snr_cnr(metrics.sampled(volume.data), mask)
+    if prepared is None:
+        return {name: float(value) for name, value in values.items()}
     n = prepared.geometry.n_views
     some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
     weights = prepared.ray_factors()

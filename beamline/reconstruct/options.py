@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.region import Region, around
 from beamline.reconstruct.result import OutputPaths
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from recon.assess.plans import Quality
 from recon.base.geometry import Geometry
@@ -40,6 +43,9 @@ class ReconOptions:
         unfinished: take the frames that there are, where the scan still runs or died.
         enough: of a followed scan: when its views are enough; None: nobody asks.
         memory: bytes that the reconstruction may use; None: 70 % of what is free.
+        region: of the volume that is wanted; None: all of it.
+        cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
+        partial: volume of which the missing slabs are reconstructed; None begins anew.
         command: that repeats this, for the record.
         recipe: its options that hold for any scan, as YAML, for the record.
     """
@@ -58,8 +64,26 @@ class ReconOptions:
     unfinished: bool = False
     enough: Goal | None = None
     memory: int | None = None
+    region: Region | None = None
+    cluster: str | None = None
+    partial: Path | None = None
     command: str = ""
     recipe: str = ""
+
+    def around_region(self, source: ScanSource) -> ReconOptions:
+        """The same with the rows that show the region; the same options where all of the volume is wanted.
+
+        Raises:
+            ConfigError: see `region.around`.
+        """
+        if self.region is None:
+            return self
+        return replace(self, selection=around(source, self.selection, self.region, self.method.traits.halo))
+
+    @property
+    def partial_path(self) -> Path:
+        """Where slabs are kept while others are made."""
+        return self.target.partial if self.partial is None else self.partial
 
     def method_for(self, geometry: Geometry) -> Method:
         """The method for these views, with the steps and Gaussians of the preset, if there is one."""

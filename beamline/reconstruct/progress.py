@@ -1,8 +1,9 @@
-"""Progress of a fit or of iterations as events: how far, how fast, and when it will be done."""
+"""Progress of a fit or of iterations as events: how far, how fast, when it will be done; and what was done to the views
+before."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
 from beamline.core.events import Event, Sink
@@ -36,3 +37,10 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
         sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress), "per_s": rate, "eta_s": left}))
 
     return listen
+
+
+def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> None:
+    """Say what each correction did to the views; "" is not said."""
+    for state, message in messages.items():
+        if message:
+            sink(Event("state", clock.now(), {"state": state, "message": message}))

@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.projections.flagged_frames import reasons, worst_frames
+from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.reconstruct.region import Placed
 from beamline.report import figures
-from beamline.report.contact_sheet import FlaggedFrame, contact_sheet
+from beamline.report.contact_sheet import FlaggedFrame, contact_sheet, reference_sheet
 from beamline.report.html import Picture, Report
 from beamline.report.metrics import METRICS, formatted
 from beamline.report.record import history_arrays, residual_curve
+from beamline.report.time_curves import quality_against_time
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.writers.recon_file import Value
@@ -43,6 +46,8 @@ class ScanFacts:
         frames: frames there are of those triggered, e.g. "110/110".
         remarks: what went wrong while it was taken, by what is in the file.
         flagged: the worst of the flagged frames.
+        references: mean darks and flats [row, col], binned, by title.
+        shape: (rows, cols) of the detector.
     """
 
     path: Path
@@ -52,6 +57,8 @@ class ScanFacts:
     frames: str
     remarks: Sequence[str] = ()
     flagged: Sequence[FlaggedFrame] = ()
+    references: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    shape: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +131,10 @@ class ReportContext:
     started: float = 0.0
     scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
+    region: Placed | None = None
+
+
+_NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
 
 
 def label_of(method: str) -> str:
@@ -157,7 +168,9 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
     remarks = [] if flags is None else reasons(flags)
     flagged = [] if flags is None else worst_frames(source, flags)
-    return ScanFacts(source.path, source.path.name, sample, table, f"{n}/{n + missing}", remarks, flagged)
+    frames = f"{n}/{n + missing}"
+    images = reference_images(source)
+    return ScanFacts(source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape)
 
 
 def compose(
@@ -174,12 +187,15 @@ def compose(
     name, geometry = label_of(made.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]
+    best = best if best in own else "seconds"  # a region by FBP is compared with nothing
     summary = (
         f"{name} volume of {' × '.join(str(n) for n in made.volume.grid.shape)} voxels from {geometry.n_views} of "
         f"{prepared.n_projections} views in {made.seconds:.1f} s; {METRICS[best].label} {formatted(best, own[best])}"
     )
     if BASELINE in metrics and made.method != BASELINE:
         summary += f" (FBP of the same views: {formatted(best, metrics[BASELINE][best])})"
+    if context.region is not None:
+        summary += f". Written, and shown in pictures of slices: the region {context.region.region} [z, y, x]"
     if made.chosen:
         summary += f". Chosen: {made.chosen}"
     if made.next_decibel_text:
@@ -215,21 +231,29 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
-        pictures=[*_pictures(made, prepared, truth, volumes, left), *_flagged(context.facts.flagged)],
+        pictures=[*_pictures(made, prepared, truth, volumes, left), *_frames(context.facts)],
         command=context.command,
         recipe=context.recipe,
         footnotes=footnotes,
     )
 
 
-def _flagged(frames: Sequence[FlaggedFrame]) -> list[Picture]:
-    if not frames:
-        return []
-    caption = (
-        "The worst of the frames that the monitor flagged, as the camera gave them, with the place of the flag if it "
-        "has one. Red: an alarm, the view is left out; orange: a warning, it weighs half."
-    )
-    return [Picture("Flagged frames", caption, contact_sheet(frames))]
+def _frames(facts: ScanFacts) -> list[Picture]:
+    """Darks, flats and flagged frames, as far as there are any."""
+    pictures = []
+    if facts.references:
+        caption = (
+            "As the camera gave them. Smooth flats are better: what stands in them and moves, or is missing in the "
+            "views, makes rings. Their ratio, where there are two groups, is better the nearer it is to one everywhere."
+        )
+        pictures.append(Picture("Darks and flats", caption, reference_sheet(facts.references, facts.shape)))
+    if facts.flagged:
+        caption = (
+            "The worst of the frames that the monitor flagged, as the camera gave them, with the place of the flag if "
+            "it has one. Red: an alarm, the view is left out; orange: a warning, it weighs half."
+        )
+        pictures.append(Picture("Flagged frames", caption, contact_sheet(facts.flagged)))
+    return pictures
 
 
 def _pictures(
@@ -252,7 +276,7 @@ def _pictures(
         ),
         Picture(
             "Slices, low contrast",
-            "The same slices, brighter: the 2nd to 90th percentile, for weak matter, streaks and noise.",
+            "The same slices, brighter: the 2nd to 90th percentile, for weak matter; fewer streaks are better.",
             figures.orthogonal_slices(shown, unit, (2.0, 90.0)),
         ),
         Picture(
@@ -262,12 +286,21 @@ def _pictures(
             figures.profile_and_values(shown, unit),
         ),
     ]
+    if len(shown) > 1:
+        pictures.append(
+            Picture(
+                "Differences",
+                f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
+                + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
+                figures.differences(shown, unit),
+            )
+        )
     if left is not None:
         at = len(left.significance) // 2
         pictures.append(
             Picture(
                 "What the volume leaves in the views",
-                "Filtered back-projection of the residual over its noise. Noise alone is even and seldom beyond 4; an "
+                "Filtered back-projection of the residual over its noise. Even noise, seldom beyond 4, is better; an "
                 "edge, a crack or a pore seen here is in the views and not in the volume. Blue: the volume has too "
                 "much, red: too little.",
                 figures.significance(left.significance[at], made.volume.grid, left.first + at, unit),
@@ -278,24 +311,30 @@ def _pictures(
             Picture(
                 "Quality against time",
                 _history_caption(made),
-                figures.quality_against_time(history_arrays(made.history), made.psnr, made.next_decibel),
+                quality_against_time(history_arrays(made.history), made.psnr, made.next_decibel),
             )
         )
     pictures += [
         Picture(
             "Projection",
-            "One corrected view: the line integral of the attenuation along each ray.",
+            "One corrected view: the line integral of the attenuation along each ray. Air is better the nearer "
+            "to 0 and the more even it is.",
             figures.projection(data, geometry, 0, unit),
         ),
-        Picture("Sinogram", "The middle detector row of all views used.", figures.sinogram(data, geometry, row)),
+        Picture(
+            "Sinogram",
+            "The middle detector row of all views used. Fewer vertical stripes are better: they become rings; a curve "
+            "that breaks off is a view that does not fit.",
+            figures.sinogram(data, geometry, row),
+        ),
     ]
     if prepared.axis is not None:
         axis = prepared.axis
         pictures.append(
             Picture(
                 "Rotation axis",
-                f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): 0 is perfect "
-                "agreement, about 1 is none. Columns of the binned detector.",
+                f"Mismatch of the views with each candidate for the rotation axis ({axis.method}): lower is "
+                "better, 0 is perfect agreement, about 1 is none. Columns of the binned detector.",
                 figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
             )
         )
@@ -315,7 +354,8 @@ def _history_caption(made: ReconOutcome) -> str:
         parts.append(f"the residual of {judged.views} as dB below the data")
     parts += ["PSNR of its snapshots against the truth"] if made.psnr else []
     parts += [f"number of {' and of '.join(growing)}"] if growing else []
-    return f"{', '.join(parts)}, against the time since {'the file was found' if _grew(made) else 'the start'}."
+    since = "the file was found" if _grew(made) else "the start"
+    return f"{', '.join(parts)}, against the time since {since}. Lower misfit and more dB are better."
 
 
 def _text(value: object) -> str:

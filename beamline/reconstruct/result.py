@@ -25,7 +25,7 @@ from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import ReconRecord, Value
 from drivers.clock import Clock
-from recon.base.volume import Volume
+from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
@@ -39,6 +39,19 @@ class OutputPaths:
     output: Path
     report: Path | None
     replace: bool = False
+
+    @property
+    def partial(self) -> Path:
+        """Of a volume that is made in slabs, while it is made."""
+        return self.output.with_name(f"{self.output.stem}.partial.h5")
+
+    def refuse_partial(self) -> None:
+        """Raise DataError where slabs of an earlier call are in the way of those to be made."""
+        if self.partial.exists():
+            raise DataError(
+                f"{self.partial} exists: it keeps the slabs of a call that was stopped. Go on from it with --resume "
+                f"{self.partial}, or move it away. Nothing was touched."
+            )
 
     def refuse_existing(self) -> None:
         """Raise DataError before any work where a result is in the way, or its folder cannot be written to."""
@@ -81,15 +94,17 @@ def write_result(
     Raises:
         DataError: a result could not be written; neither is left where one fails.
     """
-    mask = regions(truth or made.volume, context.seed)
+    region = context.region
+    region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
 
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
-        return {**measure(volume, prepared, truth, mask), "seconds": seconds}
+        return {**measure(volume, None if region_only else prepared, truth, mask), "seconds": seconds}
 
     left = unexplained(
         made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed),
         prepared.ray_factors(),
     )  # fmt: skip
+    mask = regions(truth or made.volume, context.seed)  # after what takes most memory
     metrics = {made.method: judged(made.volume, made.seconds)}
     hiding = ""
     if left is not None:
@@ -112,8 +127,10 @@ def write_result(
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     own = metrics[made.method]
     parameters = parameters_of(made, prepared, context)
+    if region is not None:
+        volumes = {method: region.cut(volume) for method, volume in volumes.items()}
     record = ReconRecord(
-        volume=made.volume,
+        volume=volumes[made.method],
         length_unit=prepared.length_unit,
         raw_file=str(context.facts.path.resolve()),
         title=f"{label_of(made.method)} reconstruction of {context.facts.name}",
@@ -137,7 +154,7 @@ def write_result(
         "method": made.method,
         "axis_col": prepared.axis_col,
         "n_views": prepared.geometry.n_views,
-        "shape": made.volume.grid.shape,
+        "shape": record.volume.grid.shape,
         "units": f"1/{prepared.length_unit}",
         "elapsed": clock.now() - context.started,
         **own,
@@ -175,12 +192,14 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
         **({"jumps": prepared.jumps, "view_shifts_px": geometry.shifts} if prepared.jumps else {}),
         "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
+        **({} if context.region is None else {"roi": str(context.region.region)}),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
         **(_flat("correction", asdict(selection.correction)) if corrected else {}),
         **({"noise": prepared.noise or "logarithms of counts"} if corrected else {}),
+        **({"flats": prepared.flats or selection.flat_fields} if corrected else {}),
         "phase": prepared.phase or "not retrieved",
         "hardening": prepared.hardening or "not corrected",
         "rings": selection.rings,

@@ -1,9 +1,9 @@
-"""Slabs: a scan that does not fit into the memory lies on disk, and a method reconstructs it slab by slab."""
+"""Slabs: what of a scan that does not fit into the memory is reconstructed at a time, and what that needs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,21 +15,19 @@ from beamline.core.text import size
 from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import choose_views, cone_of, rows_of
+from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
+from beamline.storage.writers.partial_volume import open_partial
 from drivers.clock import Clock
 from drivers.frame import FrameKind
-from recon.auto import Auto
-from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Method, Progress, RunControl
-from recon.base.slabs import Slab, part_of, slabs_of
-from recon.base.volume import Grid, Volume
-from recon.reconstruction import Reconstruction
+from recon.base.method import Method
+from recon.base.slabs import Slab, slabs_of
+from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
-from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.odd_views import odd_views_memory
 from recon.voxels.unexplained import unexplained_memory
 
@@ -41,10 +39,6 @@ _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slabs are multiples of so many, which FBP makes together
 _REGIONS = 2**24  # voxels, at most, of the regions by which volumes are judged, see `metrics.sampled`
 _ASIDE = 64_000_000  # bytes of figures that nobody counts
-_LOOKED_AT = 8  # views by which the rows with most matter are found
-
-Run = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
-"""Reconstructs views on a grid."""
 
 
 @dataclass(frozen=True)
@@ -173,8 +167,10 @@ def spill_of(
     except ConfigError:
         return None  # what is wrong with the views themselves comes first: reading them says it
     memory = memory_of(options)
-    if needs.at_once <= memory:
+    if needs.at_once <= memory and options.partial is None:
         return None
+    if options.partial is None:
+        options.target.refuse_partial()
     refuse_whole(source, options, needs, memory)
     refuse_smallest(source, replace(needs, weighted=False), memory, options.selection.binning)
     batch = max(1, int(_BATCH * memory / needs.view))
@@ -187,8 +183,10 @@ def spill_of(
 
 
 def memory_of(options: ReconOptions) -> int:
-    """Bytes that may be used."""
-    return round(SHARE * free_memory()) if options.memory is None else options.memory
+    """Bytes that this process may use, and each worker on this machine."""
+    if options.memory is not None:
+        return options.memory
+    return round(SHARE * free_memory() / (1 + local_workers(options.cluster)))
 
 
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory: int) -> None:
@@ -239,6 +237,8 @@ def prepare_within(
     prepared = prepare_projections(source, options.selection, warn, spill)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if spill is None:
+        if options.partial is not None:
+            raise DataError(f"{options.partial} holds slabs, and {source.path} is a cone, which is not made in slabs.")
         _refuse_wider(source, prepared, Needs(method, geometry, 0, not method.traits.direct), memory)
         return prepared, []
     if not geometry.is_straight:
@@ -246,7 +246,15 @@ def prepare_within(
     weighted = not method.traits.direct and (prepared.ray_factors() is not None or prepared.shares_of is not None)
     needs = Needs(method, geometry, 0, weighted)
     refuse_smallest(source, needs, memory, options.selection.binning)
-    return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)
+    if options.partial is None:
+        return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)
+    slabs = list(open_partial(options.partial).slabs)
+    if (wanted := needs.slab(slabs[0].own.stop)) > memory:
+        raise DataError(
+            f"The slabs of {options.partial} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
+            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
+        )
+    return prepared, slabs
 
 
 def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: Needs, memory: int) -> None:
@@ -258,101 +266,3 @@ def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: Need
         f"that a full turn sees takes {size(needs.at_once)} of memory, {size(memory)} may be used. Give "
         f"--axis {prepared.axis_col:.2f}, so that it is made in slabs. Nothing was written."
     )
-
-
-def in_slabs(
-    run: Run,
-    prepared: PreparedProjections,
-    options: ReconOptions,
-    slabs: Sequence[Slab],
-    control: RunControl,
-    said: Callable[[str], None],
-    warn: Callable[[str], None],
-) -> Reconstruction:
-    """A method's volume on disk, slab by slab.
-
-    The slab with most matter comes first; what it decides by its data the others follow, so that slabs fit together.
-    From slab to slab the volume fades.
-
-    Args:
-        run: reconstructs a slab.
-        control: of all slabs together.
-        said: is told of each slab.
-        warn: is told of slices that are not there, or not by the method.
-
-    Raises:
-        DataError: the views are zero everywhere.
-    """
-    grid, begin = Grid.matching(prepared.geometry), control.now()
-    volume = Volume(scratch_array(options.target.output.parent, grid.shape), grid)
-    first: Reconstruction | None = None
-    decided, done, in_all = Decisions(options.seed), 0, sum(slab.slices.stop - slab.slices.start for slab in slabs)
-    for n, slab in enumerate(busiest_first(prepared, grid, slabs)):
-        if first is not None and control.should_stop is not None and control.should_stop():
-            warn(
-                f"Stopped after {n} of {len(slabs)} slabs: {done} of {grid.shape[0]} slices are there, the others are "
-                "empty."
-            )
-            break
-        said(f"Slab {n + 1} of {len(slabs)}: slices {slab.own.start} to {slab.own.stop - 1}.")
-        decide = Decisions(options.seed, decided.made)
-        watch = _of_all(control, begin, done, slab, grid.shape[0])
-        one = replace(control, decide=decide, on_progress=watch)
-        try:
-            slices = slab.slices.stop - slab.slices.start
-            method = for_part(options.method, slices, grid.shape[0], in_all)
-            found = _one(run, prepared, method, slab, one, volume)
-        except DataError as error:
-            # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
-            if first is None or not isinstance(options.method, R2 | Auto):
-                raise
-            warn(f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}")
-            found = _one(run, prepared, FistaTv(), slab, one, volume)
-        done += slab.own.stop - slab.own.start
-        if first is None and found is not None:
-            first, decided = found, decide
-    if first is None:
-        raise DataError("The views are zero everywhere: there is nothing in the beam.")
-    settings = {**first.settings, "slabs": len(slabs), "slab_halo": options.method.traits.halo}
-    return replace(first, seconds=control.now() - begin, settings=settings)
-
-
-def _one(
-    run: Run, prepared: PreparedProjections, method: Method, slab: Slab, control: RunControl, volume: Volume
-) -> Reconstruction | None:
-    """Add a slab to the volume. Returns the reconstruction, with that volume; None of views that are zero."""
-    rows, geometry, box = part_of(prepared.geometry, volume.grid, slab.slices)
-    part = prepared.of_rows(rows, geometry)
-    if not part.projections.data.any():
-        return None
-    found = run(method, part, box, control)
-    for k, share in enumerate(slab.share):
-        volume.data[slab.slices.start + k] += share * found.volume.data[k]
-    return replace(found, volume=volume, gaussians=None, checkpoint=None)
-
-
-def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[Slab]:
-    """The slabs, the one whose rows hold most matter before all others."""
-    data = prepared.projections.data
-    some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
-    matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
-    best = int(np.argmax(matter))
-    return [slabs[best], *slabs[:best], *slabs[best + 1 :]]
-
-
-def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: int) -> Callable[[Progress], None] | None:
-    """A listener to one slab that says how far all slices are, where `done` are there before it."""
-    listen = control.on_progress
-    if listen is None:
-        return None
-
-    reached = done
-
-    def watch(progress: Progress) -> None:
-        nonlocal reached
-        share = progress.step / progress.steps if progress.steps else 0.0
-        at = done + round((slab.own.stop - slab.own.start) * share)
-        reached = max(reached, at)  # a fit's finish counts anew
-        listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
-
-    return watch

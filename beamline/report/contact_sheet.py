@@ -1,8 +1,8 @@
-"""Contact sheet: flagged frames side by side, each with its reason and the place where it is flagged."""
+"""Contact sheets: flagged frames, each with its reason and the place where it is flagged; darks and flats."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from beamline.report.figures import grey_window, png
+from beamline.report.figures import DPI, WIDTH, grey_window, png
 
 COLUMNS = 4
-_WIDTH, _DPI = 8.6, 110  # as all pictures of a report
 _COLOURS = {True: "tab:red", False: "tab:orange"}  # of alarms and of warnings
 
 
@@ -45,9 +44,9 @@ def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
     down = -(-len(frames) // COLUMNS)
     lines = max(len(frame.reasons) for frame in frames)
     rows, cols = frames[0].extent
-    width = _WIDTH / COLUMNS
+    width = WIDTH / COLUMNS
     height = np.clip(width * rows / cols, 0.5, 3.0) + 0.25 + 0.13 * lines
-    figure = Figure(figsize=(_WIDTH, float(height) * down), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(WIDTH, float(height) * down), dpi=DPI, layout="constrained")
     window = Normalize(*grey_window([frame.image for frame in frames], 0.5, 99.5))
     panels = np.ravel(figure.subplots(down, COLUMNS, squeeze=False))
     for axes in panels[len(frames) :]:
@@ -71,4 +70,31 @@ def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
             side.set(color=colour, linewidth=1.5)
         axes.tick_params(labelsize=5, length=2)
         axes.set_title("\n".join([frame.title, *frame.reasons]), fontsize=6.5)
+    return png(figure)
+
+
+def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int, int]) -> bytes:
+    """Mean darks and flats as PNG, row 0 at the top, each in a grey window of its own with its scale.
+
+    Args:
+        images: [row, col] by title, counts or ratios, binned where they are large.
+        shape: (rows, cols) of the detector.
+    """
+    rows, cols = shape
+    thin = rows < 0.15 * cols
+    width = WIDTH / max(len(images), 2)
+    size = (width * len(images), float(np.clip(0.8 * width * rows / cols, 0.6, 4.0)) + 0.6)
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
+    for axes, (title, image) in zip(figure.subplots(1, len(images), squeeze=False)[0], images.items(), strict=True):
+        shown = axes.imshow(
+            image,
+            cmap="gray",
+            norm=Normalize(*grey_window([image], 0.5, 99.5)),
+            extent=(-0.5, cols - 0.5, rows - 0.5, -0.5),
+            aspect="auto" if thin else "equal",
+            interpolation="nearest",
+        )
+        axes.tick_params(labelsize=6)
+        axes.set_title(title, fontsize=8)
+        figure.colorbar(shown, ax=axes, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
     return png(figure)

@@ -11,18 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from beamline.report.record import residual_curve
-from recon.assess.time_model import NextDecibel, duration_text, record
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
 Window = tuple[float, float]
-_DPI = 110
-_WIDTH = 8.6  # inches; the report's column
+DPI = 110
+_FINEST = 300  # pixels an inch, of slices, which have a pixel a voxel as far as that goes
+WIDTH = 8.6  # inches; the report's column
 _PROFILE = 16.0  # voxels to either side of an edge
 _LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
@@ -42,9 +41,9 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
-    height = np.clip(0.82 * _WIDTH * rows / cols, 1.6, 6.0)
+    height = np.clip(0.82 * WIDTH * rows / cols, 1.6, 6.0)
     thin = rows < _THIN * cols
-    figure, axes = _figure((_WIDTH, height + 0.8))
+    figure, axes = _figure((WIDTH, height + 0.8))
     image = axes.imshow(
         data[view],
         cmap="gray",
@@ -69,7 +68,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     order = np.argsort(geometry.angles, kind="stable")
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
-    figure, axes = _figure((_WIDTH, 4.2))
+    figure, axes = _figure((WIDTH, 4.2))
     image = axes.imshow(
         image_rows, cmap="gray", aspect="auto", interpolation="nearest", norm=Normalize(*grey_window([image_rows]))
     )
@@ -99,9 +98,9 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
     slices = {name: (v.data[at[0]], v.data[:, at[1]], v.data[:, :, at[2]]) for name, v in volumes.items()}
     window = grey_window([image for images in slices.values() for image in images], *percentiles)
     heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
-    column = min((_WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
+    column = min((WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
     size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=size, dpi=finest(nx, column - 0.35), layout="constrained")
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
     z, y, x = (_edges(first.centre[i], first.shape[i], first.voxel_size) for i in range(3))
     planes = (("x", "y", x, y), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1]))
@@ -119,6 +118,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
                 norm=Normalize(*window),
             )
             axes.tick_params(labelsize=7)
+            axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)
             if j == 0:
                 axes.set_ylabel(f"{up} ({unit})", fontsize=8)
@@ -131,6 +131,30 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
                 axes.set_title(name, fontsize=11)
     bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
     bar.set_label(f"attenuation (1/{unit})")
+    return png(figure)
+
+
+def differences(volumes: Mapping[str, Volume], unit: str) -> bytes:
+    """What each volume has more (red) or less (blue) than the first one, in the slice z of `orthogonal_slices`."""
+    (first, reference), *others = volumes.items()
+    z = bright_centre(list(volumes.values())[-1].data)[0]
+    images = [volume.data[z] - reference.data[z] for _, volume in others]
+    reach = max(-grey_window(images)[0], grey_window(images)[1], 1e-12)
+    (_, cy, cx), (_, ny, nx), size = reference.grid.centre, reference.grid.shape, reference.grid.voxel_size
+    column = min((WIDTH - 1.2) / len(images), 5.4)
+    figure = Figure(
+        figsize=(1.2 + column * len(images), 0.9 + column * ny / nx), dpi=finest(nx, column), layout="constrained"
+    )
+    for axes, image, (name, _) in zip(figure.subplots(1, len(images), squeeze=False)[0], images, others, strict=True):
+        shown = axes.imshow(
+            image, cmap="RdBu_r", origin="lower", extent=(*_edges(cx, nx, size), *_edges(cy, ny, size)),
+            norm=Normalize(-reach, reach), interpolation="nearest",
+        )  # fmt: skip
+        axes.tick_params(labelsize=7)
+        axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))
+        axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+        axes.set_title(f"{name} − {first}", fontsize=10)
+    figure.colorbar(shown, ax=figure.axes, label=f"difference (1/{unit})", shrink=0.8, pad=0.02)
     return png(figure)
 
 
@@ -147,7 +171,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
     y, x = np.unravel_index(int(np.argmax(np.hypot(down, across))), down.shape)
     angle = math.atan2(down[y, x], across[y, x])
     t = np.arange(-_PROFILE, _PROFILE + 0.25, 0.5)
-    figure = Figure(figsize=(_WIDTH, 3.2), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.2), dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2)
     for name, volume in volumes.items():
         at = (y + t * math.sin(angle), x + t * math.cos(angle))
@@ -182,7 +206,7 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
 
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
     """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
-    figure, axes = _figure((_WIDTH, 2.8))
+    figure, axes = _figure((WIDTH, 2.8))
     axes.plot(candidates, curve, color="0.25", lw=1.2)
     axes.axvline(value, color="tab:orange", lw=1.2, ls="--", label=f"axis {value:.2f} px")
     axes.set(xlabel="axis candidate (column, px)", ylabel="mismatch")
@@ -190,89 +214,6 @@ def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], valu
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)
     return png(figure)
-
-
-def quality_against_time(
-    history: Mapping[str, NDArray[np.floating]],
-    psnr: Sequence[tuple[float, float]] = (),
-    further: NextDecibel | None = None,
-) -> bytes:
-    """A fit against time: loss and residuals, the residual as dB, PSNR of snapshots, number of views and Gaussians.
-
-    Args:
-        history: equally long "seconds", "loss", and where known "residual", "held_out", "n_views", "n_gaussians".
-        psnr: (seconds, dB) of each snapshot; none without a truth.
-        further: time that another dB would take; None if it is not known.
-    """
-    seconds = history["seconds"]
-    growing = [
-        (name, label)
-        for name, label in (("n_views", "views"), ("n_gaussians", "Gaussians"))
-        if name in history and np.ptp(history[name]) > 0
-    ]
-    curve = residual_curve(history)
-    panels = 1 + (curve is not None) + bool(psnr) + bool(growing)
-    down, across = (1, panels) if panels < 4 else (2, 2)
-    figure = Figure(figsize=(_WIDTH, 3.1 * down), dpi=_DPI, layout="constrained")
-    left, *others = np.ravel(figure.subplots(down, across))
-    for name, label, colour in (
-        ("loss", "loss", "tab:blue"),
-        ("residual", "residual", "tab:orange"),
-        ("held_out", "residual, held out", "tab:red"),
-    ):
-        if name == "loss" and np.array_equal(history[name], history.get("residual", [])):
-            continue  # the loss of iterations is the residual itself
-        if name in history and np.any(np.isfinite(history[name])):
-            left.plot(seconds, history[name], color=colour, lw=1.2, marker=".", ms=3, label=label)
-    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in left.get_lines()])
-    if values.min(initial=np.inf) > 0 and values.max() > 10 * values.min():
-        left.set_yscale("log")
-        left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-        left.yaxis.set_major_formatter(ScalarFormatter())
-        left.yaxis.set_minor_formatter(NullFormatter())
-    else:
-        left.set_ylim(bottom=0)
-    left.set(xlabel="time (s)", title="Misfit")
-    left.legend(fontsize=8)
-    if curve is not None:
-        _decibels(others.pop(0), *record(curve.seconds, curve.residuals), curve.views, further)
-    if psnr:
-        axes = others.pop(0)
-        axes.plot(*np.array(psnr).T, color="tab:green", lw=1.2, marker="o", ms=3)
-        axes.set(xlabel="time (s)", ylabel="PSNR (dB)", title="Quality against the truth")
-    if growing:
-        axes = others.pop(0)
-        for (name, label), colour in zip(growing, ("tab:purple", "0.4"), strict=False):
-            values = history[name] / np.max(history[name])
-            axes.step(seconds, values, where="post", color=colour, lw=1.2, label=f"{label} / {history[name].max():.0f}")
-        axes.set(xlabel="time (s)", ylabel="share of the largest", ylim=(0, 1.05), title="Growth")
-        axes.legend(fontsize=8, loc="lower right")
-    for panel in figure.axes:
-        panel.grid(alpha=0.3)
-        panel.tick_params(labelsize=8)
-    return png(figure)
-
-
-def _decibels(
-    axes: Axes, seconds: NDArray[np.float64], quality: NDArray[np.float64], views: str, further: NextDecibel | None
-) -> None:
-    """The residual as dB below the data, and the time at which the next dB is expected."""
-    axes.plot(seconds, quality, color="tab:green", lw=1.2, marker=".", ms=3)
-    axes.set(xlabel="time (s)", ylabel="dB below the data", title=f"Residual, {views}")
-    if further is None or seconds.size == 0:
-        return
-    if not further.measurable:
-        axes.text(0.97, 0.05, "next dB: none measurable", ha="right", fontsize=8, transform=axes.transAxes)
-        return
-    note = f"next dB of the {further.of}: about {duration_text(further.seconds)} more"
-    axes.text(0.97, 0.05, note, ha="right", fontsize=8, transform=axes.transAxes)
-    if further.of == "volume":
-        return  # this curve is the residual, not the quality of the volume
-    end, top = float(seconds[-1]), float(quality[-1])
-    axes.plot([end, end + further.seconds], [top, top + 1], color="tab:green", lw=1, ls=":")
-    high = further.high if math.isfinite(further.high) else 3 * further.seconds
-    axes.plot([end + further.low, end + high], [top + 1, top + 1], color="0.4", lw=1)
-    axes.plot([end + further.seconds], [top + 1], color="0.4", marker="|", ms=8)
 
 
 def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
@@ -297,8 +238,13 @@ def _edges(centre: float, n: int, size: float) -> tuple[float, float]:
     return centre - n / 2 * size, centre + n / 2 * size
 
 
+def finest(voxels: int, inches: float) -> float:
+    """Pixels an inch that show every voxel of a row of them."""
+    return float(np.clip(voxels / inches, DPI, _FINEST))
+
+
 def _figure(size: tuple[float, float]) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=size, dpi=DPI, layout="constrained")
     return figure, figure.subplots()
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from beamline.core.errors import BeamlineError, InstrumentError, ReferencesError, ScanStopped
+from beamline.core.errors import BeamlineError, DataError, InstrumentError, ReferencesError, ScanStopped
 from beamline.core.events import Emit
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import spans
@@ -77,7 +77,7 @@ class Acquisition:
     @property
     def missing(self) -> list[int]:
         """Triggers, counted over the whole plan, that gave no frame so far (those never reached are not among them)."""
-        return [done.block.first_row + i for done in self._done if not done.again for i in done.taken.missing]
+        return [done.block.first_trigger + i for done in self._done if not done.again for i in done.taken.missing]
 
     def frames(self) -> Generator[Frame, None, None]:
         """Frames, each with its own memory, its row in the file, its trigger and its angle.
@@ -103,7 +103,8 @@ class Acquisition:
         except GeneratorExit:  # closed by the caller; no device has failed
             devices_work = True
             raise
-        except (BeamlineError, DeviceError):
+        except (BeamlineError, DeviceError) as ended_by:
+            devices_work = isinstance(ended_by, DataError)  # the disk failed
             self._warn_discrepancies()
             raise
         finally:
@@ -132,7 +133,7 @@ class Acquisition:
     def _block(self, done: TakenBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
         self._done.append(done)
-        what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.n, "first_row": self.n_frames}
+        what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.left, "first_row": self.n_frames}
         self._emit("block_started", {**what, "exposure": block.exposure, "period": block.period})
         self._supervision.states.enter(_state_of(block))
         self._set_shutter_and_sample(block.kind)
@@ -196,16 +197,24 @@ class Acquisition:
             )
 
     def _wait_while_paused(self) -> None:
-        """Wait with a closed shutter as long as a pause is asked for; a stop ends it."""
+        """Wait with a closed shutter as long as a pause is asked for; a stop ends it.
+
+        A shutter that is moved by hand is asked for after the state is told, and stays as it is in a pause that ends by
+        itself.
+        """
         pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
         reason = pause.reason
         if not reason or self._stop.stopping:
             return
-        self._devices.shutter.close()
-        self._supervision.rest()  # what was typed before does not count
-        states.enter(State.PAUSED, f"Paused with a closed shutter: {reason}")
+        shutter = self._devices.shutter
+        if not shutter.by_hand:
+            shutter.close()
+        self._supervision.wait_in_pause()  # what was typed before does not count
+        states.enter(State.PAUSED, f"Paused{'' if shutter.by_hand else ' with a closed shutter'}: {reason}")
         while pause.reason and not self._stop.stopping:
-            if self._supervision.rest():
+            if shutter.by_hand and not pause.ends_by_itself:
+                shutter.close()  # asks once
+            if self._supervision.wait_in_pause():
                 pause.resume()
         if not self._stop.stopping:
             self._set_shutter_and_sample(block.kind)
@@ -248,7 +257,7 @@ class Acquisition:
 
     def _raise_outcome(self) -> None:
         of_views = [done for done in self._done if done.block.kind is FrameKind.PROJECTION and not done.again]
-        views = sum(len(done.taken.rows) for done in of_views)
+        views = sum(len(done.taken.rows) + len(done.block.stored) for done in of_views)
         planned = sum(block.n for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION)
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{self._discrepancies()}")

@@ -35,6 +35,7 @@ class BeamLog:
         self._monitor, self._period, self._emit, self._react = monitor, period, emit, react
         self._readings: list[BeamReading] = []
         self._failed = 0  # failed readings in a row
+        self._begun = self._ended = 0  # readings
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="beam log", daemon=True)
 
@@ -42,6 +43,11 @@ class BeamLog:
     def readings(self) -> tuple[BeamReading, ...]:
         """The readings so far, in order of time."""
         return tuple(self._readings)
+
+    def next_reading_done(self) -> Callable[[], bool]:
+        """Says whether a reading that begins from now on is over, also a failed one, or none will come."""
+        due = self._begun + 1
+        return lambda: self._ended >= due or not self._thread.is_alive()
 
     def __enter__(self) -> Self:
         if self._monitor is not None:
@@ -64,12 +70,14 @@ class BeamLog:
             self._over.wait(self._period)
 
     def _read(self, monitor: BeamMonitor) -> None:
+        self._begun += 1
         try:
             reading = monitor.reading()
         except Exception as error:  # no failure of the beam monitor ends the scan
             self._fail(monitor.name, error)
         else:
             self._enter(monitor.name, reading)
+        self._ended = self._begun
 
     def _enter(self, name: str, reading: BeamReading) -> None:
         if self._over.is_set():  # too late to be written

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.scan.run_folder import CONTROL, EVENTS, SCAN
+from beamline.scan.run_folder import CONTROL, EVENTS, SCAN, parts_of
 from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 
@@ -35,28 +35,28 @@ class Verb(StrEnum):
 
 
 @contextmanager
-def obeying(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
+def verbs_taken(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
     """While the context lasts, verbs for the run in this folder are taken and done.
 
     Raises:
         DataError: the disk does not take the folder for them.
     """
-    desk, over = folder / CONTROL, threading.Event()
+    requests, over = folder / CONTROL, threading.Event()
     actions: Mapping[Verb, Callable[[], None]] = {
         Verb.ABORT: stop.abort, Verb.STOP: stop.stop, Verb.PAUSE: pause.pause, Verb.RESUME: pause.resume,
     }  # fmt: skip
 
-    def obey() -> None:
+    def take_verbs() -> None:
         while not over.wait(_POLL):
             for verb, action in actions.items():
-                if _taken(desk / verb):
+                if _taken(requests / verb):
                     action()
 
     try:
-        desk.mkdir(mode=0o700)
+        requests.mkdir(mode=0o700)
     except OSError as error:
-        raise DataError(f"{desk} cannot be made ({error.strerror}). Nothing has moved or was acquired.") from error
-    thread = threading.Thread(target=obey, name="control", daemon=True)
+        raise DataError(f"{requests} cannot be made ({error.strerror}). Nothing has moved or was acquired.") from error
+    thread = threading.Thread(target=take_verbs, name="control", daemon=True)
     thread.start()
     try:
         yield
@@ -65,8 +65,8 @@ def obeying(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[No
         thread.join(_ANSWER)
         with suppress(OSError):
             for verb in Verb:
-                _taken(desk / verb)
-            desk.rmdir()
+                _taken(requests / verb)
+            requests.rmdir()
 
 
 def _taken(request: Path) -> bool:
@@ -80,7 +80,8 @@ def _taken(request: Path) -> bool:
 
 def running(runs: Path) -> list[Path]:
     """The runs in a folder whose scan is running, oldest first."""
-    return sorted(desk.parent for desk in runs.glob(f"*/{CONTROL}") if held(desk.parent / SCAN))
+    newest = ((run, parts_of(run)[-1]) for run in runs.glob("*/"))
+    return sorted(run for run, part in newest if (part / CONTROL).is_dir() and held(part / SCAN))
 
 
 def tell(run: Path, verb: Verb) -> State:
@@ -90,7 +91,8 @@ def tell(run: Path, verb: Verb) -> State:
         ConfigError: no scan runs there, or none that answers within 5 s; the request is withdrawn.
         DataError: the request cannot be made.
     """
-    request = run / CONTROL / verb
+    part = parts_of(run)[-1]
+    request = part / CONTROL / verb
     if not request.parent.is_dir():
         raise ConfigError(f"no scan runs in {run}. Nothing was changed.")
     try:
@@ -104,8 +106,8 @@ def tell(run: Path, verb: Verb) -> State:
             f"the scan in {run} does not answer: it has died, or its disk hangs. Nothing was changed. If it has died, "
             "look at the instrument, and run `beamline recover` on its file."
         )
-    _within(_EFFECT, lambda: _done(state_of(run), verb))
-    return state_of(run)
+    _within(_EFFECT, lambda: _done(state_of(part), verb))
+    return state_of(part)
 
 
 def state_of(run: Path) -> State:

@@ -13,7 +13,7 @@ from beamline.core.errors import BeamlineError, InstrumentError
 from beamline.core.events import Emit
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
-from beamline.plan.timeline import move_seconds, pass_ends
+from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.ledger import EXTRA, Account, Exposed, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
@@ -27,7 +27,7 @@ POLL = 0.02  # s between looks at a moving stage
 PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera is silent; at least
 PATIENCE_PERIODS = 10  # so many trigger periods
 RAMP_TOLERANCE = 0.1  # of what the acceleration adds to the time of the first pulse
-SILENT_EXPOSURES = 3  # software triggers in a row without a frame
+SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera is taken for silent
 
 
 @dataclass
@@ -187,21 +187,24 @@ class Exposures:
         self._wait(seconds, until_stop=False)
 
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
-        ends, firsts = pass_ends(block), np.cumsum([0, *(train.n for train in block.trains)])
-        i = 0
-        while (i := self._next(i, block, taken)) < block.n and not self._stop.stopping:  # in a pass only after a pause
-            k = int(np.searchsorted(firsts, i, "right")) - 1
-            train, (start, end), done = block.trains[k], ends[k], i - int(firsts[k])
+        ahead, i = passes(block), 0
+        # It begins within a pass only after a pause.
+        while (i := self._after_pause(i, block, taken)) < block.n and not self._stop.stopping:
+            flown = next(flown for flown in ahead if i < flown.first + flown.train.n)
+            train, done = flown.train, i - flown.first
             self._supervision.states.enter(State.TAXI)
-            begin = start + float(block.angles[i] - block.angles[firsts[k]])
+            begin = flown.start + float(block.angles[i] - block.angles[flown.first])
             if not self.go(begin):
                 return
-            ahead = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
-            i += yield from self._pass(block, taken, ahead, i, (begin, end))
+            left = TriggerTrain(train.start + done * train.interval, train.interval, train.n - done)
+            i += yield from self._pass(block, taken, left, i, (begin, flown.end))
 
-    def _next(self, i: int, block: Block, taken: Taken) -> int:
-        """Wait while the scan is paused. Returns the trigger to go on with: `i`, or the first one since there may have
-        been no beam; its frame and those after it are taken again."""
+    def _after_pause(self, i: int, block: Block, taken: Taken) -> int:
+        """Wait while the scan is paused. Returns the trigger to go on with: `i` or the next one that is not stored, or
+        the first one since there may have been no beam; its frame and those after it are taken again."""
+        i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
+        if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
+            self._supervision.wait_for_beam_reading()
         self._wait_while_paused()
         since = self._supervision.pause.take_unlit_since()
         doubtful = [trigger for trigger, (_, time) in taken.rows.items() if time + block.exposure > since]
@@ -238,7 +241,7 @@ class Exposures:
             taken.enter(settle(flight.ledger, cut_short), first)
         self._stage.disarm()
         self._camera.disarm()
-        if flight.ledger.last < 0 and not cut_short:
+        if flight.ledger.last < 0 and not cut_short and train.n >= SILENT_EXPOSURES:
             raise InstrumentError(
                 f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned from "
                 f"{math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Check the trigger cable, its polarity "
@@ -265,7 +268,7 @@ class Exposures:
         patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
         first_pulse = flight.ledger.train.first or 0.0
         wait = patience + max(0.0, first_pulse - self._clock.now())
-        braking = False
+        silent_at, braking = self._clock.now() + wait, False
         while not flight.so_far.complete:
             if self._interrupted and not braking:
                 flight.braked, flight.paused = self._clock.now(), not self._stop.stopping
@@ -273,10 +276,10 @@ class Exposures:
                 braking = True
             frame = self._next_frame(tail + 2 * block.period if braking else wait, until_stop=not braking)
             if frame is not None:
-                wait = patience
+                wait, silent_at = patience, self._clock.now() + patience
                 if not flight.paused or frame.time + tail <= flight.braked:
                     yield from flight.enter(frame)
-            elif braking or not self._interrupted:
+            elif braking or self._clock.now() >= silent_at:  # before that a pause was asked for, or also taken back
                 if not self._stage.moving():
                     break
                 if not braking and self._clock.now() >= flight.last_due + tail:
@@ -302,7 +305,7 @@ class Exposures:
         position = self._stage.position()
         triggered, silent = -math.inf, 0
         owed, i = self._stop.stopping, -1
-        while (after := self._next(i + 1, block, taken)) < block.n:
+        while (after := self._after_pause(i + 1, block, taken)) < block.n:
             if after <= i:
                 self._arm_anew(block.n - after)
             i, angle = after, block.angles[after]

@@ -65,21 +65,26 @@ class DryRun:
             "skew_px": worked.skew_px,
             "min_period": self.camera.min_period,
             "blocks": [
-                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": b.first_row, "n": b.n} for b in worked.blocks
+                {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.left}
+                for b, row in zip(worked.blocks, worked.first_rows, strict=True)
             ],
         }
 
 
-def dry_run(settings: Config) -> DryRun:
+def dry_run(settings: Config, runs: Path | None = None, stored: frozenset[int] = frozenset()) -> DryRun:
     """Work out a configuration without asking a device.
+
+    Args:
+        runs: where the file would be, for the free disk; the configured folder unless given.
+        stored: views that are not taken again.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
             here: they are the timeline's violations.
     """
-    plan = plan_of(settings)
+    plan = replace(plan_of(settings), stored=stored)
     stage, camera, to_counts = connect.describe(settings)
-    free = free_bytes(Path(settings.storage.folder))
+    free = free_bytes(runs or Path(settings.storage.folder))
     worked = work_out(
         plan,
         stage,
@@ -145,11 +150,12 @@ class ReadyScan:
     info: ScanInfo
 
 
-def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
+def preflight(config: Config, instrument: Instrument, runs: Path, stored: frozenset[int] = frozenset()) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
         runs: where the file will be, for the free disk.
+        stored: views that are not taken again.
 
     Raises:
         ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot
@@ -157,7 +163,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path) -> ReadyScan:
         DeviceRefused: the camera does not take its settings.
     """
     stage, camera = instrument.devices.stage, instrument.devices.camera
-    plan = plan_of(config)
+    plan = replace(plan_of(config), stored=stored)
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, free = camera.timing, free_bytes(runs)
     axis_col = config.optics.axis_col
@@ -187,6 +193,7 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
         saturation=2**timing.bits - 1,
         pixels=math.prod(timing.shape),
         period=timeline.views.period if plan.mode is Mode.FLY else None,
+        stored=plan.stored,
         cone=info.source_distance_mm is not None,
         axis_col=info.axis_col,
     )

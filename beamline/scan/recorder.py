@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import shutil
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from queue import Full, Queue
+from queue import Empty, Full, Queue
 from typing import Any, Protocol
 
 import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, user_message
 from beamline.core.events import Emit
+from beamline.core.stop import PauseRequest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
 from beamline.monitor.digest import FrameDigest, digest
@@ -22,10 +26,13 @@ from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
+from beamline.scan.supervision import BacklogGuard, SpaceGuard
 from drivers.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # at least and at most
+LOOK = 1.0  # real s between two looks at the free space
+BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
 STALL = 60.0  # real s without a frame written, after which the disk is taken for dead
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
@@ -44,10 +51,12 @@ class Writer(Protocol):
 class Recorder:
     """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
 
-    No frame is dropped: while the disk is behind, `put` waits.
+    No frame is dropped: while the disk is behind, `put` waits. So that it need not in a fly scan, whose frames come
+    whether there is room or not, the scan pauses before; and any scan before the disk is full.
 
     Args:
         react: told the flags of each frame.
+        pause: what pauses the scan.
 
     Attributes:
         n_frames: written so far.
@@ -63,6 +72,7 @@ class Recorder:
         preview_bin: int,
         emit: Emit,
         react: Callable[[tuple[Flag, ...]], None] = lambda flags: None,
+        pause: PauseRequest | None = None,
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
         self._emit, self._react = emit, react
@@ -73,13 +83,19 @@ class Recorder:
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
-        self._retaken = 0
+        self._retaken, self._retaking = 0, False
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
         low, high = WAITING_FRAMES
-        self._waiting: Queue[Frame | threading.Event | None] = Queue(
-            min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
-        )
+        room = min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
+        self._waiting: Queue[Frame | threading.Event | None] = Queue(room)
+        self._row_bytes = timeline.total_bytes // timeline.n_frames
+        pause, views = pause or PauseRequest(), timeline.views
+        on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
+        self._space = SpaceGuard(self._row_bytes * (room + on_the_way), pause)
+        self._backlog = BacklogGuard(room, pause) if views.trains else None
+        self._flying = False
+        self._looked_at, self._busy_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
@@ -90,6 +106,19 @@ class Recorder:
             DataError: the disk takes no frames, or a frame before could not be written.
         """
         self._enqueue(frame)
+        if frame.kind is not FrameKind.INVALID:  # which comes in any block
+            self._flying = frame.kind is FrameKind.PROJECTION and not self._retaking
+        self._look_at_backlog()
+        self._raise_failure()
+
+    def check(self) -> None:
+        """Look whether the disk answers, while no frames come.
+
+        Raises:
+            DataError: it has not taken a frame for STALL, or failed.
+        """
+        if time.monotonic() - self._busy_since > STALL:
+            raise self._stalled()
         self._raise_failure()
 
     def wait(self) -> None:
@@ -151,6 +180,7 @@ class Recorder:
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Frames beside the timeline's come next; may be called while no frame waits."""
+        self._retaking = True
         self._progress.expect_more(self.n_frames, n, seconds)
 
     @property
@@ -181,16 +211,34 @@ class Recorder:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _run(self) -> None:
-        while (frame := self._waiting.get()) is not None:
+        while (frame := self._next()) is not None:
             if isinstance(frame, threading.Event):
                 frame.set()
                 continue
             if self._failure is not None:
                 continue  # frames after a failure are discarded, so that `put` does not wait for a place in the queue
+            self._busy_since = time.monotonic()
             try:
                 self._record(frame)
             except Exception as error:
                 self._failure = error
+            self._busy_since = math.inf
+
+    def _next(self) -> Frame | threading.Event | None:
+        """What comes next in the queue; looks at the disk about once a second meanwhile."""
+        while True:
+            self._look_at_backlog()
+            if time.monotonic() - self._looked_at > LOOK:
+                self._looked_at = time.monotonic()
+                with suppress(OSError):  # a failing disk ends the scan where it takes no frame
+                    left = max(0, self._progress.total - self.n_frames) * self._row_bytes
+                    self._space(shutil.disk_usage(self._writer.path.parent).free, left)
+            with suppress(Empty):
+                return self._waiting.get(timeout=LOOK)
+
+    def _look_at_backlog(self) -> None:
+        if self._backlog is not None:
+            self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames come when `put` lets them
 
     def _record(self, frame: Frame) -> None:
         found = digest(frame.counts, self._monitor.context.saturation, self._preview_bin)
@@ -198,6 +246,8 @@ class Recorder:
         self._writer.append(frame, found, flags)
         self.references.add(frame, found)
         self.n_frames += 1
+        if frame.kind is FrameKind.INVALID or (frame.replaces >= 0 and not self._retaking):
+            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and nobody announced it
         self._report(frame, flags)
         data = self._progress.update(frame, self.n_frames)
         if data is not None:
@@ -240,9 +290,9 @@ class _Progress:
     """Data of the `frame` event: frames written, rate, time left."""
 
     def __init__(self, timeline: Timeline) -> None:
-        self._total, self._bytes = timeline.n_frames, timeline.frame_bytes
+        self.total, self._bytes = timeline.n_frames, timeline.frame_bytes
         # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
-        periods = np.concatenate([np.full(block.n, block.period) for block in timeline.blocks])
+        periods = np.concatenate([np.full(block.left, block.period) for block in timeline.blocks])
         self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
         self._times: deque[float] = deque(maxlen=RATE_FRAMES)
         self._last_event = -EVENT_INTERVAL
@@ -251,22 +301,22 @@ class _Progress:
         """After `done` frames `n` come that were not planned, in `seconds`."""
         before, after = self._ahead[: done + 1] + seconds, self._ahead[done:]
         self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
-        self._total += n
+        self.total += n
 
     def update(self, frame: Frame, n: int) -> Mapping[str, Any] | None:
         """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)
         now = time.monotonic()
-        if now - self._last_event < EVENT_INTERVAL and n < self._total:
+        if now - self._last_event < EVENT_INTERVAL and n < self.total:
             return None
         self._last_event = now
         span = self._times[-1] - self._times[0]
         rate = (len(self._times) - 1) / span if span > 0 else 0.0
         return {
             "n": n,
-            "of": self._total,
+            "of": self.total,
             "kind": frame.kind.name.lower(),
             "frames_per_s": rate,
             "mb_per_s": rate * self._bytes / 1e6,
-            "eta_s": float(self._ahead[min(n, self._total)]),
+            "eta_s": float(self._ahead[min(n, self.total)]),
         }

@@ -22,15 +22,17 @@ from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count
 from beamline.instrument.connect import Instrument, connect
 from beamline.instrument.operator import enter_pressed
+from beamline.instrument.simulated import clock_of
 from beamline.plan.plan import Block
 from beamline.plan.retake import Retake, spread
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog
-from beamline.scan.control import obeying
+from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction
 from beamline.scan.preflight import ReadyScan, preflight
 from beamline.scan.recorder import Recorder
+from beamline.scan.resume import ResumableRun
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, Supervision
@@ -62,7 +64,7 @@ class RunResult:
     """A finished scan.
 
     Attributes:
-        path: the scan file; its folder holds everything else.
+        path: the scan file; its folder holds everything else. Of a run that went on: the file that joins its parts.
         n_frames: rows of the file.
         missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
         flags: frames that the monitor flagged: their number by check, then by level.
@@ -71,7 +73,7 @@ class RunResult:
         retaken: views that were taken again, because they had one or gave no frame.
         reference_faults: what is wrong with darks and flats, a sentence or more a group.
         seconds: real time of the whole run.
-        bytes: size of the scan file.
+        bytes: size of the file that was written.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
     """
 
@@ -90,7 +92,7 @@ class RunResult:
 
 def run_scan(
     config: Config,
-    runs: Path | None = None,
+    runs: Path | ResumableRun | None = None,
     sinks: Sequence[Sink] = (),
     stop: StopRequest | None = None,
     *,
@@ -102,7 +104,8 @@ def run_scan(
     """Run the scan that `config` describes.
 
     Args:
-        runs: the folder in which the run gets its own; the configured one unless given.
+        runs: the folder in which the run gets its own; the configured one unless given. Or the run that goes on, with
+            the configuration that it has.
         sinks: besides events.jsonl and user.log in the run's folder.
         stop: ends the scan from another thread or a signal handler.
         live: gives the command line of a live reconstruction; None: there is none.
@@ -111,7 +114,8 @@ def run_scan(
         ask: puts a request to the operator, where the shutter or the sample is moved by hand.
 
     Raises:
-        ConfigError: the plan breaks a limit; nothing has moved and no folder was made.
+        ConfigError: the plan breaks a limit, or the instrument is not that of the run that goes on; nothing has moved
+            and no folder was made.
         DeviceError, InstrumentError: a device failed. ScanStopped, ScanAborted: it was requested.
         ReferencesError: darks or flats cannot be used; no projection was taken.
         DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
@@ -119,14 +123,18 @@ def run_scan(
     """
     began = time.monotonic()
     stop = stop or StopRequest()
-    runs = runs or Path(config.storage.folder)
+    series = runs if isinstance(runs, ResumableRun) else None
+    place = runs.run if isinstance(runs, ResumableRun) else runs or Path(config.storage.folder)
+    clock = None
+    if series and config.simulation is not None:  # a simulated clock starts anew in each process
+        clock = clock_of(config.simulation.clock, not_before=series.last_frame_time)
     with ExitStack() as connected:
         instrument = instrument or connected.enter_context(
-            connect(config, ask=ask, check_stop=lambda: _refuse_stop(stop))
+            connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
         )
-        ready = preflight(config, instrument, runs)
+        ready = preflight(config, instrument, place, series.views if series else frozenset())
         _refuse_stop(stop)
-        folder = create_run_folder(runs, config.sample.name, SystemClock().now())
+        folder = series.begin(ready) if series else create_run_folder(place, config.sample.name, SystemClock().now())
         with ExitStack() as stack:
             try:
                 (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
@@ -137,8 +145,8 @@ def run_scan(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
-            run = _Run(config, instrument, ready, folder, stop, emit, began)
-            stack.enter_context(obeying(folder, stop, run.pause))
+            run = _Run(config, instrument, ready, folder, stop, emit, began, series)
+            stack.enter_context(verbs_taken(folder, stop, run.pause))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
                 guarded.enter_context(watched(folder, emit))
@@ -173,6 +181,7 @@ class _Run:
     stop: StopRequest
     emit: Emit
     began: float
+    series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
     told: set[str] = field(default_factory=set)
     """Groups of references whose faults were told."""
@@ -184,7 +193,7 @@ class _Run:
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
         try:
-            self.states.enter(State.PREPARING, "Preparing")
+            self.states.enter(State.PREPARING, "Preparing" if self.series is None else self.series.said)
             result = self._scan(live, release)
             if afterwards is not None:
                 result = self._reconstructed(afterwards, result)
@@ -225,9 +234,10 @@ class _Run:
         self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
     ) -> RunResult:
         recorder = self._recorder(writer)
-        acquisition = self._acquisition(recorder)
+        beam = self._beam_log()
+        acquisition = self._acquisition(recorder, beam)
         labels = LabelLog()
-        with self._beam_log() as beam:
+        with beam:
             error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
         self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
         disk = _failure_of(recorder.finish)
@@ -244,9 +254,15 @@ class _Run:
         for remark in writer.remarks:
             self.emit("warning", {"message": remark})
         error = self._worse(error, _failure_of(release))
+        path, n_frames = writer.path, writer.committed
+        if self.series is not None and n_frames and unfinished is None:
+            try:
+                path, n_frames = self.series.join(path)
+            except DataError as failure:
+                error = self._worse(error, failure)
         result = RunResult(
-            path=writer.path,
-            n_frames=writer.committed,
+            path=path,
+            n_frames=n_frames,
             missing=tuple(missing),
             flags=recorder.flags,
             alarmed_frames=recorder.alarmed_frames,
@@ -309,18 +325,28 @@ class _Run:
             preview_bin=self.config.storage.preview_bin,
             emit=self.emit,
             react=AlarmReaction(policy, self.stop, self.pause, self.emit),
+            pause=self.pause,
         )
 
-    def _acquisition(self, recorder: Recorder) -> Acquisition:
+    def _acquisition(self, recorder: Recorder, beam: BeamLog) -> Acquisition:
         ready, instrument = self.ready, self.instrument
         return Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.emit,
             Supervision(
-                lambda: self._refusal(recorder), self.pause, _rest, self.states,
-                lambda missing: self._retakes(recorder, missing),
+                lambda: self._refusal(recorder), self.pause, lambda: _wait_in_pause(recorder), self.states,
+                lambda missing: self._retakes(recorder, missing), lambda: self._wait_for_reading(beam),
             ),
         )  # fmt: skip
+
+    def _wait_for_reading(self, beam: BeamLog) -> None:
+        """Where the scan pauses without beam: wait until the beam was read after the last frame of a block."""
+        chosen = self.config.devices.beam_monitor
+        if isinstance(chosen, NoBeamMonitor) or chosen.pause_below is None:
+            return
+        over = beam.next_reading_done()
+        while not over() and not self.stop.stopping:
+            time.sleep(PAUSE_POLL)
 
     def _refusal(self, recorder: Recorder) -> str | None:
         """Why no projection should be taken after these darks and flats; None where none, or the operator wants it."""
@@ -388,9 +414,10 @@ class _Run:
         }
 
 
-def _rest() -> bool:
-    """Wait a moment, while paused; whether Enter was pressed at the terminal."""
+def _wait_in_pause(recorder: Recorder) -> bool:
+    """Wait a moment, while paused, and look whether the disk works; whether Enter was pressed at the terminal."""
     time.sleep(PAUSE_POLL)
+    recorder.check()
     return enter_pressed()
 
 

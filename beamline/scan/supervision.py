@@ -10,15 +10,17 @@ from dataclasses import dataclass, field
 
 from beamline.core.events import Emit
 from beamline.core.stop import PauseRequest, StopRequest
+from beamline.core.text import size
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.plan.retake import Retake
 from beamline.scan.states import State, StateMachine
 from drivers.protocols import BeamReading
 
+CLOSING = 20_000_000  # bytes that a file may take to be closed, with its /exchange view
 PAUSE_POLL = 0.05  # real s between looks at a paused scan
 
 
-def _rest() -> bool:
+def _wait_in_pause() -> bool:
     time.sleep(PAUSE_POLL)
     return False
 
@@ -31,17 +33,20 @@ class Supervision:
         refusal: asked once, before the first projection, when all frames before it were taken over: why no projection
             should be taken; None: they may be.
         pause: looked at before each frame of a stage that stands, and all the time while it turns.
-        rest: called again and again while the scan is paused: waits a moment, and says whether the operator at the
-            terminal let it go on since the last call.
+        wait_in_pause: called again and again while the scan is paused: waits a moment, and says whether the operator at
+            the terminal let it go on since the last call.
         states: told what the scan is doing.
+        wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there
+            was beam.
         retakes: asked once, after the last projection: which to take again; is given the triggers without a frame.
     """
 
     refusal: Callable[[], str | None] = lambda: None
     pause: PauseRequest = field(default_factory=PauseRequest)
-    rest: Callable[[], bool] = _rest
+    wait_in_pause: Callable[[], bool] = _wait_in_pause
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
+    wait_for_beam_reading: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,51 @@ class BeamGuard:
         if reading.time - self._back >= limits.settle:
             self._paused, self._back, self._good = False, None, reading.time
             self._pause.beam_back()
+
+
+class SpaceGuard:
+    """Pauses a scan before its disk is full, until there is space for twice as much.
+
+    Args:
+        reserve: bytes that must stay free for the frames that still come when the scan is to pause.
+    """
+
+    def __init__(self, reserve: int, pause: PauseRequest) -> None:
+        self._reserve, self._pause = reserve, pause
+
+    def __call__(self, free: int, left: int) -> None:
+        """Take note of the bytes that are free, and of those that are still to be written."""
+        again = min(2 * self._reserve, left) + CLOSING
+        if left and free < min(self._reserve, left) + CLOSING:
+            self._pause.hold(
+                "space",
+                f"{size(free)} are free on the scan's disk, and {size(left)} are still to come. Free some: at "
+                f"{size(again)} the scan goes on by itself",
+            )
+        elif not left or free >= again:
+            self._pause.release("space")
+
+
+class BacklogGuard:
+    """Pauses a fly scan before frames come that find no room, until few wait for the disk.
+
+    Args:
+        room: frames that may wait.
+    """
+
+    def __init__(self, room: int, pause: PauseRequest) -> None:
+        self._room, self._pause = room, pause
+
+    def __call__(self, waiting: int) -> None:
+        """Take note of the frames that wait."""
+        if 4 * waiting >= 3 * self._room:
+            self._pause.hold(
+                "backlog",
+                f"the disk is behind, {waiting} of at most {self._room} frames wait in memory. The scan goes on by "
+                "itself when most of them are written; a longer period_s or a faster disk spares the pauses",
+            )
+        elif 4 * waiting <= self._room:
+            self._pause.release("backlog")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from beamline.config.devices import StageOutputShutter
 from beamline.config.load import Config, load
 from beamline.core.events import Emit
 from beamline.core.process import ChildProcess
@@ -50,8 +51,9 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     Args:
         say: takes a sentence on each step.
     """
-    stage = config.devices.stage
+    stage, shutter = config.devices.stage, config.devices.shutter
     settings, port = stage.settings, stage.port
+    closed = "its shutter is closed" if isinstance(shutter, StageOutputShutter) else "the shutter is moved by hand"
 
     def disarm() -> None:
         with closing(settings.connect(port, clock)) as connected:
@@ -59,7 +61,7 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
             shutter_of(config, connected, clock, say).close()
 
     stopped = _insist(lambda: settings.halt(port, clock), clock, say, "The stage was told to stop.")
-    return _insist(disarm, clock, say, "The stage stands, its trigger output is disarmed.") and stopped
+    return _insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}.") and stopped
 
 
 def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], done: str) -> bool:

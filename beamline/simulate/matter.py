@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 
+from recon.prep.phase import HC
 from simulators.light.beam import Beam, Tube
 from simulators.light.materials import Material, Reals, of_formula
 from simulators.light.palette import known, known_names
@@ -14,7 +15,6 @@ from simulators.light.spectrum import Spectrum, light
 
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _DEEP = 10.0  # line integral up to which a tube's spectrum is refined
-_HC = 1.239841984e-6  # keV mm (CODATA 2018)
 
 
 def delta_beta(name: str, energy_kev: float) -> float:
@@ -27,7 +27,7 @@ def delta_beta(name: str, energy_kev: float) -> float:
         ValueError: neither of them, or an energy outside the tables.
     """
     material = _material(name)
-    beta = float(material.attenuation(energy_kev)) * _HC / energy_kev / (4 * math.pi)
+    beta = float(material.attenuation(energy_kev)) * HC / energy_kev / (4 * math.pi)
     return material.decrement(energy_kev) / beta
 
 

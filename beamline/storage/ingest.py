@@ -121,6 +121,8 @@ def _copy(
     layout.create(file, info, source.shape, dtype, quantity=source.quantity, preview_bin=4, start=None)
     if no_data is not None:
         file["/entry/record/no_data"] = float(no_data)
+    if source.part_starts.size > 1:
+        file[layout.PART_STARTS] = source.part_starts
     rows = layout.Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0

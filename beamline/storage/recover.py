@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
-import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.text import count
 from beamline.storage import hdf5
+from beamline.storage.parts import views_in, views_planned
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import held
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
-from drivers.frame import FrameKind
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
 
@@ -126,11 +124,8 @@ def _finished(path: Path, file: h5py.File) -> Recovered:
 
 
 def _views_missing(file: h5py.File) -> int | None:
-    planned = json.loads(file["/entry/record/plan"].asstr()[()]).get("angles_deg")
-    if planned is None:
-        return None
-    taken = file["/entry/frame_log/trigger"][()][file[layout.KIND][()] == FrameKind.PROJECTION]
-    return int(np.setdiff1d(np.arange(len(planned)), taken).size)
+    planned = views_planned(file)
+    return None if planned is None else planned - len(views_in(file))
 
 
 def _write_head(path: Path, head: Superblock) -> None:

@@ -20,14 +20,29 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
     Raises:
         DataError: the disk has not so much space.
     """
-    wanted, free = 4 * int(np.prod(shape, dtype=np.int64)), shutil.disk_usage(folder).free
-    refusal = f"{folder} needs {size(wanted)} for scratch, and {size(free)} are free. Write the output to another disk."
-    if wanted > free:
-        raise DataError(refusal)
+    wanted = 4 * int(np.prod(shape, dtype=np.int64))
     with tempfile.TemporaryFile(dir=folder) as file:  # the map keeps it open
-        if hasattr(os, "posix_fallocate"):  # space that is not there is missed now, not in the middle of the work
-            try:
-                os.posix_fallocate(file.fileno(), 0, wanted)
-            except OSError as error:
-                raise DataError(refusal) from error
+        reserve(file.fileno(), wanted, folder)
         return np.memmap(file, np.float32, "r+" if os.fstat(file.fileno()).st_size == wanted else "w+", shape=shape)
+
+
+def reserve(descriptor: int, wanted: int, folder: Path) -> None:
+    """Take so many bytes for an open file in the folder where the system can: space that is not there is missed now,
+    not in the middle of the work.
+
+    Raises:
+        DataError: the disk has not so much space.
+    """
+    there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
+    taken = 512 * there.st_blocks if hasattr(there, "st_blocks") else there.st_size
+    refusal = (
+        f"{folder} has {size(free)} free, and {size(wanted - taken)} more are needed while the volume is made. Write "
+        "the output to another disk. Nothing was written."
+    )
+    if wanted - taken > free:
+        raise DataError(refusal)
+    if hasattr(os, "posix_fallocate"):
+        try:
+            os.posix_fallocate(descriptor, 0, wanted)
+        except OSError as error:
+            raise DataError(refusal) from error

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import sys
 import weakref
-from contextlib import suppress
 from pathlib import Path
 
 if sys.platform == "win32":
@@ -16,26 +15,34 @@ if sys.platform == "win32":
 
     _BEYOND = 2**62  # a byte that no file has: Windows lets nobody read or write one that is locked
 
-    def _lock(file: int, *, alone: bool) -> None:
+    def _lock(file: int, *, exclusive: bool) -> None:
         os.lseek(file, _BEYOND, os.SEEK_SET)
         msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
 
 else:
     import fcntl
 
-    def _lock(file: int, *, alone: bool) -> None:
+    def _lock(file: int, *, exclusive: bool) -> None:
         # Shared by the writer, because HDF5 takes a shared lock to open a file for reading.
-        fcntl.flock(file, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        fcntl.flock(file, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
 
 
 class WriterLock:
-    """Held from now on until `release`, or until this process ends. Nothing is held where the disk has no locks."""
+    """Held from now on until `release`, or until this process ends. Nothing is held where the disk has no locks.
 
-    def __init__(self, path: Path) -> None:
+    Args:
+        exclusive: take an exclusive lock, and raise OSError where another process holds one; else a shared one.
+    """
+
+    def __init__(self, path: Path, *, exclusive: bool = False) -> None:
         file = os.open(path, os.O_RDWR)
         self.release = weakref.finalize(self, os.close, file)
-        with suppress(OSError):
-            _lock(file, alone=False)
+        try:
+            _lock(file, exclusive=exclusive)
+        except OSError as error:
+            if exclusive and isinstance(error, BlockingIOError | PermissionError):
+                self.release()
+                raise
 
 
 def held(path: Path) -> bool:
@@ -45,7 +52,7 @@ def held(path: Path) -> bool:
     except OSError:
         return False
     try:
-        _lock(file, alone=True)
+        _lock(file, exclusive=True)
     except (BlockingIOError, PermissionError):
         return True
     except OSError:  # no locks on this disk

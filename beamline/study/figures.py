@@ -3,60 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from beamline.core.files import named_on_failure, whole_file
 from beamline.core.machine import machine_line
-from beamline.report.figures import bright_centre, grey_window, png
+from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
+from beamline.report.slice_sheet import Slices
 from beamline.study.table import HEADINGS, StudyTable, formatted, write_text
 from recon.methods import by_name
-
-F32 = NDArray[np.float32]
-_COLUMNS, _WIDTH, _DPI = 4, 8.6, 110
-
-
-class Slices:
-    """The slice [y, x] of each volume through the bright parts of the first one, by label."""
-
-    def __init__(self, first: F32, label: str) -> None:
-        self._at = bright_centre(first)[0]
-        self._shown: dict[str, F32] = {label: first[self._at].copy()}
-        self._drawn: set[tuple[str, str]] = set()
-
-    def add(self, label: str, volume: F32, family: str = "", method: str = "") -> None:
-        """One more; of the rows of one family by one method the first alone."""
-        if family and (family, method) in self._drawn:
-            return
-        self._drawn.add((family, method))
-        self._shown[label] = volume[self._at].copy()
-
-    def labels(self, method: str) -> list[str]:
-        """Those of a method, after those that are of no row."""
-        return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
-
-    def png(self, labels: Sequence[str]) -> bytes:
-        """These slices, four beside one another, in the grey window of the first."""
-        low, high = grey_window([self._shown[labels[0]]])
-        rows, cols = self._shown[labels[0]].shape
-        head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // _COLUMNS)
-        # One image: a panel for each slice takes ten times as long to draw.
-        sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
-        size = (_WIDTH, _WIDTH * sheet.shape[0] / sheet.shape[1])
-        figure = Figure(figsize=size, dpi=_DPI)
-        axes = figure.add_axes((0, 0, 1, 1))
-        axes.set_axis_off()
-        for i, label in enumerate(labels):
-            top, left = i // _COLUMNS * (rows + head), i % _COLUMNS * (cols + gap)
-            sheet[top + head : top + head + rows, left : left + cols] = self._shown[label][::-1]  # y grows upwards
-            axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
-        axes.imshow(sheet, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
-        return png(figure)
 
 
 def figures_of_rows(table: StudyTable) -> bytes:
@@ -64,7 +22,7 @@ def figures_of_rows(table: StudyTable) -> bytes:
     names, rows = table.names, list(dict.fromkeys(cell.row.label for cell in table.done))
     down = -(-len(names) // 2)
     height = 2.0 * down + 2.2
-    figure = Figure(figsize=(_WIDTH, height), dpi=_DPI)
+    figure = Figure(figsize=(WIDTH, height), dpi=DPI)
     panels = np.ravel(figure.subplots(down, 2, squeeze=False, sharex=True))
     figure.subplots_adjust(0.08, 2.1 / height, 0.99, 1 - 0.1 / height, wspace=0.2, hspace=0.12)
     for axes, name in zip(panels, names, strict=False):

@@ -21,8 +21,9 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth, regions
 from beamline.reconstruct.recon_report import facts_of
+from beamline.report.slice_sheet import Slices
 from beamline.storage.readers.open import SourceOptions
-from beamline.study.figures import Slices, write_page
+from beamline.study.figures import write_page
 from beamline.study.studies import Row, Study, ViewSet, averaged
 from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data
@@ -126,7 +127,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     for cell in table.cells:
         if cell.row.groups is None and cell.method == options.methods[0]:
             warn(f"{cell.row.label} is left out: {cell.message}")
-    slices: Slices | None = None
+    slices = Slices()
     with result_folder(folder) as work:
         try:
             with named_on_failure(work / "views.npy"):
@@ -140,7 +141,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
                     f"{options.source.path}: the FBP of all views, to compare with, failed: {outcome.message}"
                 )
             mask = regions(Volume(reference if truth is None else truth, grid), options.seed)
-            slices = Slices(reference, REFERENCE)
+            slices.add(REFERENCE, reference)
             if truth is not None:
                 slices.add("truth", truth)
             rig.compile(options.methods)
@@ -157,7 +158,6 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
                 raise
             table = replace(table, stopped=True)
     write_table(folder, table)
-    assert slices is not None
     write_page(folder, table, slices)
     summary = {"output": folder, "rows": len(todo), "done": len(table.done), "stopped": table.stopped}
     sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))

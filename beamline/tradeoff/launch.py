@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.files import named_on_failure
-from beamline.core.process import ChildProcess, Ending, json_object
+from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
 from beamline.tradeoff.trials import Outcome, Status, Trial
 from recon.base.method import PRECISION
 
@@ -54,11 +53,12 @@ def run_trial(
 
 @dataclass(frozen=True)
 class _Ended:
-    """A process that has ended: its last event, its exit code, its stderr, and whether its time was over."""
+    """A process that has ended: its last event, its exit code, the last line of its stderr, and whether its time was
+    over."""
 
     event: Mapping[str, Any]
     code: int | None
-    stderr: str
+    last_line: str
     out_of_time: bool
 
 
@@ -72,14 +72,12 @@ def _run(job: Mapping[str, Any], work: Path, max_seconds: float | None = None) -
         nonlocal last
         last = json_object(line) or last
 
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with (
         log.open("w", encoding="utf-8") as stderr,
-        ChildProcess(command(path), stderr, remember, environment, tether=True) as process,
+        ChildProcess(command(path), stderr, remember, with_our_path(), tether=True) as process,
     ):
         ending = process.wait(seconds=math.inf if max_seconds is None else max_seconds)
-    text = log.read_text(encoding="utf-8", errors="replace")
-    return _Ended(last, process.code, text, ending is Ending.OUT_OF_TIME)
+    return _Ended(last, process.code, last_line(log), ending is Ending.OUT_OF_TIME)
 
 
 def _outcome(trial: Trial, ended: _Ended) -> Outcome:
@@ -90,6 +88,5 @@ def _outcome(trial: Trial, ended: _Ended) -> Outcome:
     status: Status = "out of time" if ended.out_of_time else "failed"
     if ended.out_of_time:
         return Outcome(trial, status, message="ended: the time given with --max-seconds was over")
-    lines = ended.stderr.strip().splitlines()
-    default = f"its process ended with code {ended.code}" + (f": {lines[-1]}" if lines else "")
+    default = f"its process ended with code {ended.code}" + (f": {ended.last_line}" if ended.last_line else "")
     return Outcome(trial, status, math.nan, message=str(event.get("message", default)))

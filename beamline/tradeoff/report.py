@@ -17,6 +17,7 @@ from beamline.core.machine import machine_line
 from beamline.core.version import version
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
+from beamline.report.slice_sheet import Slices
 from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
 from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
@@ -43,6 +44,12 @@ _COLUMNS = {
     "residual_held_out": _Column("held out", "held-out res.", "residual of views held out"),
     "resolution": _Column("FSC", "FSC ({})", "period in {} to which two halves of the views agree"),
 }
+
+
+_FSC = (
+    "FSC: a smaller period is better among settings of one method only. Two halves that are regularised alike agree "
+    "also in what the prior made, and in rings; no method is sharper than FBP because its FSC is: look at the slices."
+)
 
 
 def text(table: TrialTable) -> str:
@@ -103,6 +110,8 @@ def conclusions(table: TrialTable) -> list[str]:
             f"+{stretch.gain:.2f} dB for {_duration(stretch.cost)} more ({_duration(stretch.per_decibel)} a dB): "
             f"{compared[stretch.end].trial.label}."
         )
+    if any("resolution" in outcome.metrics for outcome in compared):
+        out.append(_FSC)
     out += [_precision(o.details) for o in table.outcomes if o.trial.group == PRECISION and o.details]
     return out
 
@@ -151,8 +160,8 @@ def to_csv(table: TrialTable) -> str:
     return out.getvalue()
 
 
-def write_figures(folder: Path, table: TrialTable) -> None:
-    """Write the pictures, as far as there are data for them, and the page."""
+def write_figures(folder: Path, table: TrialTable, slices: Slices) -> None:
+    """Write the pictures, as far as there are data for them, and the page; `slices` of each baseline, and the truth."""
     pictures = []
     for cost in (TIME, MEMORY):
         if table.front(cost):
@@ -170,6 +179,9 @@ def write_figures(folder: Path, table: TrialTable) -> None:
             "of its Gaussians, which may lie between voxels and outside the volume; the table judges the volume."
         )
         pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
+    if labels := slices.labels():
+        caption = "The same slice by each method with its usual settings, all in the grey window of the first."
+        pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     for name, picture in pictures:
         with named_on_failure(folder / name), whole_file(folder / name, replace=True) as partial:
             partial.write_bytes(picture.png)

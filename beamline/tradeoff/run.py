@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.files import named_on_failure, result_folder
@@ -18,6 +20,7 @@ from beamline.projections.prepare import PreparedProjections, prepare_projection
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.recon_report import facts_of
+from beamline.report.slice_sheet import Slices
 from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
@@ -27,6 +30,7 @@ from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
 from drivers.clock import Clock
 from recon.base.method import Depth
 from recon.base.volume import Grid
+from recon.methods import by_name
 from recon.splatting.initialise import default_count
 
 _HELD_OUT_ONE_IN = 8  # one of so many views is held out if there is no truth
@@ -99,6 +103,9 @@ def run_tradeoff(
         command=options.command,
     )
     sink(Event("tradeoff_started", clock.now(), {"file": options.source.path, "trials": len(trials), "by": table.by}))
+    slices = Slices()
+    if truth is not None:
+        slices.add("truth", truth)
     with result_folder(folder) as work:
         try:
             with named_on_failure(work / "data.npz"):
@@ -106,7 +113,7 @@ def run_tradeoff(
             state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
             sink(Event("state", clock.now(), state))
             compile_kernels(trials, work)
-            for table in _each(table, work, options, sink, clock, now):  # noqa: B020 - each has one more trial than the last
+            for table in _each(table, work, slices, options, sink, clock, now):  # noqa: B020 - each has one more trial than the last
                 write_table(folder, table)
         except KeyboardInterrupt:
             if table.n_done == 0:
@@ -114,7 +121,7 @@ def run_tradeoff(
                 raise
             table = replace(table, stopped=True)
     write_table(folder, table)
-    write_figures(folder, table)
+    write_figures(folder, table, slices)
     summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
     sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))
     return table
@@ -132,9 +139,15 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
 
 
 def _each(
-    table: TrialTable, work: Path, options: TradeoffOptions, sink: Sink, clock: Clock, now: Callable[[], float]
+    table: TrialTable,
+    work: Path,
+    slices: Slices,
+    options: TradeoffOptions,
+    sink: Sink,
+    clock: Clock,
+    now: Callable[[], float],
 ) -> Iterator[TrialTable]:
-    """The table after each trial, and after one that Ctrl-C interrupted."""
+    """The table after each trial, and after one that Ctrl-C interrupted; `slices` take those of the baselines."""
     begin = now()
     timed: list[Timed] = []
     for index, outcome in enumerate(table.outcomes):
@@ -145,12 +158,15 @@ def _each(
         eta = seconds_left(timed, [other.trial for other in table.outcomes[index:]])
         progress = {"stage": "tradeoff", "n": index, "of": len(table.outcomes), "label": trial.label, "eta_s": eta}
         sink(Event("progress", clock.now(), {**progress, "per_min": 60 * index / max(now() - begin, 1e-9)}))
-        started = now()
+        started, keep = now(), work / "volume.npy" if trial.group == "method" else None
         try:
-            result = run_trial(trial, work, options.seed, left)
+            result = run_trial(trial, work, options.seed, left, keep=keep)
         except KeyboardInterrupt:
             yield table.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             raise
+        if keep is not None and keep.exists():
+            slices.add(by_name(trial.method).label, np.load(keep))
+            keep.unlink()
         timed.append(Timed.of(result, now() - started))
         table = table.with_outcome(index, result)
         yield table

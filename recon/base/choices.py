@@ -13,6 +13,7 @@ Filter = Literal["ram-lak", "shepp-logan", "hann"]
 Loss = Literal["l1", "l2", "poisson"]
 Noise = Literal["auto", "log", "counts"]
 Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
+FlatFields = Literal["groups", "dynamic"]
 Start = Literal["fbp", "tv"]
 
 KERNEL = Kernel.COMPACT

@@ -107,6 +107,16 @@ class Grid:
         middle = np.asarray(self.centre[::-1])
         return np.stack((middle - half, middle + half))
 
+    def part(self, z: slice, y: slice, x: slice) -> Grid:
+        """The box of these voxels, slices with first and end."""
+        slices, lowest = (z, y, x), [axis[0] for axis in self.coordinates()]
+        centre = tuple(
+            low + (part.start + part.stop - 1) / 2 * edge
+            for low, part, edge in zip(lowest, slices, self.spacing, strict=True)
+        )
+        nz, ny, nx = (part.stop - part.start for part in slices)
+        return replace(self, shape=(nz, ny, nx), centre=centre)
+
     def coordinates(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Voxel centres along each axis: (z [nz], y [ny], x [nx]) in mm."""
         return tuple(  # type: ignore[return-value]

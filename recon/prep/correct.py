@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_right
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from recon.base.masks import Image, Mask, fill, plan_fill
 from recon.prep.air import air_columns, air_light, edge_profiles
 from recon.prep.counts import Photons, of_view
 from recon.prep.defects import dead_pixels, zingers
+from recon.prep.dynamic_flats import DynamicFlats
 
 
 class UnlitViewsError(ValueError):
@@ -25,10 +27,21 @@ class References:
     Attributes:
         dark: float32 [row, col], mean or median of the darks.
         flats: (position, float32 [row, col]) of each group of flats; the position counts frames of the scan.
+        dynamic: how flats differ from one another; None: a view's flat is interpolated between groups.
+        part_starts: ascending, the first frame of each part of the scan. A view's flat is that of the flats of its own
+            part; of the nearest group, where this part has none.
     """
 
     dark: Image
     flats: tuple[tuple[float, Image], ...]
+    dynamic: DynamicFlats | None = None
+    part_starts: tuple[int, ...] = (0,)
+
+    def rows(self, rows: slice) -> References:
+        """The same of some detector rows."""
+        flats = tuple((position, flat[rows]) for position, flat in self.flats)
+        dynamic = None if self.dynamic is None else self.dynamic.rows(rows)
+        return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
 
 
 @dataclass(frozen=True)
@@ -86,8 +99,11 @@ class Projections:
     weights: NDArray[np.float32] | None = None
 
 
-def _flat_at(position: float, groups: list[tuple[float, Image]]) -> Image:
-    """Net flat at a frame's position: interpolated between groups, the nearest group outside."""
+def _flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
+    """Net flat at a frame's position: interpolated between groups of its part, the nearest group outside."""
+    part = bisect_right(part_starts, position)
+    own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
+    groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
     at = [p for p, _ in groups]
     upper = int(np.searchsorted(at, position))
     if upper == 0 or upper == len(groups):
@@ -149,12 +165,13 @@ class Correction:
         if masked is None:
             masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
         self.masked = masked
-        self._fill, self._photons = plan_fill(masked), photons
+        self._fill, self._photons, self._dynamic = plan_fill(masked), photons, references.dynamic
         with np.errstate(invalid="ignore", over="ignore"):
             self._flats = [
                 (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - self._dark))
                 for position, flat in sorted(references.flats, key=lambda group: group[0])
             ]
+        self._part_starts = references.part_starts
         self._profiles: list[NDArray[np.float32]] = []
         self._before: Image | None = None  # the last view given out, before the logarithm
         self._waiting: tuple[Transmission, NDArray[np.float32]] | None = None  # the newest view, and its air
@@ -205,9 +222,9 @@ class Correction:
         data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
         beam = None if self._photons is None else np.empty(counts.shape, np.float32)
         for v, view in enumerate(data):
-            flat = _flat_at(float(positions[v]), self._flats)
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 np.subtract(counts[v], self._dark, out=view, casting="unsafe")
+                flat = self._flat_of(view, float(positions[v]))
                 view /= flat
             if beam is not None and self._photons is not None:
                 np.divide(flat, np.float32(self._photons.gain), out=beam[v])
@@ -220,6 +237,15 @@ class Correction:
                 )
             fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
         return Transmission(data, ids, repaired, beam)
+
+    def _flat_of(self, view: Image, position: float) -> Image:
+        """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
+        between = _flat_at(position, self._flats, self._part_starts)
+        if self._dynamic is None:
+            return between
+        live = ~self.masked
+        level = between[live].mean() / self._dynamic.mean[live].mean()
+        return np.where(self.masked, np.float32(1), level * self._dynamic.flat_of(view / level, self._settings.floor))
 
     def survey(self, views: Transmission) -> None:
         """Let the views take part in finding the air columns."""

@@ -27,29 +27,29 @@ class NoCurveError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Line integrals as they should be by line integrals as they were seen.
+    """Corrected line integrals by measured ones.
 
     Attributes:
-        seen: float64 [node], ascending from 0.
-        meant: float64 [node], ascending from 0. Below 0 the curve goes on along its first piece, at the end along its
-            last.
+        measured: float64 [node], ascending from 0.
+        corrected: float64 [node], ascending from 0. Below 0 the curve goes on along its first piece, at the end
+            along its last.
     """
 
-    seen: F64
-    meant: F64
+    measured: F64
+    corrected: F64
 
     def __post_init__(self) -> None:
-        rising = (np.diff(self.seen) > 0).all() and (np.diff(self.meant) > 0).all()
-        if self.seen.shape != self.meant.shape or self.seen.size < 2 or not rising:
-            raise ValueError("a curve needs two nodes or more, seen and meant ascending")
+        rising = (np.diff(self.measured) > 0).all() and (np.diff(self.corrected) > 0).all()
+        if self.measured.shape != self.corrected.shape or self.measured.size < 2 or not rising:
+            raise ValueError("a curve needs two nodes or more, measured and corrected ascending")
 
     def linearise(self, views: F32, weights: F32 | None = None) -> None:
-        """Replace line integrals of any shape by those meant, and inverse variances by theirs, in place."""
-        slopes = np.diff(self.meant) / np.diff(self.seen)
+        """Replace line integrals of any shape by corrected ones, and inverse variances by theirs, in place."""
+        slopes = np.diff(self.corrected) / np.diff(self.measured)
         for n, view in enumerate(views):
-            piece = np.clip(np.searchsorted(self.seen, view) - 1, 0, slopes.size - 1)
+            piece = np.clip(np.searchsorted(self.measured, view) - 1, 0, slopes.size - 1)
             slope = slopes[piece]
-            view[...] = self.meant[piece] + slope * (view - self.seen[piece])
+            view[...] = self.corrected[piece] + slope * (view - self.measured[piece])
             if weights is not None:
                 weights[n] /= slope**2
 
@@ -59,21 +59,21 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
     Args:
         weights: shares of the light detected at these energies, of any sum.
-        highest: line integral seen that it must reach.
+        highest: measured line integral that it must reach.
     """
     mu, w = np.asarray(attenuations, np.float64), np.asarray(weights, np.float64)
     mu = mu / (mu @ w / w.sum())
-    meant = np.linspace(0, 1, _NODES) ** 2 * max(highest, 0.1) / mu[w > 0].min()
-    seen = mu[w > 0].min() * meant - np.log(np.exp(-np.outer(meant, mu - mu[w > 0].min())) @ (w / w.sum()))
-    return Curve(seen, meant)
+    corrected = np.linspace(0, 1, _NODES) ** 2 * max(highest, 0.1) / mu[w > 0].min()
+    measured = mu[w > 0].min() * corrected - np.log(np.exp(-np.outer(corrected, mu - mu[w > 0].min())) @ (w / w.sum()))
+    return Curve(measured, corrected)
 
 
-def curve_of_paths(seen: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
+def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
     """The curve of two energies that is closest to line integrals over paths through the material (Van de Casteele et
     al. 2002, Phys. Med. Biol. 47, 4181): it always rises, and less and less.
 
     Args:
-        seen: line integrals.
+        measured: line integrals.
         paths: lengths of the rays inside the material, in any unit; 0 of rays beside it, which have to be air.
         highest: as of `curve_of_spectrum`.
 
@@ -83,7 +83,7 @@ def curve_of_paths(seen: ArrayLike, paths: ArrayLike, highest: float) -> tuple[C
     Raises:
         NoCurveError: there are few rays, or the sample is not of one material.
     """
-    p, length = np.ravel(np.asarray(seen, np.float64)), np.ravel(np.asarray(paths, np.float64))
+    p, length = np.ravel(np.asarray(measured, np.float64)), np.ravel(np.asarray(paths, np.float64))
     few = slice(None, None, max(1, p.size // _MOST_RAYS))
     p, length = p[few], length[few]
     if (inside := np.count_nonzero(length)) < _FEWEST_RAYS:

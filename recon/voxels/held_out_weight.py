@@ -27,6 +27,9 @@ _ROWS = 16  # of the slab that trials see
 _SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3  # of a trial
 _HALVINGS = 5  # at most
 _ROUNDS = 3  # of sweeps, at most
+_BREGMAN_RUNS = 5  # one once, and two twice
+MOST_SWEEPS = _ROUNDS * _SWEEPS
+"""Of a finish, where views held out prefer them."""
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
 _LEVEL = 0.002  # residuals of views held out that differ by less are equal
 
@@ -68,6 +71,13 @@ def choice_sweeps(geometry: Geometry) -> float:
     if not _can_hold_out(geometry):
         return 0.0
     return 3 * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+
+
+def sweeps_choice_cost(geometry: Geometry) -> float:
+    """What `preferred_sweeps`, `sweeps_by_noise` and `bregman_weight` cost at most, in sweeps over all rows."""
+    if not _can_hold_out(geometry):
+        return 0.0
+    return (_ROUNDS + _BREGMAN_RUNS) * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
 
 
 def _can_hold_out(geometry: Geometry) -> bool:

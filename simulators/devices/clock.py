@@ -6,15 +6,17 @@ import threading
 
 from drivers.clock import Clock
 
+VIRTUAL_START = 1_795_152_000.0  # s since the Unix epoch: a round moment (2026-11-20 05:20:00 UTC), so that runs repeat
+
 
 class VirtualClock:
     """Time that moves only when somebody sleeps: `sleep` jumps and returns at once. Safe from several threads.
 
     Args:
-        start: s since the Unix epoch. The default is a round moment (2026-11-20 05:20:00 UTC), so that runs repeat.
+        start: s since the Unix epoch.
     """
 
-    def __init__(self, start: float = 1_795_152_000.0) -> None:
+    def __init__(self, start: float = VIRTUAL_START) -> None:
         self._now = float(start)
         self._lock = threading.Lock()
 
@@ -29,19 +31,20 @@ class VirtualClock:
 
 
 class ScaledClock:
-    """A clock that starts at its base's time and then runs `speed` times as fast.
+    """A clock that starts at its base's time, or at `not_before` where that is later, and runs `speed` times as fast.
 
     Raises:
         ValueError: speed is not positive.
     """
 
-    def __init__(self, base: Clock, speed: float) -> None:
+    def __init__(self, base: Clock, speed: float, not_before: float = 0.0) -> None:
         if not speed > 0:
             raise ValueError(f"a clock's speed must be positive, not {speed}; 1 is the base clock's own")
-        self._base, self._speed, self._start = base, float(speed), base.now()
+        self._base, self._speed, self._base_start = base, float(speed), base.now()
+        self._start = max(self._base_start, not_before)
 
     def now(self) -> float:
-        return self._start + (self._base.now() - self._start) * self._speed
+        return self._start + (self._base.now() - self._base_start) * self._speed
 
     def sleep(self, seconds: float) -> None:
         self._base.sleep(seconds / self._speed)

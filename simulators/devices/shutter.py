@@ -15,6 +15,8 @@ class BeamGate(Protocol):
 class SimulatedShutter:
     """Implements `drivers.protocols.Shutter`; it starts closed, as a beamline does."""
 
+    by_hand = False
+
     def __init__(self, name: str = "shutter") -> None:
         self.name = name
         self._open = False

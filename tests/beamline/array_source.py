@@ -24,7 +24,9 @@ class ArraySource:
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
     flags = None
+    currents: NDArray[np.float64] | None = None
     replaces = None
+    part_starts: NDArray[np.int64] = np.zeros(1, np.int64)
     checksummed = False
     damaged: frozenset[int] = frozenset()
     finished = True

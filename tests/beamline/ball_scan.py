@@ -8,7 +8,7 @@ from beamline.config import load as config
 from beamline.config.models import Config
 from beamline.instrument import connect as devices
 from beamline.plan.plan import Block
-from beamline.plan.timeline import pass_ends
+from beamline.plan.timeline import passes
 from drivers.protocols import TriggerSource
 
 # A ball off the axis and no effects: every frame is Beer-Lambert, so that its angle can be read off the picture.
@@ -39,12 +39,12 @@ def fly(instrument: devices.Instrument, block: Block, settings: Config) -> tuple
     camera.configure(devices.camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))
     stamps, images = [], []
     camera.arm(block.n)
-    for train, (start, stop) in zip(block.trains, pass_ends(block), strict=True):
-        stage.start_move(start, stage.limits.max_speed)
+    for flown in passes(block):
+        stage.start_move(flown.start, stage.limits.max_speed)
         stage.wait(60.0)
-        stage.arm(train)
-        stage.start_move(stop, block.speed)
-        for _ in range(train.n):
+        stage.arm(flown.train)
+        stage.start_move(flown.end, block.speed)
+        for _ in range(flown.train.n):
             frame = camera.next_frame(10.0)
             stamps.append(frame.framestamp)
             images.append(frame.counts)

@@ -298,6 +298,7 @@ class Camera:
 
 class Shutter:
     name = "shutter"
+    by_hand = False
 
     def __init__(self, instrument: FakeInstrument) -> None:
         self.instrument = instrument

@@ -34,6 +34,8 @@ class ScanSource(Protocol):
         image_key: int32 [frame], values of drivers.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
         exposures: float64 [frame] s, NaN where unknown.
+        currents: float64 [frame] of the ring, or what else the file's monitor of the beam reads, in its own unit; NaN
+            where unknown; None where there is no monitor.
         pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
@@ -41,6 +43,8 @@ class ScanSource(Protocol):
         flags: of the monitor, by frame; None where no monitor looked at the frames.
         replaces: int64 [frame], the row of the view that a frame was taken again for (an INVALID frame from then on),
             -1 in others; None where no view was taken again.
+        part_starts: int64 [part], ascending, the first row of each part: between two parts the scan was interrupted,
+            so that beam and camera may have changed. [0] where it was not.
         checksummed: the file holds a checksum of every frame.
         damaged: rows read so far whose pixels are not those that were written, by these checksums; frames of
             which less than half is read are not compared.
@@ -65,6 +69,8 @@ class ScanSource(Protocol):
     @property
     def exposures(self) -> NDArray[np.float64]: ...
     @property
+    def currents(self) -> NDArray[np.float64] | None: ...
+    @property
     def pixel_size_mm(self) -> float | None: ...
     @property
     def energy_kev(self) -> float | None: ...
@@ -78,6 +84,8 @@ class ScanSource(Protocol):
     def flags(self) -> FrameFlags | None: ...
     @property
     def replaces(self) -> NDArray[np.int64] | None: ...
+    @property
+    def part_starts(self) -> NDArray[np.int64]: ...
     @property
     def checksummed(self) -> bool: ...
     @property
@@ -168,8 +176,16 @@ class ScanReader(ABC):
         return None
 
     @property
+    def currents(self) -> NDArray[np.float64] | None:
+        return None
+
+    @property
     def replaces(self) -> NDArray[np.int64] | None:
         return None
+
+    @property
+    def part_starts(self) -> NDArray[np.int64]:
+        return np.zeros(1, np.int64)
 
     @property
     def checksummed(self) -> bool:

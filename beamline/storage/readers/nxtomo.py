@@ -145,6 +145,8 @@ class NXtomoSource(ScanReader):
             said["x_rotation_axis_pixel_position"] = f"{position[()]} (not used: its origin is not defined)"
         if self._places.angle_problem:
             said["angles"] = f"unknown: {self._places.angle_problem}"
+        if self._places.data.is_virtual:
+            said["parts"] = ", ".join(source.file_name for source in self._places.data.virtual_sources())
         if self._ours:
             for item in (self._file[layout.STATUS], self._file[layout.MISSING]):
                 item.refresh()
@@ -158,10 +160,28 @@ class NXtomoSource(ScanReader):
             return read_flags(self._file, self.n) if self._ours else None
 
     @property
+    def currents(self) -> NDArray[np.float64] | None:
+        item = None if self._ours else hdf5.dataset(self._places.entry, "control/data")
+        if item is None or item.dtype.kind not in "uif" or item.size < self.n:
+            return None
+        with hdf5.readable(self.path):
+            values = np.ravel(item[()])[: self.n].astype(np.float64)
+        return np.where(values > 0, values, np.nan)
+
+    @property
     def replaces(self) -> NDArray[np.int64] | None:
         with hdf5.readable(self.path):
             rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n] if self._ours else np.full(0, -1)
             return rows if (rows >= 0).any() else None
+
+    @property
+    def part_starts(self) -> NDArray[np.int64]:
+        with hdf5.readable(self.path):
+            item = hdf5.dataset(self._file, layout.PART_STARTS) if self._ours else None
+            starts = np.zeros(1, np.int64) if item is None else np.ravel(item[()])
+        if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
+            raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
+        return starts.astype(np.int64)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the frames asked for, in that order."""

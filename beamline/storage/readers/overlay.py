@@ -91,8 +91,21 @@ class Overlay(ScanReader):
         return None if rows is None else np.concatenate([np.full(n, -1), np.where(rows < 0, -1, rows + n)])
 
     @property
+    def part_starts(self) -> NDArray[np.int64]:
+        """Those of `base`, the first with the references in front; flats that are laid over are those of all parts."""
+        if self._replaced[FrameKind.FLAT] is not None:
+            return np.zeros(1, np.int64)
+        starts = self._base.part_starts
+        return np.where(starts > 0, starts + len(self._front), 0)
+
+    @property
     def checksummed(self) -> bool:
         return self._base.checksummed
+
+    @property
+    def currents(self) -> NDArray[np.float64] | None:
+        known = self._base.currents
+        return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
 
     @property
     def damaged(self) -> frozenset[int]:

@@ -156,8 +156,8 @@ def time_order(places: Places) -> Iterator[Finding]:
 def framestamp_order(places: Places) -> Iterator[Finding]:
     """A camera's counter goes up by one a frame.
 
-    It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones; not
-    always at 0, for the first frame may be lost.
+    It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones, or with
+    another part of a joined file; not always at 0, for the first frame may be lost.
     """
     stamps, triggers = _column(places, "frame_log/framestamp"), _column(places, "frame_log/trigger")
     key = np.ravel(places.image_key[()])[: stamps.size]
@@ -166,6 +166,9 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
     steps = np.diff(stamps)
     new = np.zeros(triggers.size, np.bool_)
     new[np.unique(np.stack([key, triggers]), axis=1, return_index=True)[1]] = True
+    parts = places.data.virtual_sources() if places.data.is_virtual else []
+    begin = [part.vspace.get_select_bounds()[0][0] for part in parts]
+    new[[row for row in begin if row < new.size]] = True
     armed = new[1:] & ((steps < 0) | (stamps[1:] == 0))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,20 +52,25 @@ def _kept(groups: tuple[Frames, ...], ok: list[bool]) -> tuple[Frames, ...]:
     return tuple(group for group, good in zip(groups, ok, strict=True) if good) if any(ok) else groups
 
 
-def groups_of(image_key: NDArray[np.int32], kind: FrameKind) -> tuple[Frames, ...]:
-    """Rows of the references of a kind, by groups: those with no projection between them were taken together."""
-    rows = np.flatnonzero(image_key == kind)
-    before = np.cumsum(image_key == FrameKind.PROJECTION)[rows]
+def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
+    """Rows of the references of a kind, by groups: those of one part with no projection between them were taken
+    together."""
+    rows = np.flatnonzero(source.image_key == kind)
+    before = np.cumsum(source.image_key == FrameKind.PROJECTION)[rows]
+    before += np.searchsorted(source.part_starts, rows, "right")  # neither decreases, so that the sum tells both
     return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
 
 
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
-    """The groups of references of a scan of counts, judged by a few frames of each."""
-    darks, flats = (groups_of(source.image_key, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
-    looked_at = [[_reference(source, int(row)) for row in _some(group)] for group in (*darks, *flats)]
+    """The references of a scan of counts, judged by a few frames of each group; flats beside those of their part."""
+    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
+    dark, lit = ([[_reference(source, int(row)) for row in _some(group)] for group in of] for of in (darks, flats))
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
-    witnesses = [_reference(source, int(row)) for row in _some(views)] if views.size and flats else []
-    found = judge(looked_at, limits, witnesses)
+    found = judge([*dark, *lit], limits)[: len(darks)]
+    for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
+        own, seen = [group for group in lit if start <= group[0].row < end], views[(views >= start) & (views < end)]
+        witnesses = [_reference(source, int(row)) for row in _some(seen)] if seen.size and own else []
+        found += judge([*dark, *own], limits, witnesses)[len(darks) :]
     whole = [JudgedGroup(j.kind, tuple(g.tolist()), j.faults) for j, g in zip(found, (*darks, *flats), strict=True)]
     return ReferenceGroups(darks, flats, tuple(whole))
 

@@ -177,11 +177,12 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
 def quantity_said(source: ScanSource) -> Iterator[Finding]:
     """It is known what a pixel means: a forgotten or a second logarithm ruins a volume without a sign."""
     if source.quantity == "unknown":
+        note = source.attributes.get("quantity")
+        said = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
         yield Finding(
             "error",
             "quantity",
-            "Nothing says whether pixels are counts or line integrals: say --quantity counts or --quantity "
-            "line-integrals.",
+            f"{said} whether pixels are counts or line integrals: say --quantity counts or --quantity line-integrals.",
         )
 
 

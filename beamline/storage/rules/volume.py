@@ -26,6 +26,10 @@ def volume_findings(record: ReconRecord) -> Iterator[Finding]:
         yield Finding("error", "voxels", f"{bad} voxels are NaN or infinite (first: slice {first}).")
     if low == high:
         yield Finding("error", "voxels", f"Every voxel is {low:g}.")
+    if there := record.parameters.get("partial"):
+        yield Finding(
+            "error", "partial", f"Partial: {there} are there, the others are empty. recon --resume makes them."
+        )
     if record.parameters.get("ended_early"):
         yield Finding("warning", "ended-early", "The reconstruction was stopped early; this is what it had reached.")
     if record.length_unit != "mm":

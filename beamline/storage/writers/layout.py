@@ -10,6 +10,7 @@
                                 flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
+      record/part_starts        of a scan in parts: the first row of each (see storage.parts)
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
@@ -49,10 +50,13 @@ ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
 PREVIEW = "/entry/digest/preview"
 COMMITTED = "/entry/progress/frames_committed"
+TRIGGER = "/entry/frame_log/trigger"
+TIME = "/entry/frame_log/time"
 REPLACES = "/entry/frame_log/replaces"
 FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
+PART_STARTS = "/entry/record/part_starts"
 END_TIME = "/entry/end_time"
 BEAM = "/entry/record/beam"
 SOURCE_DISTANCE = "/entry/record/source_distance"
@@ -67,9 +71,9 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
         f"{DETECTOR}/count_time": ("<f8", "s"),
         ANGLE: ("<f8", "degree"),
         KIND: ("<i4", ""),
-        "/entry/frame_log/trigger": ("<i8", ""),
+        TRIGGER: ("<i8", ""),
         "/entry/frame_log/framestamp": ("<i8", ""),
-        "/entry/frame_log/time": ("<f8", "s"),
+        TIME: ("<f8", "s"),
         REPLACES: ("<i8", ""),
         FLAGS: ("<u8", ""),
         "/entry/digest/minimum": ("<f8", ""),
@@ -218,7 +222,7 @@ def create(
     _growing(file, SCORES, (len(CHECKS),), np.dtype("<f4"), _MARKS_PER_CHUNK)
     _growing(file, REGIONS, (len(CHECKS), 4), np.dtype("<i4"), _MARKS_PER_CHUNK)
     write_legend(file)
-    file["/entry/frame_log/time"].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
+    file[TIME].attrs["description"] = "since 1970-01-01T00:00:00Z, at the trigger"
     if info.beam_unit is not None:
         file.create_group(BEAM).attrs["NX_class"] = "NXlog"
         for name, unit in (("time", "s"), ("value", info.beam_unit)):

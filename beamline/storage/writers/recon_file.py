@@ -66,14 +66,18 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
             ) from error
 
 
-def write_record(path: Path, record: ReconRecord) -> None:
-    """Write the new file `path`, sixteen slices at a time. OSError where the disk refuses."""
+def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> None:
+    """Write the new file `path`, sixteen slices at a time. OSError where the disk refuses.
+
+    Args:
+        empty: without the voxels, for which there is one place, of zeros.
+    """
     with hdf5.created(path) as file:
-        _write_entry(_group(file, "entry", "NXentry"), record)
+        _write_entry(_group(file, "entry", "NXentry"), record, empty)
         file.attrs["default"] = "entry"
 
 
-def _write_entry(entry: h5py.Group, record: ReconRecord) -> None:
+def _write_entry(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
     entry.attrs["default"] = "data"
     entry["definition"] = DEFINITION
     entry["title"] = record.title
@@ -99,8 +103,10 @@ def _write_entry(entry: h5py.Group, record: ReconRecord) -> None:
     data.attrs["axes"] = ["z", "y", "x"]
     # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
     shape = record.volume.grid.shape
-    stored = data.create_dataset("data", shape, np.float32, chunks=(1, *shape[1:]))
-    for first in range(0, shape[0], _SLAB):  # so that a signal need not wait for the whole
+    stored = data.create_dataset("data", shape, np.float32, chunks=None if empty else (1, *shape[1:]))
+    if empty:
+        stored[-1, -1, -1] = 0  # which allocates it
+    for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
         stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
     data["data"].attrs["units"] = f"1/{record.length_unit}"
     data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"

@@ -11,7 +11,7 @@ import pytest
 
 from beamline.cli import batch as command
 from beamline.reconstruct import batch
-from beamline.reconstruct.batch import BatchOptions, Row, names_of, run_batch
+from beamline.reconstruct.batch import COMMAND, BatchOptions, Row, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
@@ -31,7 +31,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scans are reconstructed without a process of their own, which takes seconds to start."""
 
     def run(line: Sequence[str], log: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
-        result = beamline(*line[len(BatchOptions([], None, Path()).command) - 1 :])
+        result = beamline(*line[len(COMMAND) - 1 :])
         for text in result.stdout.splitlines():
             on_line(text)
         return result.exit_code, (result.stderr.splitlines() or [""])[-1]
@@ -108,7 +108,7 @@ def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, mo
         if done:
             (log.parent / "recon.h5.partial").touch()
             raise KeyboardInterrupt
-        done.append(line[len(BatchOptions([], None, folder).command)])
+        done.append(line[len(COMMAND)])
         (log.parent / "recon.h5").touch()
         return 0, ""
 

@@ -41,7 +41,7 @@ def scan(*arguments: str, **overrides: Any) -> Result:
 
 def on(monkeypatch: pytest.MonkeyPatch, instrument: FakeInstrument) -> None:
     """Let the command find `instrument` where the configured devices would be."""
-    monkeypatch.setattr(run_module, "connect", lambda config, ask, check_stop: instrument.connected())
+    monkeypatch.setattr(run_module, "connect", lambda config, clock, ask, check_stop: instrument.connected())
 
 
 def press(number: int, *at: int) -> Any:
@@ -83,7 +83,7 @@ def test_0_with_json_stdout_is_the_events(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_0_a_dry_run_prints_the_plan_and_touches_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_module, "connect", lambda config, ask, check_stop: pytest.fail("a device was touched"))
+    monkeypatch.setattr(run_module, "connect", lambda *_, **how: pytest.fail("a device was touched"))
     result = scan("--dry-run", "-o", str(tmp_path / "runs"), **{"devices.stage.low_deg": -30})
     assert result.exit_code == 0, result.output
     for word in ("projection", "taxi", "counts", "blur", "skew", "duration", "free"):
@@ -135,7 +135,7 @@ def test_3_a_device_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_3_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def silent(config: object, ask: object, check_stop: object) -> None:
+    def silent(config: object, clock: object, ask: object, check_stop: object) -> None:
         raise DeviceError("stage", "does not answer")
 
     monkeypatch.setattr(run_module, "connect", silent)
@@ -227,7 +227,7 @@ def test_130_an_abort(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     instrument = FakeInstrument()
 
-    def connect(config: object, ask: object, check_stop: object) -> Any:
+    def connect(config: object, clock: object, ask: object, check_stop: object) -> Any:
         signal.raise_signal(signal.SIGINT)
         return instrument.connected()
 
@@ -243,7 +243,7 @@ def test_a_shutter_moved_by_hand_is_asked_for(tmp_path: Path, monkeypatch: pytes
     instrument, asked = FakeInstrument(), []
     monkeypatch.setattr(scan_module, "ask_operator", asked.append)
 
-    def connect(config: object, ask: Any, check_stop: object) -> Any:
+    def connect(config: object, clock: object, ask: Any, check_stop: object) -> Any:
         connected = instrument.connected()
         return replace(connected, devices=replace(connected.devices, shutter=ByHand(instrument, ask)))
 

@@ -129,7 +129,8 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
 
 def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
     volume = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
-    slices = Slices(volume, "FBP of all views")
+    slices = Slices()
+    slices.add("FBP of all views", volume)
     for method in ("r2", "fbp"):
         for draw in (1, 2):
             slices.add(f"random, draw {draw}: {method}", volume, "random", method)

@@ -40,7 +40,7 @@ def _beamline(*arguments: str) -> Result:
 def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
     seen: list[Trial] = []
 
-    def trial(trial: Trial, *_: object) -> Outcome:
+    def trial(trial: Trial, *_: object, keep: Path | None) -> Outcome:
         seen.append(trial)
         return Outcome(trial, "done", float(len(seen)), 10**8, {"residual_held_out": 1 / (1 + len(seen))})
 
@@ -76,10 +76,10 @@ def test_ctrl_c_is_exit_code_4_with_a_table(
 ) -> None:
     trial = tradeoff.run_trial
 
-    def interrupted(*arguments: Any) -> Outcome:
+    def interrupted(*arguments: Any, **named: Any) -> Outcome:
         if len(quick_trials) == 2:
             signal.raise_signal(number)
-        return trial(*arguments)
+        return trial(*arguments, **named)
 
     monkeypatch.setattr(tradeoff, "run_trial", interrupted)
     result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
@@ -93,7 +93,7 @@ def test_ctrl_c_is_exit_code_4_with_a_table(
 def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    monkeypatch.setattr(tradeoff, "run_trial", lambda *_: signal.raise_signal(number))
+    monkeypatch.setattr(tradeoff, "run_trial", lambda *_, **__: signal.raise_signal(number))
     result = _beamline("scan.h5", "--axis", "20.7", "-o", "out")
     assert result.exit_code == 130, result.output
     assert result.stderr.endswith("beamline: interrupted\n") and result.stdout == ""

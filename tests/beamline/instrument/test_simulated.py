@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from beamline.config.models import Config
+from beamline.config.models import Config, Speed
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
+from beamline.instrument.simulated import clock_of
 from beamline.plan.timeline import block_seconds
 from beamline.scan.preflight import dry_run
 from drivers.clock import SystemClock
@@ -195,3 +196,9 @@ def test_truth_lies_where_a_reconstruction_puts_it() -> None:
     assert z == pytest.approx(0.01 - 4 * 4.6e-3, abs=1e-4)
     # A ball of 0.02 mm radius and 30 / mm.
     assert volume.data.sum() * 4.6e-3**3 == pytest.approx(30 * 4 / 3 * math.pi * 0.02**3, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["virtual", Speed(speed=4.0)])
+def test_the_clock_of_a_run_that_goes_on_starts_after_its_last_frame(kind: str | Speed) -> None:
+    after = clock_of("real").now() + 1e6
+    assert after <= clock_of(kind, not_before=after).now() < after + 60

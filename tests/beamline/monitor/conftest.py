@@ -77,10 +77,14 @@ class FakeScan:
         return self.darks() + self.flats()
 
     def flags(
-        self, frames: Iterable[Frame], period: float | None = PERIOD, checks: Sequence[Check] = CHECKS
+        self,
+        frames: Iterable[Frame],
+        period: float | None = PERIOD,
+        checks: Sequence[Check] = CHECKS,
+        stored: frozenset[int] = frozenset(),
     ) -> list[Flag]:
         """All flags of a fresh monitor that sees `frames`."""
-        state = scan.start(ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period), checks)
+        state = scan.start(ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period, stored=stored), checks)
         flags: list[Flag] = []
         for frame in frames:
             state, found = scan.look(state, frame, digest(frame.counts, SATURATION, 4))

@@ -48,3 +48,10 @@ def test_a_wait_before_the_camera_was_armed_anew_is_no_finding(fake: Any, armed_
     if armed_anew:
         frames[4:] = [replace(f, framestamp=f.trigger - 4) for f in frames[4:]]
     assert len(only(fake.flags(frames))) == found
+
+
+def test_triggers_whose_views_are_stored_are_not_missing(fake: Any) -> None:
+    frames = fake.views(8)
+    del frames[3:5]
+    assert only(fake.flags(frames, stored=frozenset({3, 4}))) == []
+    assert [f.score for f in only(fake.flags(frames, stored=frozenset({4, 6})))] == [1]

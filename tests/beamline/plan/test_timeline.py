@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.plan.timeline import block_seconds, describe, move_seconds, pass_ends, taxi_angle, work_out
+from beamline.plan.timeline import block_seconds, describe, move_seconds, passes, taxi_angle, work_out
 from drivers.errors import DeviceRefused
 from drivers.frame import FrameKind
 from drivers.protocols import CameraTiming, StageLimits
@@ -46,7 +46,7 @@ def worked(
 
 def test_a_fly_scan_worked_by_hand() -> None:
     timeline = worked(axis_col=125.5)
-    assert [(b.kind.name, b.mode, b.first_row, b.n) for b in timeline.blocks] == [
+    assert [(b.kind.name, b.mode, b.first_trigger, b.n) for b in timeline.blocks] == [
         ("DARK", Mode.STATIC, 0, 10),
         ("FLAT", Mode.STATIC, 10, 20),
         ("PROJECTION", Mode.FLY, 30, 360),
@@ -60,8 +60,8 @@ def test_a_fly_scan_worked_by_hand() -> None:
     assert views.speed == pytest.approx(5 * DEG)
     assert views.taxi == pytest.approx(0.5 * DEG)
     np.testing.assert_allclose(views.angles, np.arange(360) * 0.5 * DEG, atol=1e-12)
-    ((start, stop),) = pass_ends(views)
-    assert (start, stop) == (pytest.approx(-0.5 * DEG), pytest.approx(180.0 * DEG))
+    (flown,) = passes(views)
+    assert (flown.start, flown.end) == (pytest.approx(-0.5 * DEG), pytest.approx(180.0 * DEG))
     # Half the detector is 126 px: 5 deg/s * 0.05 s = 0.00436 rad.
     assert timeline.blur_px == pytest.approx(126 * 0.25 * DEG)
     assert timeline.skew_px == pytest.approx(126 * 5 * DEG * 3.6e-6 * 143)
@@ -119,7 +119,7 @@ def test_rows_are_contiguous_and_every_view_has_its_pulse(
     timeline = worked(plan)
     row = 0
     for block in timeline.blocks:
-        assert block.first_row == row
+        assert block.first_trigger == row
         assert block.n > 0
         row += block.n
     assert row == timeline.n_frames
@@ -346,7 +346,7 @@ def test_interlaced_passes_return_at_full_speed() -> None:
     views = two.blocks[2]
     assert len(views.trains) == 2
     assert views.speed == pytest.approx(10 * DEG)
-    (a, b), (c, d) = pass_ends(views)
+    (a, b), (c, d) = [(flown.start, flown.end) for flown in passes(views)]
     back = move_seconds(c - b, STAGE.max_speed, STAGE.acceleration)
     pure = sum(move_seconds(x - y, views.speed, STAGE.acceleration) for x, y in ((a, b), (c, d)))
     assert back > 6

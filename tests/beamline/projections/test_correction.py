@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.selection import Selection
 from recon.prep.correct import CorrectionSettings, merge_and_empty
@@ -52,6 +54,37 @@ def test_batches_are_the_views_at_once_also_where_the_end_comes_later(
     np.testing.assert_array_equal(parts.view_ids, whole.view_ids)
 
 
+PARTS = {  # image keys of two parts
+    "flats at the start": ([2, 1, 1, *[0] * 9], [2, 1, 1, *[0] * 9]),
+    "flats at both ends": ([2, 1, 1, *[0] * 9, 1, 1], [2, 1, 1, *[0] * 9, 1, 1]),
+    "flats at the end, then at the start": ([2, *[0] * 9, 1, 1], [1, 1, *[0] * 9, 2]),
+    "the second without flats": ([2, 1, 1, *[0] * 9, 1, 1], [2, *[0] * 9]),
+}
+
+
+@pytest.mark.parametrize("left", [0.9, 0.3])
+@pytest.mark.parametrize("flats", PARTS)
+def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, rng: np.random.Generator) -> None:
+    """A beam that is weaker after an interruption, and a sample that lets half of it through."""
+    first, second = PARTS[flats]
+    keys, beam = np.array(first + second), np.repeat([BEAM, left * BEAM], [len(first), len(second)])
+    light = beam * np.choose(keys, [0.5, 1.0, 0.0])
+    data = rng.poisson(DARK + light[:, None, None] * np.ones((1, 20, 80))).astype(np.uint16)
+    source, said = ArraySource(data, keys.tolist(), np.zeros(keys.size), np.ones(keys.size)), list[str]()
+    source.part_starts = np.array([0, len(first)])
+    selection = Selection(correction=CorrectionSettings(air="none"))
+    views = np.flatnonzero(keys == 0)
+    found = ScanCorrection(source, selection, said.append).at_once(views)  # type: ignore[arg-type]
+    truth = np.full(views.size, 0.5)
+    if flats == "the second without flats":
+        truth[9:] *= left  # by the beam of the first
+        (warning,) = said
+        assert f"Frames {len(first)}-{keys.size - 1}, a part of the scan, have no flats of their own" in warning
+    else:
+        assert said == []
+    np.testing.assert_allclose(np.exp(-found.data).mean(axis=(1, 2)), truth, rtol=3e-3)  # 5 sigma of 1600 pixels
+
+
 def test_line_integrals_need_no_neighbour() -> None:
     source = ArraySource(SCAN.counts().astype(np.float32), [0] * 45, SCAN.angles)
     source.quantity = "line_integrals"
@@ -60,3 +93,47 @@ def test_line_integrals_need_no_neighbour() -> None:
     assert correction.feed(np.arange(0), last=True) is None and not correction.outdated
     whole = merge_and_empty([part for part in parts if part is not None])
     np.testing.assert_array_equal(whole.data, correction.at_once(np.arange(45)).data)
+
+
+def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
+    """Each frame has its own stripes; line integrals are exact up to noise, and a sentence says what was done."""
+    counts, rows = SCAN.counts().astype(np.float64), np.arange(4)[:, None]
+    flats = np.full((12, 4, 40), DARK + BEAM, np.float64)
+    frames = np.concatenate([np.full((1, 4, 40), DARK), flats, counts])
+    stripes = np.exp(0.1 * np.sin(rng.normal(0, 2, (len(frames), 1, 1)) + 1.5 * rows))
+    data = rng.poisson((frames - DARK) * stripes * 20) / 20 + DARK
+    source = ArraySource(data.astype(np.float32), [2] + [1] * 12 + [0] * 45, np.r_[[np.nan] * 13, SCAN.angles])
+    errors = []
+    for way in ("groups", "dynamic"):
+        correction = ScanCorrection(source, Selection(flat_fields=way), pytest.fail)  # type: ignore[arg-type]
+        assert bool(correction.flats) is (way == "dynamic")
+        errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
+    assert errors[1] < 0.3 * errors[0]
+    assert "components of their changes" in correction.flats
+    few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
+    with pytest.raises(ConfigError, match="--flat-fields dynamic: array: dynamic flats need at least 4 flats, got 3"):
+        ScanCorrection(few, Selection(flat_fields="dynamic"), lambda _: None)  # type: ignore[arg-type]
+
+
+def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
+    """Without air columns; flats, which are dimmer by their own current, are scaled as well."""
+    current = np.r_[np.nan, 80.0, 90.0, np.linspace(200, 150, 45)]
+    counts = SCAN.counts().astype(np.float64) - DARK
+    data = (
+        np.concatenate([np.zeros((1, 4, 40)), np.full((2, 4, 40), BEAM), counts])
+        * np.nan_to_num(current)[:, None, None]
+    )
+    source = ArraySource((data / 180 + DARK).astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
+    none = Selection(correction=CorrectionSettings(air="none"))
+    with pytest.raises(ConfigError, match="array has no ring current"):
+        ScanCorrection(source, replace(none, use_current=True), pytest.fail)  # type: ignore[arg-type]
+    source.currents = current
+    off = []
+    for selection in (none, replace(none, use_current=True)):
+        correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+        off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
+    assert off[0] > 0.5 and off[1] < 0.01
+    assert correction.flats == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    source.currents[2] = np.nan
+    with pytest.raises(ConfigError, match="no ring current for some views or flats"):
+        ScanCorrection(source, replace(none, use_current=True), pytest.fail)  # type: ignore[arg-type]

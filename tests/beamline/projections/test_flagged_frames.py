@@ -7,7 +7,7 @@ import pytest
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
-from beamline.projections.flagged_frames import reasons, worst_frames
+from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.report.contact_sheet import contact_sheet
 from beamline.storage.flag_legend import TODAY, FrameFlags, mark_of
 from tests.beamline.array_source import ArraySource
@@ -73,3 +73,17 @@ def test_the_sheet_is_a_picture(n: int) -> None:
     assert len(found) == n
     png = contact_sheet(found)
     assert png.startswith(b"\x89PNG") and len(png) > 5000
+
+
+def test_means_of_darks_and_flats_and_how_the_beam_changed() -> None:
+    frames = np.repeat([10, 12, 110, 112, 60, 60, 70], 6 * 600).reshape(7, 6, 600)
+    scan = ArraySource(frames.astype(np.uint16), [2, 2, 1, 1, 0, 0, 1], np.zeros(7))
+    found = reference_images(scan)  # type: ignore[arg-type]
+    levels = {title: (image.shape, float(image.min()), float(image.max())) for title, image in found.items()}
+    assert levels == {
+        "dark (counts)": ((2, 200), 11, 11),
+        "flats (counts)": ((2, 200), 111, 111),
+        "last flats (counts)": ((2, 200), 70, 70),
+        "last flats / first": ((2, 200), pytest.approx(0.59), pytest.approx(0.59)),
+    }
+    assert reference_images(source()) == {}  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.projections.read import read_binned, read_references
+from beamline.projections.selection import Selection
 from beamline.storage.rules.references import ReferenceGroups, groups_of
 from drivers.frame import FrameKind
 from tests.beamline.array_source import ArraySource
@@ -49,8 +50,8 @@ def test_flats_are_grouped_by_the_views_between_them() -> None:
     keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
     data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
     source = ArraySource(data, keys, np.zeros(12))
-    darks, flats = (groups_of(source.image_key, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
-    references = read_references(source, ReferenceGroups(darks, flats, ()), slice(0, 2), 1)  # type: ignore[arg-type]
+    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))  # type: ignore[arg-type]
+    references = read_references(source, ReferenceGroups(darks, flats, ()), slice(0, 2), Selection())  # type: ignore[arg-type]
     assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
         (1.5, 1.5),
         (7.0, 7.0),

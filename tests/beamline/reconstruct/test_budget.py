@@ -91,12 +91,30 @@ def test_the_time_is_used_and_not_exceeded(
     assert np.isfinite(done.result.history[-1].held_out)  # six views were not chosen
 
 
+def test_iterations_on_voxels_take_no_sample_that_is_wider_than_the_field(
+    prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They put what is beyond into the rim; and where pixels must not be binned they are not."""
+    _as_fast_as(monkeypatch, 0.01, 0.1, 0.001, 0.1, 0.001)
+    found, views = prepared.projections, prepared.geometry
+    inner = replace(found, data=np.ascontiguousarray(found.data[..., 11:31]), masked=found.masked[:, 11:31])
+    cut = Geometry.parallel(views.angles, (6, 20), axis_col=views.axis_col - 11)
+    narrow = replace(prepared, projections=inner, geometry=cut, held_out=None)
+    methods = (FistaTv(), R2(), Fbp())
+    for data, taken in ((prepared, True), (narrow, False)):
+        done = within(4.0, data, methods, 0, RunControl(now=Ticking(0.01)), lambda said: None, 1)
+        assert ("fista-tv" in done.because) is taken and done.choice.binning == 1
+
+
 def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for(prepared: PreparedProjections) -> None:
     views, grid = prepared.geometry, Grid.matching(prepared.geometry)
     # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6
     # and three trials of 8 over seven of eight views.
-    found = [module.finish_within(seconds, views, grid, Ticking(1.0)) for seconds in (0.0, 141.0, 146.0, 165.0, 1e3)]
+    found = [module.finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 141.0, 146.0, 165.0, 1e3)]
     assert found == [(0, 0.0), (0, 0.0), (2, 145.0), (6, 165.0), (8, 175.0)]
+    # As many as views held out prefer, where time is left for 24, and for eight trials of 8 over seven of eight views.
+    found = [module.finish_within(1e3, spare, views, grid, Ticking(1.0)) for spare in (534.0, 535.0)]
+    assert found == [(8, 175.0), (None, 535.0)]
 
 
 def test_a_slow_machine_takes_fbp_of_binned_pixels(

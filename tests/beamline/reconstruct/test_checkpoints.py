@@ -13,7 +13,7 @@ import pytest
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.checkpoints import CheckpointOptions, differences, fit_origin
+from beamline.reconstruct.checkpoints import CheckpointOptions, differences, origin_of
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import Checkpoint, write_checkpoint
 from recon.base.kernel import Kernel
@@ -65,9 +65,9 @@ CHANGES: dict[str, tuple[Callable[[PreparedProjections], PreparedProjections], F
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_every_change_is_told_by_its_name(prepared: PreparedProjections, name: str) -> None:
-    before = fit_origin(prepared, SETTINGS, OTHERS)
+    before = origin_of(prepared, SETTINGS, OTHERS)
     change, settings, others = CHANGES[name]
-    found = differences(fit_origin(change(prepared), settings, others), before)
+    found = differences(origin_of(change(prepared), settings, others), before)
     assert [said.split(" ")[0] for said in found] == [name]
 
 
@@ -77,24 +77,24 @@ def test_fewer_views_are_told_by_number(prepared: PreparedProjections) -> None:
         projections=replace(prepared.projections, data=prepared.projections.data[:20]),
         geometry=prepared.geometry.select(slice(20)),
     )
-    found = differences(fit_origin(few, SETTINGS, OTHERS), fit_origin(prepared, SETTINGS, OTHERS))
-    assert "n_views (20, 30 in the checkpoint)" in found
+    found = differences(origin_of(few, SETTINGS, OTHERS), origin_of(prepared, SETTINGS, OTHERS))
+    assert "n_views (20, 30 in the file)" in found
 
 
 def test_a_checkpoint_that_names_no_kernel_is_of_gaussians(tmp_path: Path, prepared: PreparedProjections) -> None:
-    origin = fit_origin(prepared, replace(SETTINGS, kernel=Kernel.GAUSSIAN), OTHERS)
+    origin = origin_of(prepared, replace(SETTINGS, kernel=Kernel.GAUSSIAN), OTHERS)
     older = {name: value for name, value in origin.items() if name != "setting kernel"}
     state = {name: values for name, values in _state().items() if name != "kernel_exponent"}
     write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, older, 100))
     resumed = CheckpointOptions(None, tmp_path / "fit.h5")
     assert resumed.begin(origin, 100, lambda said: None) is not None
-    with pytest.raises(DataError, match=r"kernel \(compact:1.5, gaussian in the checkpoint\)"):
-        resumed.begin(fit_origin(prepared, replace(SETTINGS, kernel=Kernel.COMPACT), OTHERS), 100, lambda said: None)
+    with pytest.raises(DataError, match=r"kernel \(compact:1.5, gaussian in the file\)"):
+        resumed.begin(origin_of(prepared, replace(SETTINGS, kernel=Kernel.COMPACT), OTHERS), 100, lambda said: None)
 
 
 def test_views_held_out_do_not_matter(prepared: PreparedProjections) -> None:
     spoilt = replace(prepared, held_out=(np.zeros((1, 2, 40), np.float32), prepared.geometry.select([0])))
-    assert not differences(fit_origin(spoilt, SETTINGS, OTHERS), fit_origin(prepared, SETTINGS, OTHERS))
+    assert not differences(origin_of(spoilt, SETTINGS, OTHERS), origin_of(prepared, SETTINGS, OTHERS))
 
 
 def _state(**changes: Any) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def _state(**changes: Any) -> dict[str, Any]:
 
 def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: PreparedProjections) -> None:
     path, said = tmp_path / "fit.h5", list[str]()
-    origin = fit_origin(prepared, SETTINGS, OTHERS)
+    origin = origin_of(prepared, SETTINGS, OTHERS)
     CheckpointOptions(path).write(origin, 100, said.append, _state())
     again = CheckpointOptions(path, path)
     again.refuse_existing()  # the one that it begins from may be replaced
@@ -115,8 +115,8 @@ def test_it_comes_through_the_file_and_back(tmp_path: Path, prepared: PreparedPr
     np.testing.assert_array_equal(state["statistic"], np.zeros(5))
     again.begin(origin, 200, said.append)
     assert "100 steps, this one is over 200 steps" in said[0]
-    with pytest.raises(DataError, match=r"loss \(l1, l2 in the checkpoint|loss \(l2, l1 in the checkpoint"):
-        again.begin(fit_origin(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
+    with pytest.raises(DataError, match=r"loss \(l1, l2 in the file|loss \(l2, l1 in the file"):
+        again.begin(origin_of(prepared, replace(SETTINGS, loss="l2"), OTHERS), 100, said.append)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_a_plan_without_steps_is_told(
     tmp_path: Path, prepared: PreparedProjections, kept: int, wanted: int, words: str
 ) -> None:
     path, said = tmp_path / "fit.h5", list[str]()
-    origin = fit_origin(prepared, SETTINGS, OTHERS)
+    origin = origin_of(prepared, SETTINGS, OTHERS)
     CheckpointOptions(path).write(origin, kept, said.append, _state())
     assert CheckpointOptions(path, path).begin(origin, wanted, said.append) is not None
     assert len(said) == 1 and words in said[0]

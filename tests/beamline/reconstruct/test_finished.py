@@ -100,9 +100,8 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     page = (tmp_path / "out.html").read_text(encoding="utf-8")
     for said in ("R²-Gaussian", "FBP", "beamline recon scan.h5", "12 of 45 views"):
         assert said in page
-    assert (
-        page.count("data:image/png;base64,") == 6
-    )  # slices in two windows, profile, quality, projection, sinogram; the axis was given
+    # Slices in two windows, profile, differences, quality, projection, sinogram, darks and flats; the axis was given.
+    assert page.count("data:image/png;base64,") == 8
 
 
 @pytest.mark.parametrize(
@@ -308,7 +307,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
         checkpoints=CheckpointOptions(None, kept),
         target=OutputPaths(tmp_path / "b.h5", None),
     )
-    with pytest.raises(DataError, match=r"loss \(l2, l1 in the checkpoint\); seed \(4, 0 in the checkpoint\)"):
+    with pytest.raises(DataError, match=r"loss \(l2, l1 in the file\); seed \(4, 0 in the file\)"):
         reconstruct_file(other, lambda e: None, SystemClock())
     with pytest.raises(DataError, match="axis_col"):
         reconstruct_file(

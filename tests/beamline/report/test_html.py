@@ -15,8 +15,10 @@ from matplotlib.figure import Figure
 
 from beamline.core.errors import DataError
 from beamline.report import figures
+from beamline.report.contact_sheet import reference_sheet
 from beamline.report.html import Picture, Report, render, to_html, write_report
 from beamline.report.metrics import METRICS, formatted
+from beamline.report.time_curves import quality_against_time
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from tests.beamline.html_page import parsed_page
@@ -163,9 +165,31 @@ def test_profile_and_values_of_an_edge_and_of_nothing(rng: np.random.Generator) 
 
 @pytest.mark.parametrize(("shape", "n"), [((1, 64, 64), 1), ((2, 8, 300), 3), ((40, 20, 20), 3)])
 def test_slices_of_any_shape(shape: tuple[int, int, int], n: int, rng: np.random.Generator) -> None:
-    volume = Volume(rng.random(shape, dtype=np.float32), Grid(shape, 0.1))
-    pixels = _pixels(figures.orthogonal_slices({f"v{i}": volume for i in range(n)}, "mm"))
-    assert pixels.shape[1] < 1100
+    """A voxel is a pixel or more, where the picture has room for it, and a picture is not huge."""
+    volumes = {f"v{i}": Volume(rng.random(shape, dtype=np.float32), Grid(shape, 0.1)) for i in range(n)}
+    pixels = _pixels(figures.orthogonal_slices(volumes, "mm"))
+    assert shape[2] * n < pixels.shape[1] < 2600
+    if n > 1:
+        assert _pixels(figures.differences(volumes, "mm")).shape[1] > shape[2] * (n - 1)
+
+
+def test_differences_are_from_the_first_in_one_scale_about_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
+    grid = Grid((3, 8, 9), 1.0)
+    volumes = {name: Volume(np.full(grid.shape, v, np.float32), grid) for name, v in (("a", 1), ("b", 3), ("c", 0.5))}
+    figures.differences(volumes, "px")
+    images = [(axes.get_title(), axes.images[0]) for axes in drawn[0].axes if axes.images]
+    assert [title for title, _ in images] == ["b − a", "c − a"]
+    for (_, image), value in zip(images, (2.0, -0.5), strict=True):
+        np.testing.assert_array_equal(np.asarray(image.get_array()), value)
+        assert image.norm.vmin == -image.norm.vmax  # type: ignore[operator]
+
+
+def test_the_sheet_of_darks_and_flats(rng: np.random.Generator) -> None:
+    images = {title: rng.random((20, 30), dtype=np.float32) for title in ("dark", "flats", "last flats / first")}
+    assert _pixels(reference_sheet(images, (200, 300))).ndim == 3
+    assert _pixels(reference_sheet({"dark": images["dark"][:1]}, (2, 300))).ndim == 3
 
 
 def test_projection_and_sinogram(rng: np.random.Generator) -> None:
@@ -180,6 +204,6 @@ def test_curves() -> None:
     assert _pixels(figures.axis_curve(columns, (columns - 14) ** 2, 14.0, False)).ndim == 3
     seconds = np.arange(5.0)
     history = {"seconds": seconds, "loss": 1 / (1 + seconds), "residual": np.full(5, np.nan), "n_views": seconds}
-    narrow = _pixels(figures.quality_against_time(history))
-    wide = _pixels(figures.quality_against_time(history, [(0.0, 20.0), (2.0, 25.0)]))
+    narrow = _pixels(quality_against_time(history))
+    wide = _pixels(quality_against_time(history, [(0.0, 20.0), (2.0, 25.0)]))
     assert narrow.shape == wide.shape

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from beamline.reconstruct.recon_report import ReconOutcome
-from beamline.report.figures import quality_against_time
 from beamline.report.record import history_arrays, history_from, residual_curve
+from beamline.report.time_curves import quality_against_time
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
 from recon.base.volume import Grid, Volume

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,8 +15,9 @@ from beamline.core.errors import ScanStopped
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.states import State, StateMachine
-from beamline.scan.supervision import Supervision
+from beamline.scan.supervision import BacklogGuard, Supervision
 from drivers.frame import Frame, FrameKind
+from drivers.manual import ManualShutter
 from drivers.protocols import CameraFrame
 from tests.beamline.acquired import Run, assert_safe, assert_true_angles
 from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults
@@ -55,6 +56,7 @@ class Paused:
             self.at_rest.append(not self.instrument.is_open and not self.instrument.stage.moving())
             self.pause.resume()
             self.pause.beam_back()
+            self.pause.release("backlog")
 
     def at_frame(self, number: int) -> Paused:
         self.instrument.on_frame = lambda seen: self.pause.pause() if seen == number else None
@@ -75,7 +77,7 @@ class Paused:
         return self
 
     def run(self, n: int, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30) -> Run:
-        supervision = Supervision(pause=self.pause, rest=lambda: False, states=self.machine)
+        supervision = Supervision(pause=self.pause, wait_in_pause=lambda: False, states=self.machine)
         return Run(self.instrument, self.instrument.timeline(n, mode, passes, at, speed), self.stop, supervision)
 
 
@@ -188,4 +190,110 @@ def test_a_pause_asked_for_before_the_first_frame_is_kept() -> None:
     paused.pause.pause()
     run = paused.run(12)
     assert run.error is None and paused.states[:3] == [State.DARKS, State.PAUSED, State.DARKS]
+    assert_same(run.frames, whole(12))
+
+
+class SlowDisk:
+    """On the scan's clock: writes a frame in `seconds`, and room for `room` finds in memory before."""
+
+    def __init__(self, paused: Paused, seconds: float, room: int, guard: Callable[[int], None]) -> None:
+        self.clock, self.seconds, self.room, self.guard = paused.instrument.clock, seconds, room, guard
+        self.free_at, self.waiting, self.most = self.clock.now(), 0, 0
+
+    def look(self) -> None:
+        while self.waiting and self.free_at <= self.clock.now():
+            self.waiting -= 1
+            self.free_at += self.seconds
+        self.guard(self.waiting)
+
+    def put(self) -> None:
+        self.look()
+        self.free_at = max(self.free_at, self.clock.now() + self.seconds) if not self.waiting else self.free_at
+        self.waiting += 1
+        self.most = max(self.most, self.waiting)
+        self.guard(self.waiting)
+
+    def rest(self) -> bool:
+        self.clock.sleep(0.1)
+        self.look()
+        return False
+
+
+def slow_disk(guarded: bool) -> tuple[SlowDisk, Run, Paused]:
+    """A fly scan of a view every 0.2 s with a disk that takes 0.5 s for each."""
+    paused = Paused()
+    guard = BacklogGuard(8, paused.pause)
+    disk = SlowDisk(paused, 0.5, 8, guard if guarded else lambda waiting: None)
+    paused.instrument.on_frame = lambda number: disk.put()
+    machine = StateMachine(lambda event, data: paused.states.append(data["state"]), State.PREPARING)
+    timeline = paused.instrument.timeline(30, Mode.FLY, at=Place.BOTH)
+    run = Run(
+        paused.instrument, timeline, None, Supervision(pause=paused.pause, wait_in_pause=disk.rest, states=machine)
+    )
+    return disk, run, paused
+
+
+def test_a_fly_scan_pauses_before_frames_come_that_a_slow_disk_has_no_room_for() -> None:
+    disk, run, paused = slow_disk(guarded=True)
+    assert run.error is None
+    assert disk.most <= disk.room
+    assert paused.states.count(State.PAUSED) > 1
+    assert_same(run.frames, whole(30, at=Place.BOTH))
+    assert_safe(paused.instrument)
+    assert slow_disk(guarded=False)[0].most > disk.room  # and without the pauses it would not have held them
+
+
+class Moment(PauseRequest):
+    """Asked for when it is looked at for the `nth` time, and taken back before the next look."""
+
+    def __init__(self, nth: int) -> None:
+        super().__init__()
+        self.left = nth
+
+    @property
+    def reason(self) -> str:
+        self.left -= 1
+        return "for a moment" if self.left == 0 else ""
+
+
+def test_a_pause_taken_back_at_once_is_no_silent_camera() -> None:
+    expected = whole(4, speed=20)
+    for nth in range(1, 41):
+        paused = Paused()
+        paused.pause = Moment(nth)
+        run = paused.run(4, speed=20)
+        assert run.error is None, nth
+        assert_same(run.frames, expected)
+    assert cast(Moment, paused.pause).left > 0  # there were not so many looks
+
+
+@pytest.mark.parametrize(("cause", "asked_in_pause"), [("space", 0), ("backlog", 0), ("beam", 1), ("", 1)])
+def test_a_shutter_moved_by_hand_stays_as_it_is_in_a_pause_for_the_disk(cause: str, asked_in_pause: int) -> None:
+    paused, asked = Paused(), list[tuple[str, State]]()
+
+    def put(request: str) -> None:
+        asked.append((request, paused.machine.state))
+        paused.instrument.is_open = request.startswith("Open")
+        if paused.machine.state is State.PAUSED and paused.pause.reason:
+            paused.pause.resume()
+            paused.pause.release(cause)
+
+    def wait() -> bool:
+        if paused.machine.state is State.PAUSED and not asked_in_pause:
+            paused.pause.release(cause)
+        return False
+
+    def at_frame(number: int) -> None:
+        if number == FIRST + 4:
+            paused.pause.hold(cause, "for a while") if cause else paused.pause.pause()
+
+    paused.instrument.on_frame = at_frame
+    paused.instrument.devices = replace(paused.instrument.devices, shutter=ManualShutter(put))
+    machine = paused.machine = StateMachine(lambda event, data: paused.states.append(data["state"]), State.PREPARING)
+    supervision = Supervision(pause=paused.pause, wait_in_pause=wait, states=machine)
+    run = Run(paused.instrument, paused.instrument.timeline(12, Mode.FLY, 1, Place.START, 30), None, supervision)
+    assert run.error is None and paused.states.count(State.PAUSED) == 1
+    assert [request for request, state in asked if state is State.PAUSED] == [
+        "Close the beam shutter.", "Open the beam shutter."
+    ][: 2 * asked_in_pause]  # fmt: skip
     assert_same(run.frames, whole(12))

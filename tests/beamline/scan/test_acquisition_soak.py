@@ -1,11 +1,14 @@
-"""Seeded schedules of faults, pauses, beam losses, stops, aborts: every scan ends by name, safe, with true angles."""
+"""Seeded schedules of faults of camera, stage and disk, pauses, beam losses, stops, aborts.
+
+Every scan ends by name, safe, with true angles.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from beamline.core.errors import InstrumentError
+from beamline.core.errors import DataError, InstrumentError
 from beamline.core.stop import ScanAborted, ScanStopped, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.ledger import LedgerError
@@ -25,12 +28,32 @@ def scheduled(seed: int) -> None:
     def some(most: int) -> set[int]:
         return {int(i) for i in FIRST + rng.choice(N, rng.integers(0, most + 1), replace=False)}
 
-    faults = Faults(lost=some(2), ignored=some(2), extra_after=some(1), errors=dict.fromkeys(some(1), 1))
+    rare = rng.random(3) < 0.1
+    # A camera that fails once is asked again; one that fails twice is unplugged, and so is a stage that stalls.
+    faults = Faults(
+        lost=some(2),
+        ignored=some(2),
+        extra_after=some(1),
+        errors=dict.fromkeys(some(1), 2 if rare[0] else 1),
+        stall_at=int(rng.integers(0, 18000)) if rare[1] else None,
+    )
     stop = StopRequest()
     paused = Paused(faults, stop)
+    full_at = int(rng.integers(0, FIRST + N)) if rare[2] else -1
+
+    def on_frame(number: int) -> None:
+        if number == full_at:
+            raise DataError("The disk is full.")
+
+    paused.instrument.on_frame = on_frame
     clock, begun = paused.instrument.clock, paused.instrument.clock.now()
-    acts = [paused.pause.pause, lambda: paused.pause.no_beam("no beam", clock.now() - rng.uniform(0, 2))]
-    planned = [(float(rng.uniform(0, SECONDS)), acts[int(rng.integers(2))]) for _ in range(rng.integers(0, 4))]
+    acts = [
+        paused.pause.pause,
+        lambda: paused.pause.no_beam("no beam", clock.now() - rng.uniform(0, 2)),
+        lambda: paused.pause.hold("backlog", "a slow disk"),
+        lambda: paused.pause.release("backlog"),
+    ]
+    planned = [(float(rng.uniform(0, SECONDS)), acts[int(rng.integers(4))]) for _ in range(rng.integers(0, 5))]
     if rng.random() < 0.3:
         planned.append((float(rng.uniform(0, SECONDS)), stop.abort if rng.random() < 0.5 else stop.stop))
     due, sleep = sorted(planned, key=lambda act: act[0]), clock.sleep
@@ -44,7 +67,7 @@ def scheduled(seed: int) -> None:
     mode, passes = ((Mode.FLY, 1), (Mode.FLY, 3), (Mode.STEP, 1))[int(rng.integers(3))]
     run = paused.run(N, mode, passes, at=Place.BOTH)
     assert run.error is None or isinstance(
-        run.error, LedgerError | ScanStopped | ScanAborted | InstrumentError | DeviceError
+        run.error, DataError | ScanStopped | ScanAborted | InstrumentError | DeviceError
     ), seed
     assert_safe(paused.instrument, home=False)
     assert all(paused.at_rest)

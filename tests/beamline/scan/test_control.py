@@ -15,7 +15,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
 from beamline.scan import control
-from beamline.scan.control import Verb, obeying, running, state_of, tell
+from beamline.scan.control import Verb, running, state_of, tell, verbs_taken
 from beamline.scan.states import State
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
@@ -76,7 +76,7 @@ def test_a_run_is_ended_also_while_it_is_paused(
 
 def test_only_the_owner_may_ask_and_nothing_is_left(tmp_path: Path) -> None:
     pause = PauseRequest()
-    with obeying(tmp_path, StopRequest(), pause):
+    with verbs_taken(tmp_path, StopRequest(), pause):
         if os.name == "posix":
             assert (tmp_path / "control").stat().st_mode & 0o777 == 0o700
         asked(tmp_path, Verb.PAUSE)
@@ -96,13 +96,13 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     stop = StopRequest()
     (runs[0] / "events.jsonl").write_text('{"event": "frame"}\n{"event": "state", "state": "acquiring"}\n{"event": "st')
     locks = [WriterLock(runs[0] / "scan.h5")]
-    with obeying(runs[0], stop, PauseRequest()):
+    with verbs_taken(runs[0], stop, PauseRequest()):
         assert running(Path("runs")) == [Path("runs/a")]
         result = CliRunner().invoke(main, ["stop"])
         assert result.exit_code == 0 and result.stdout == f"{Path('runs/a')}: acquiring\n"
         assert stop.stopping and not stop.aborting
         locks.append(WriterLock(runs[1] / "scan.h5"))
-        with obeying(runs[1], stop, PauseRequest()):
+        with verbs_taken(runs[1], stop, PauseRequest()):
             result = CliRunner().invoke(main, ["abort"])
             assert result.exit_code == 2 and "2 scans run in runs: a, b" in result.stderr
             assert CliRunner().invoke(main, ["abort", str(runs[1])]).exit_code == 0

@@ -49,6 +49,12 @@ def test_what_a_live_volume_takes_is_told() -> None:
     assert said("simulated", "recon.live=false") == said("simulated", "recon.method=fbp") == []
 
 
+def test_the_disk_is_that_of_the_run_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("beamline.scan.preflight.free_bytes", lambda folder: 7 if folder == tmp_path else 10**15)
+    assert dry_run(shipped("demo")).free_bytes == 10**15
+    assert dry_run(shipped("demo"), tmp_path).free_bytes == 7
+
+
 def test_violations_are_refused_all_at_once() -> None:
     worked = dry_run(shipped("demo")).timeline
     refuse_violations(worked)

@@ -319,7 +319,7 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
         raise DeviceError("stage", "its port does not close")
 
     instrument = replace(FakeInstrument().connected(), close=fail)
-    monkeypatch.setattr(module, "connect", lambda config, ask, check_stop: instrument)
+    monkeypatch.setattr(module, "connect", lambda config, clock, ask, check_stop: instrument)
     events: list[Event] = []
     with pytest.raises(DeviceError, match="does not close"):
         run_scan(small(), tmp_path, [events.append])

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,9 +20,10 @@ from beamline.instrument.connect import Instrument
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
 from beamline.scan.states import State
-from beamline.scan.supervision import AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits
+from beamline.scan.supervision import AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, SpaceGuard
 from beamline.storage.readers.open import open_scan
-from drivers.frame import FrameKind
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.frame import Frame, FrameKind
 from drivers.protocols import BeamReading
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
@@ -130,6 +134,7 @@ def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
 ) -> None:
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (1, 1))  # the writer keeps up with the virtual clock
     monkeypatch.setattr(recorder_module, "WAITING_BYTES", 1)
+    monkeypatch.setattr(recorder_module, "BacklogGuard", lambda room, pause: lambda waiting: None)
     instrument = FakeInstrument(Faults(repeats={9, 10}))
     paused: list[tuple[str, bool]] = []
 
@@ -169,3 +174,126 @@ def test_the_policy_stop_ends_the_scan_cleanly(tmp_path: Path, monkeypatch: pyte
     n = ran.of("scan_done")[0].data["n_frames"]
     assert 11 <= n < 20
     ran.assert_safe()
+
+
+def test_a_scan_pauses_before_its_disk_is_full_and_goes_on_when_there_is_space() -> None:
+    pause = PauseRequest()
+    look, mb = SpaceGuard(100_000_000, pause), 1_000_000
+    steps = [(500, 900, ""), (121, 800, ""), (119, 790, "119 MB are free.* 790 MB are still to come.* at 220 MB")]
+    for free, left, said in [*steps, (219, 790, "Free some"), (220, 790, ""), (119, 790, "Free some")]:
+        look(free * mb, left * mb)
+        assert re.search(said, pause.reason) if said else pause.reason == ""
+    look(119 * mb, 99 * mb)  # what is still to come fits
+    assert pause.reason == ""
+
+
+def test_what_holds_a_scan_ends_by_itself_alone() -> None:
+    pause = PauseRequest()
+    pause.hold("space", "full")
+    pause.no_beam("dark", 0.0)
+    pause.pause()
+    pause.resume()
+    pause.beam_back()
+    assert pause.reason == "full"
+    pause.release("space")
+    assert pause.reason == ""
+
+
+def test_a_scan_waits_for_space_on_its_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another program takes it while the ninth frame is exposed, and gives it back when the scan has paused."""
+    free = [10**12]
+    monkeypatch.setattr(recorder_module, "LOOK", 0.01)
+    monkeypatch.setattr(recorder_module.shutil, "disk_usage", lambda path: SimpleNamespace(free=free[0]))
+
+    def take(number: int) -> None:
+        if number == 8:
+            free[0] = 10**6
+            time.sleep(0.2)
+
+    def give_back(event: Event) -> None:
+        if event.data.get("state") is State.PAUSED:
+            assert "1 MB are free on the scan's disk" in event.data["message"]
+            free[0] = 10**12
+
+    ran = Ran(tmp_path, FakeInstrument(on_frame=take), heard=give_back)
+    assert ran.error is None
+    assert State.PAUSED in ran.states
+    ran.assert_good_file(3 + 2 + 12 + 2, "complete")
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_a_slow_disk_loses_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
+    """A fly scan pauses before frames find no room, a step scan just waits."""
+    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (8, 8))
+    append, waiting = NXtomoWriter.append, []
+    put = recorder_module.Recorder.put
+
+    def slowly(writer: NXtomoWriter, *row: Any) -> None:
+        time.sleep(0.02)
+        append(writer, *row)
+
+    def noted(recorder: recorder_module.Recorder, frame: Frame) -> None:
+        put(recorder, frame)
+        waiting.append(recorder._waiting.qsize())
+
+    monkeypatch.setattr(NXtomoWriter, "append", slowly)
+    monkeypatch.setattr(recorder_module.Recorder, "put", noted)
+    ran = Ran(tmp_path, FakeInstrument(), f"scan.mode={mode}", "scan.angles.views=36")
+    assert ran.error is None
+    assert (State.PAUSED in ran.states) is (mode == "fly")
+    assert max(waiting) < 8 if mode == "fly" else max(waiting) == 8
+    ran.assert_good_file(3 + 2 + 36 + 2, "complete")
+
+
+def test_a_slow_disk_pauses_no_darks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (4, 4))
+    append = NXtomoWriter.append
+
+    def slowly(writer: NXtomoWriter, *row: Any) -> None:
+        time.sleep(0.02)
+        append(writer, *row)
+
+    monkeypatch.setattr(NXtomoWriter, "append", slowly)
+    ran = Ran(tmp_path, FakeInstrument(), "scan.mode=fly", "scan.darks.count=12")
+    assert ran.error is None
+    assert ran.states[:4] == [State.PREPARING, State.DARKS, State.FLATS, State.TAXI]
+    assert State.PAUSED in ran.states
+
+
+@pytest.mark.parametrize("block", [State.FLATS, State.ACQUIRING])
+def test_a_loss_of_beam_read_after_the_last_frame_of_a_block_is_mended(tmp_path: Path, block: State) -> None:
+    """The reading after the last view (or flat) is without beam, the next one with: what came since is taken again."""
+    instrument, lost = FakeInstrument(), [False]
+
+    class Beam:
+        name = "beam monitor"
+
+        def reading(self) -> BeamReading:
+            time.sleep(0.01)
+            value = 0.0 if lost[0] else 100.0
+            lost[0] = False
+            return BeamReading(value, "mA", instrument.clock.now())
+
+        def close(self) -> None: ...
+
+    def at_frame(number: int) -> None:
+        if number == (4 if block is State.FLATS else 16):
+            lost[0] = True
+
+    instrument.on_frame = at_frame
+    devices = replace(instrument.connected(), beam_monitor=Beam())
+    instrument.connected = lambda: devices  # type: ignore[method-assign]
+    beam = (
+        "devices.beam_monitor={kind: ring_current, url: 'file:///r', pattern: '(.)', period_s: 0.05, pause_below: 50,"
+        " settle_s: 0}"
+    )
+    ran = Ran(tmp_path, instrument, beam)
+    assert ran.error is None and ran.result is not None
+    with open_scan(ran.result.path) as source:
+        kinds = [FrameKind.FLAT if block is State.FLATS else FrameKind.PROJECTION]
+        again = [frame for frame in source.frames() if frame.replaces >= 0]
+        assert again and {frame.kind for frame in again} == set(kinds)
+        assert (source.image_key == FrameKind.PROJECTION).sum() == 12
+    frames = ran.of("frame")
+    assert all(event.data["n"] <= event.data["of"] for event in frames)
+    assert frames[-1].data["n"] == frames[-1].data["of"] == ran.result.n_frames

@@ -65,7 +65,8 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Pa
             time.sleep(0.1)
             text = log.read_text(encoding="utf-8") if log.exists() else ""
         assert "has died" in text and "told to stop" in text and "disarmed" in text
-        assert ("Close the beam shutter." in text) is not outputs
+        assert ("Close the beam shutter." in text) is ("moved by hand" in text) is not outputs
+        assert ("its shutter is closed" in text) is outputs
         stood = line.angle_at(clock.now())
         assert not controller.output_is_high(2)
         time.sleep(0.3)

@@ -20,6 +20,7 @@ from beamline.monitor.digest import digest
 from beamline.simulate.labels import LabelledRun, write_labels
 from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
+from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.frame import FrameKind
 from drivers.protocols import BeamReading
@@ -80,10 +81,11 @@ def paths(*files: Path) -> set[str]:
 
 @pytest.fixture
 def whole_scan(tmp_path: Path) -> list[Path]:
-    """A scan with all that a scan file can have but a no-data value, and an ingested one that has that."""
+    """A scan with all that a scan file can have but a no-data value and parts, and others that have these."""
+    plan = {kind: {"count": 0, "at": "start"} for kind in ("darks", "flats")}
     info = ScanInfo(
         "s", pixel_size_mm=0.5, energy_kev=20.0, distance_mm=900.0, exposure=0.1, period=0.2, axis_col=20.7,
-        source_distance_mm=1e4, devices={"stage": {"model": "m"}}, beam_unit="A",
+        source_distance_mm=1e4, devices={"stage": {"model": "m"}}, beam_unit="A", plan=json.dumps(plan),
     )  # fmt: skip
     frames = frames_of(SCAN)
     frames.append(replace(frames[-1], index=len(frames), kind=FrameKind.ALIGNMENT))
@@ -93,7 +95,8 @@ def whole_scan(tmp_path: Path) -> list[Path]:
     writer.close(beam=[BeamReading(1.0, "A", 1.8e9)])
     assert writer.remarks == []
     ingested = ingest(write_exchange(tmp_path / "exchange.h5", SCAN), tmp_path / "ingested.h5", no_data=0.0)
-    return [writer.path, ingested.path]
+    join([writer.path, writer.path], tmp_path / "joined.h5")
+    return [writer.path, ingested.path, tmp_path / "joined.h5"]
 
 
 def test_scan_files(whole_scan: list[Path]) -> None:

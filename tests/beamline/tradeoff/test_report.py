@@ -13,6 +13,7 @@ import pytest
 
 from beamline.core.machine import machine
 from beamline.report.html import Picture
+from beamline.report.slice_sheet import Slices
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Trial, plan
@@ -56,6 +57,8 @@ def test_each_further_decibel_is_told_with_its_price() -> None:
     assert quality == "Quality: PSNR, dB."
     assert fastest == "Fastest: fbp, 10 views: 20.00 dB in 2 s."
     assert step == "+4.00 dB for 10 s more (2.5 s a dB): r2, 10 views, 100 steps, 2k Gaussians."
+    with_halves = replace(_done(BASE, 2.0, 20.0), metrics={"psnr": 20.0, "resolution": 0.6})
+    assert conclusions(_table(with_halves))[-1].startswith("FSC: a smaller period is better among settings of one")
     assert conclusions(_table())[-1] == "No trial has both a time and a quality."
 
 
@@ -101,10 +104,12 @@ def test_the_page_has_every_part_and_requests_nothing() -> None:
 
 
 def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
-    write_figures(tmp_path, _table(Outcome(BASE, "failed")))
+    write_figures(tmp_path, _table(Outcome(BASE, "failed")), Slices())
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html"}
     curve = ((0.1, 3.0), (0.2, 4.0))
-    write_figures(tmp_path, _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")))
+    write_figures(
+        tmp_path, _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")), Slices()
+    )
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html", "quality_seconds.png", "curves.png"}
 
 

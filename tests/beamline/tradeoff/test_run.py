@@ -43,8 +43,10 @@ def _options(tmp_path: Path, **changes: Any) -> TradeoffOptions:
     return replace(options, **changes)
 
 
-def _made_up(trial: Trial, *_: object) -> Outcome:
+def _made_up(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
     """A trial that takes no time: more work gives more quality, for more seconds and memory."""
+    if keep is not None:
+        np.save(keep, np.zeros((4, 5, 6), np.float32))
     if trial.group == "precision":
         names = ("residual_float32", "residual_float64", "difference", "seconds_float32", "seconds_float64")
         return Outcome(trial, "done", 0.1, details=dict.fromkeys(names, 0.1))
@@ -79,7 +81,7 @@ def _rows(folder: Path) -> list[dict[str, str]]:
 def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) -> None:
     events: list[Event] = []
     table = run_tradeoff(_options(tmp_path), events.append, SystemClock())
-    assert _left(tmp_path / "out") == TABLES | FIGURES | {"curves.png"}
+    assert _left(tmp_path / "out") == TABLES | FIGURES | {"curves.png", "slices.png"}
     record = json.loads((tmp_path / "out" / "tradeoff.json").read_text(encoding="utf-8"))
     rows = _rows(tmp_path / "out")
     assert len(record["trials"]) == len(rows) == len(table.outcomes)
@@ -90,7 +92,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
         if outcome.trial.group != "precision":
             assert float(row["quality_db"]) == pytest.approx(20 * math.log10(1000 * outcome.seconds))
     page = (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 4
     assert all(outcome.trial.label in page for outcome in table.compared)
     assert [e.event for e in events if e.event != "progress"] == [
         "tradeoff_started", "state", *["trial"] * len(rows), "done"
@@ -114,7 +116,7 @@ def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> N
     grid = Grid.matching(Geometry.parallel([0.0], SCAN.shape))
     np.save(tmp_path / "truth.npy", SCAN.truth(grid))
     seen: list[Trial] = []
-    made_up(lambda trial, *rest: seen.append(trial) or _made_up(trial))  # type: ignore[operator, func-returns-value]
+    made_up(lambda trial, *rest, keep=None: seen.append(trial) or _made_up(trial))  # type: ignore[operator, func-returns-value]
     table = run_tradeoff(_options(tmp_path, truth=str(tmp_path / "truth.npy")), lambda e: None, SystemClock())
     assert table.by == "psnr"
     assert max(trial.views for trial in seen) == 30
@@ -125,7 +127,7 @@ def test_with_a_truth_no_view_is_kept_back(tmp_path: Path, made_up: object) -> N
 def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> None:
     done: list[Trial] = []
 
-    def interrupted(trial: Trial, *_: object) -> Outcome:
+    def interrupted(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
         if len(done) == 3:
             raise KeyboardInterrupt
         done.append(trial)
@@ -147,7 +149,7 @@ def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any) -> N
 def test_ctrl_c_before_the_first_trial_is_done_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
-    def interrupted(*_: object) -> Outcome:
+    def interrupted(*_: object, **__: object) -> Outcome:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(tradeoff, where, interrupted)
@@ -178,7 +180,7 @@ def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
 def test_a_disk_that_is_full_later_keeps_the_trials_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: Any
 ) -> None:
-    def filling(trial: Trial, *_: object) -> Outcome:
+    def filling(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
         if trial.views != 27:
             monkeypatch.setattr(Path, "write_text", _full)
         return _made_up(trial)
@@ -191,7 +193,7 @@ def test_a_disk_that_is_full_later_keeps_the_trials_written(
 
 
 def test_events_and_page_tell_the_settings_and_short_times(tmp_path: Path, made_up: Any) -> None:
-    def short(trial: Trial, *_: object) -> Outcome:
+    def short(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
         made = _made_up(trial)
         return replace(made, seconds=made.seconds * 1e-4, cpu_seconds=made.seconds * 1e-4)
 
@@ -217,7 +219,7 @@ def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any)
     time = iter(range(0, 10_000, 5))
     limits: list[float] = []
 
-    def timed(trial: Trial, work: Path, seed: int, left: float) -> Outcome:
+    def timed(trial: Trial, work: Path, seed: int, left: float, keep: Path | None) -> Outcome:
         limits.append(left)
         return _made_up(trial)
 
@@ -228,14 +230,14 @@ def test_a_limit_of_time_ends_it_without_a_failure(tmp_path: Path, made_up: Any)
 
 
 def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any) -> None:
-    def failing(trial: Trial, *_: object) -> Outcome:
+    def failing(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
         return Outcome(trial, "failed", message="no room") if trial.method == "fbp" else _made_up(trial)
 
     made_up(failing)
     table = run_tradeoff(_options(tmp_path), lambda e: None, SystemClock())
     assert "failed: no room" in text(table)
     assert "failed: no room" in (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
-    made_up(lambda trial, *_: Outcome(trial, "failed", message="no room"))
+    made_up(lambda trial, *_, **__: Outcome(trial, "failed", message="no room"))
     table = run_tradeoff(_options(tmp_path, folder=tmp_path / "b"), lambda e: None, SystemClock())
     assert "No trial has both" in text(table)
     assert _left(tmp_path / "b") == TABLES

@@ -390,6 +390,6 @@ class Rig:
         return bool(wishes) and wishes[-1].startswith("Open")
 
     def _connect(self, config: Config, **how: Any) -> Instrument:
-        bench = connect(config, self.clock, **how)
+        bench = connect(config, **{**how, "clock": self.clock})
         self.after_connecting()
         return bench

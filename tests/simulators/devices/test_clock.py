@@ -66,3 +66,11 @@ def test_a_clock_that_stands_or_goes_back_is_refused(speed: float) -> None:
 
 def test_the_system_clock_agrees_with_the_epoch() -> None:
     assert SystemClock().now() == pytest.approx(time.time(), abs=1.0)
+
+
+def test_clocks_may_start_later_than_their_base() -> None:
+    base = VirtualClock(start=100.0)
+    assert ScaledClock(base, 10.0, not_before=50.0).now() == 100.0
+    clock = ScaledClock(base, 10.0, not_before=5000.0)
+    base.sleep(2.0)
+    assert clock.now() == 5020.0

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
+from beamline.storage.readers.overlay import Overlay
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import INFO, StandingClock
@@ -133,6 +134,20 @@ def test_a_foreign_nxtomo_in_savus_place(tmp_path: Path) -> None:
         assert [frame.trigger for frame in replayed] == [0, 0, 0, 1, 2, 0]
         assert replayed[3].exposure == pytest.approx(0.02)
         assert (replayed[3].framestamp, np.isnan(replayed[3].time)) == (-1, True)
+
+
+def test_the_ring_current_of_each_frame(tmp_path: Path) -> None:
+    """0 and what is no number are unknown; laid-over references have none."""
+    path = foreign(tmp_path / "f.nxs")
+    with open_scan(path) as source:
+        assert source.currents is None
+    with h5py.File(path, "r+") as file:
+        file["entry1/tomo_entry/control/data"] = [0.0, 199.5, 200.0, 190.0, 180.0, np.nan]
+    with open_scan(path) as source:
+        np.testing.assert_array_equal(source.currents, [np.nan, 199.5, 200.0, 190.0, 180.0, np.nan])
+    with open_scan(path) as source:
+        over = Overlay(source, darks=np.zeros((2, 4, 5), np.uint16))
+        np.testing.assert_array_equal(over.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
 
 
 def test_radians_are_taken_as_radians(tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_a_file_that_the_system_does_not_let_go_of_is_left_as_it_is(
 
 
 def test_a_failure_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(entry: h5py.Group, record: ReconRecord) -> None:
+    def full_disk(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
         entry["definition"] = "NXtomoproc"
         raise OSError(28, "No space left on device")
 

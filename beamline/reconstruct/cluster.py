@@ -1,0 +1,133 @@
+"""Cluster: processes on this machine or on others that reconstruct slabs, by dask.distributed."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import recon
+from beamline.core.errors import BeamlineError, ConfigError
+from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse, Method, RunControl
+from recon.base.volume import Grid
+from recon.reconstruction import Reconstruction
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_CONNECT_TIMEOUT = 30  # for a scheduler to answer
+_TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
+
+
+class WorkersLost(BeamlineError):  # noqa: N818 - what happened
+    """Workers did not come back with a slab."""
+
+    exit_code = 5
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Workers that reconstruct; one that is lost has its work done by another.
+
+    Attributes:
+        workers: how many.
+    """
+
+    workers: int
+    _client: Client
+
+    def reconstruct(
+        self,
+        projections: NDArray[np.float32],
+        geometry: Geometry,
+        method: Method,
+        *,
+        grid: Grid,
+        seed: int,
+        device: str,
+        use: DataUse,
+        control: RunControl,
+    ) -> Reconstruction:
+        """As `recon.reconstruct`, by a worker with as many threads as there are here; without progress and stop.
+
+        Raises:
+            WorkersLost: one after the other, with this work, or the scheduler.
+        """
+        import numba
+        from distributed import KilledWorker
+
+        work = (np.array(projections), geometry, method, grid, seed, device, use, control.decide)
+        future = self._client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
+        try:
+            found: Reconstruction = future.result()
+        except (KilledWorker, CancelledError) as error:
+            raise WorkersLost(
+                f"The scheduler, or several workers with the same slab, were lost ({error}). They may lack memory: "
+                "give a smaller --memory, or fewer workers. Slabs that are finished stay: see --resume."
+            ) from error
+        return found
+
+
+def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
+    """On a worker. The same number of threads gives the same bits."""
+    import numba
+
+    data, geometry, method, grid, seed, device, use, decide = work
+    assert decide is None or isinstance(decide, Decisions)
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    found = recon.reconstruct(
+        data, geometry, method, grid=grid, seed=seed, device=device, use=use, control=RunControl(decide=decide)
+    )
+    return replace(found, gaussians=None, checkpoint=None, settings=dict(found.settings))
+
+
+def check_cluster(spec: str) -> None:
+    """Raises ValueError for what is neither local:N nor an address, and where dask.distributed is not installed."""
+    if find_spec("distributed") is None:
+        raise ValueError("it needs dask.distributed: pip install splatline[cluster]")
+    if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+", spec):
+        raise ValueError(f"{spec!r} is neither local:N with N workers on this machine, nor tcp://HOST:PORT")
+
+
+def local_workers(spec: str | None) -> int:
+    """Workers on this machine; 0: none, or those of a scheduler."""
+    return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0
+
+
+@contextmanager
+def connected(spec: str) -> Iterator[Cluster]:
+    """The cluster that `spec` names; workers on this machine end with the block.
+
+    Raises:
+        ConfigError: the scheduler does not answer or has no workers.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as closing:
+        closing.enter_context(dask.config.set({"distributed.admin.large-graph-warning-threshold": _TASK_SIZE_WARNING}))
+        address: Any = spec
+        try:
+            if n := local_workers(spec):
+                # Without a page on a port, and without a limit of its own: --memory is that of a slab.
+                address = LocalCluster(
+                    n, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs=logging.ERROR
+                )
+                closing.enter_context(address)
+            client = closing.enter_context(Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False))
+            workers = len(client.scheduler_info(n_workers=-1)["workers"])
+        except (OSError, RuntimeError, ValueError) as error:
+            raise ConfigError(f"--cluster {spec}: no scheduler answers ({error}).") from error
+        if not workers:
+            raise ConfigError(f"--cluster {spec}: the scheduler has no workers. Start some: dask worker {spec}.")
+        yield Cluster(workers, client)

@@ -1,0 +1,102 @@
+"""Region: a box of the volume at full resolution, from the detector rows that show it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.projections.selection import Selection, cone_of, rows_of
+from beamline.storage.readers.base import ScanSource
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Region:
+    """Voxels first:end along z, y and x of the volume that the same options give of all of it."""
+
+    z: Span
+    y: Span
+    x: Span
+
+    @classmethod
+    def parse(cls, text: str) -> Region:
+        """Of `z0:z1,y0:y1,x0:x1`. ValueError for anything else."""
+        spans = [tuple(map(int, span)) for span in re.findall(r"(?:^|,)(\d+):(\d+)(?=,|$)", text)]
+        if len(spans) != 3 or text.count(",") != 2 or any(first >= end for first, end in spans):
+            raise ValueError(
+                f"{text!r} is not Z0:Z1,Y0:Y1,X0:X1 with whole numbers, first < end, e.g. 40:80,100:300,0:90"
+            )
+        return cls(*spans)  # type: ignore[arg-type]
+
+    def __str__(self) -> str:
+        return ",".join(f"{first}:{end}" for first, end in (self.z, self.y, self.x))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A region in the volume of the rows that are read for it.
+
+    Attributes:
+        region: in the whole volume.
+        part: the same slices (z, y, x) of the volume of these rows.
+        lift: mm by which z = 0 of these rows lies above that of all rows.
+    """
+
+    region: Region
+    part: tuple[slice, slice, slice]
+    lift: float
+
+    def of_rows(self, grid: Grid) -> Grid:
+        """The region's box in the frame of these rows, whose volume has this grid."""
+        return grid.part(*self.part)
+
+    def cut(self, volume: Volume) -> Volume:
+        """The region alone, in the frame of all rows, of the volume of these rows or of its own box."""
+        grid, data = volume.grid, volume.data
+        if grid.shape != tuple(part.stop - part.start for part in self.part):
+            grid, data = self.of_rows(grid), data[self.part]
+        z, y, x = grid.centre
+        return Volume(data, replace(grid, centre=(z + self.lift, y, x)))
+
+
+def around(source: ScanSource, selection: Selection, region: Region, halo: int) -> Selection:
+    """The rows of the selection that show the region, and so many slices beside it; the axis is that of all rows.
+
+    Raises:
+        ConfigError: a cone, or a region that the rows do not show.
+    """
+    if cone_of(source, selection) is not None:
+        raise ConfigError(f"--roi is for a parallel beam; {source.path} is a cone. Give --rows instead.")
+    rows, side, (first, end) = rows_of(source, selection), selection.binning, region.z
+    slices = (rows.stop - rows.start) // side
+    if end > slices:
+        raise ConfigError(f"--roi {region}: slices {first}:{end} do not lie in the volume's 0:{slices}.")
+    low, high = max(first - halo, 0), min(end + halo, slices)
+    near = rows.start + low * side, rows.start + high * side
+    return replace(selection, rows=near, axis_rows=(rows.start, rows.stop))
+
+
+def placed(region: Region, selection: Selection, geometry: Geometry) -> Placed:
+    """Where the region lies in the volume of `geometry`, which is of the selection that `around` gave.
+
+    Raises:
+        ConfigError: it lies outside.
+        DataError: the views are shifted along the axis, so that slices are not rows.
+    """
+    assert selection.rows is not None and selection.axis_rows is not None
+    grid, side = Grid.matching(geometry), selection.binning
+    low, high = ((row - selection.axis_rows[0]) // side for row in selection.rows)
+    slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
+    if geometry.shifts[:, 1].any():
+        raise DataError(
+            "The views are shifted along the axis, by jumps of the sample: --roi takes rows for slices. Give --rows."
+        )
+    for name, (first, end), width in zip("yx", (region.y, region.x), grid.shape[1:], strict=True):
+        if end > width:
+            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in the volume's 0:{width}.")
+    part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)
+    return Placed(region, part, ((low + high) - slices) / 2 * geometry.sample_pitch)

@@ -1,0 +1,252 @@
+"""The slabs of a volume, one after the other, into a partial volume, which a later call may go on with."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import astuple, dataclass, replace
+from math import nan
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from beamline.core.errors import DataError, ScanStopped
+from beamline.core.files import remove
+from beamline.core.version import version
+from beamline.projections.correction import Warn
+from beamline.projections.prepare import PreparedProjections
+from beamline.reconstruct.checkpoints import origin_of, refuse_other
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.slabs import for_part
+from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
+from beamline.storage.writers.recon_file import ReconRecord, Value
+from recon.auto import Auto
+from recon.base.decisions import Decisions
+from recon.base.method import Method, Progress, RunControl
+from recon.base.slabs import Slab, part_of
+from recon.base.volume import Grid, Volume
+from recon.reconstruction import Reconstruction
+from recon.splatting.r2 import R2
+from recon.voxels.methods.fista_tv import FistaTv
+
+_LOOKED_AT = 8  # views by which the rows with most matter are found
+_WEIGHED = 16  # rows of which weights are made at a time
+
+_LOOK = 0.5  # s between two looks at slabs under way
+
+T = TypeVar("T")
+Run = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
+"""Reconstructs views on a grid."""
+
+
+@dataclass(frozen=True)
+class SlabWorkers:
+    """Reconstructs `count` slabs at a time, each by `run` in a thread of its own."""
+
+    count: int
+    run: Run
+
+
+def in_slabs(
+    run: Run,
+    prepared: PreparedProjections,
+    options: ReconOptions,
+    slabs: Sequence[Slab],
+    control: RunControl,
+    said: Callable[[str], None],
+    warn: Warn,
+    workers: SlabWorkers | None = None,
+) -> Reconstruction:
+    """A method's volume on disk, slab by slab; of a partial volume those that it lacks.
+
+    The slab with most matter comes first; what it decides by its data the others follow, so that slabs fit together.
+    From slab to slab the volume fades. Each slab depends on the data and the first slab alone: a volume that was
+    stopped and resumed is equal to the bit.
+
+    Args:
+        run: reconstructs a slab.
+        control: of all slabs together.
+        said: is told of each slab.
+        warn: is told of slices that are not by the method.
+        workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
+
+    Raises:
+        DataError: the views are zero everywhere, or the partial volume is of other data or options.
+    """
+    grid, begin = Grid.matching(prepared.geometry), control.now()
+    made_from, partial = _made_from(prepared, options), None
+    if options.partial is not None:
+        partial = open_partial(options.partial)
+        refuse_other(options.partial, made_from, partial.made_from, "reconstruction")
+        said(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
+    in_all = sum(slab.slices.stop - slab.slices.start for slab in slabs)
+
+    def made(n: int, by: Run, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
+        """The slab, and what is to be said of it; None of views that are zero."""
+        slab, follows = slabs[n], partial is not None
+        one = replace(control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0]))
+        rows, geometry, box = part_of(prepared.geometry, grid, slab.slices)
+        part = prepared.of_rows(rows, geometry)
+        if not part.projections.data.any():
+            return None, ""
+        try:
+            method = for_part(options.method, slab.slices.stop - slab.slices.start, grid.shape[0], in_all)
+            return by(method, part, box, one), ""
+        except DataError as error:
+            # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
+            if not follows or not isinstance(options.method, R2 | Auto):
+                raise
+            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
+            return by(FistaTv(), part, box, one), remark
+
+    def told(n: int) -> None:
+        said(f"Slab {n + 1} of {len(slabs)}: slices {slabs[n].own.start} to {slabs[n].own.stop - 1}.")
+
+    left = [n for n in busiest_first(prepared, grid, slabs) if partial is None or not partial.has(n)]
+    while partial is None:
+        if not left:
+            raise DataError("The views are zero everywhere: there is nothing in the beam.")
+        told(n := left.pop(0))
+        decide = Decisions(options.seed)
+        if (found := made(n, run, decide, 0)[0]) is not None:
+            record = _record(prepared, options, grid, begin)
+            partial = create_partial(options.partial_path, record, slabs, made_from, _kept(found, decide))
+            partial.add(n, found.volume.data)
+        del found  # no slab is in memory while the next one is made
+    decided = partial.kept["decided"]
+    if workers is None:
+        for n in left:
+            told(n)
+            _add(partial, n, *made(n, run, Decisions(options.seed, decided), partial.n_slices_done), warn)
+    else:
+
+        def by_worker(n: int) -> tuple[Reconstruction | None, str]:
+            return made(n, workers.run, Decisions(options.seed, decided), 0)
+
+        for n, (found, remark) in _as_they_come(by_worker, left, workers.count):
+            _add(partial, n, found, remark, warn)
+            said(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
+            if (listen := control.on_progress) is not None:
+                seconds, views = control.now() - begin, prepared.geometry.n_views
+                listen(Progress(partial.n_slices_done, grid.shape[0], seconds, nan, nan, 0, views, unit="slices"))
+    return _whole(partial, grid, options, control.now() - begin)
+
+
+def _as_they_come(make: Callable[[int], T], left: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:
+    """The slabs `left` and what `make` returns of each; so many at a time are made or wait to be taken."""
+    pool, ahead, under_way = ThreadPoolExecutor(at_a_time), list(left), dict[Future[T], int]()
+    try:
+        while ahead or under_way:
+            while ahead and len(under_way) < at_a_time:
+                n = ahead.pop(0)
+                under_way[pool.submit(make, n)] = n
+            # On Windows a wait without an end is deaf to Ctrl-C.
+            for task in wait(under_way, _LOOK, FIRST_COMPLETED).done:
+                yield under_way.pop(task), task.result()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _add(partial: PartialVolume, n: int, found: Reconstruction | None, remark: str, warn: Warn) -> None:
+    partial.add(n, None if found is None else found.volume.data)
+    if remark:
+        warn(remark)
+
+
+@contextmanager
+def keeping(path: Path) -> Iterator[None]:
+    """The partial volume at `path` goes when the block has succeeded; else it stays.
+
+    Raises:
+        ScanStopped: instead of KeyboardInterrupt, where there are slabs to go on from.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if not path.is_file():
+            raise
+        raise ScanStopped(
+            f"The reconstruction was stopped; {path} keeps the slabs that are finished. The same call with --resume "
+            f"{path} makes the others."
+        ) from error
+    remove(path)
+
+
+def _made_from(prepared: PreparedProjections, options: ReconOptions) -> dict[str, Value]:
+    """Everything that decides what the slabs are."""
+    weights = hashlib.sha256()
+    if not options.method.traits.direct:
+        rows = prepared.geometry.detector_shape[0]
+        for first in range(0, rows, _WEIGHED):
+            end = min(first + _WEIGHED, rows)
+            some = prepared.of_rows(slice(first, end), prepared.geometry.rows(first, end)).ray_weights()
+            if some is not None:
+                weights.update(np.ascontiguousarray(some).data)
+    others: dict[str, Value] = {
+        "method": options.method.name, "seed": options.seed, "device": options.device, "program": version(),
+    }  # fmt: skip
+    return {**origin_of(prepared, options.method, others), "weights": weights.hexdigest()}
+
+
+def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, now: float) -> ReconRecord:
+    """What a partial volume says of itself, without voxels."""
+    path = Path(options.source.path)
+    return ReconRecord(
+        volume=Volume(np.broadcast_to(np.float32(0), grid.shape), grid),
+        length_unit=prepared.length_unit,
+        raw_file=str(path.resolve()),
+        title=f"Partial reconstruction of {path.name}",
+        sample="not stated",
+        time=now,
+        parameters={"method": options.method.name, "command": options.command},
+    )
+
+
+def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
+    """What the other slabs and the result need of the first slab."""
+    return {
+        "decided": decide.made,
+        "method": first.method,
+        "settings": dict(first.settings),
+        "history": [astuple(progress) for progress in first.history],
+    }
+
+
+def _whole(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: float) -> Reconstruction:
+    """The result, when all slabs are there."""
+    kept = partial.kept
+    settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.traits.halo}
+    if options.partial is not None:
+        settings["resumed_from"] = str(options.partial)
+    history = tuple(Progress(*values) for values in kept["history"])
+    return Reconstruction(Volume(partial.volume, grid), seconds, history, kept["method"], None, settings)
+
+
+def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
+    """Numbers of the slabs, the one whose rows hold most matter before all others."""
+    data = prepared.projections.data
+    some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
+    matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
+    best = int(np.argmax(matter))
+    return [best, *(n for n in range(len(slabs)) if n != best)]
+
+
+def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: int) -> Callable[[Progress], None] | None:
+    """A listener to one slab that says how far all slices are, where `done` are there before it."""
+    listen = control.on_progress
+    if listen is None:
+        return None
+
+    reached = done
+
+    def watch(progress: Progress) -> None:
+        nonlocal reached
+        share = progress.step / progress.steps if progress.steps else 0.0
+        at = done + round((slab.own.stop - slab.own.start) * share)
+        reached = max(reached, at)  # a fit's finish counts anew
+        listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
+
+    return watch

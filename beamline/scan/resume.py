@@ -1,0 +1,209 @@
+"""Resume: a run that was killed, failed, stopped or aborted goes on; its missing views come into a file of their own.
+
+The files that are there are only read (after `recover`, where their writer died): what is stored is never at risk. The
+new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first
+file joins them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from beamline.config.load import Config, load, resolved_yaml
+from beamline.core.errors import ConfigError, DataError
+from beamline.scan.preflight import ReadyScan
+from beamline.scan.run_folder import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
+from beamline.storage import hdf5
+from beamline.storage.parts import join, views_in, views_planned
+from beamline.storage.recover import Recovered, recover
+from beamline.storage.writer_lock import WriterLock, held
+from beamline.storage.writers import layout
+
+_UNTOUCHED = "Nothing was changed."
+_IDENTITY = (  # what a device says of itself that no scan and no day changes
+    "model", "identity", "serial", "firmware", "axis", "device", "channel", "counts_per_turn", "vendor", "cameraid",
+    "cameraversion",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ResumableRun:
+    """A run that goes on.
+
+    Attributes:
+        run: its folder.
+        config: what it was started with.
+        parts: its files so far, each with a frame at least.
+        views: of the plan, in these files.
+        planned: views of the whole plan.
+        last_frame_time: time of the last frame, s since the Unix epoch.
+        left_out: a sentence on each part that counts for nothing.
+    """
+
+    run: Path
+    config: Config
+    parts: tuple[Path, ...]
+    views: frozenset[int]
+    planned: int
+    last_frame_time: float
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def said(self) -> str:
+        """One line for people."""
+        missing = self.planned - len(self.views)
+        return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
+
+    def begin(self, ready: ReadyScan) -> Path:
+        """Make ordinary files of the parts whose writer died, and the folder of the new part.
+
+        Raises:
+            ConfigError: plan, frames or devices are not what they were; nothing was changed.
+            DataError: a part cannot be recovered.
+        """
+        with hdf5.open_hdf5(self.parts[0]) as first, hdf5.readable(self.parts[0]):
+            _require_same_instrument(self.run, first, ready)
+        for part in self.parts:
+            recover(part)
+        return create_part(self.run)
+
+    def join(self, part: Path) -> tuple[Path, int]:
+        """Join the parts with the new one: the file that has them all, and its frames."""
+        joined = self.run / JOINED
+        return joined, join([*self.parts, part], joined)
+
+
+@contextmanager
+def open_for_resume(run: Path, given: Config | None = None) -> Iterator[ResumableRun]:
+    """The run in this folder, held while the context lasts, so that no other process goes on with it.
+
+    Args:
+        given: a configuration that must be the run's.
+
+    Raises:
+        ConfigError: it is no run, it goes on already, its configuration differs, or nothing is missing.
+        DataError: a file of it cannot be read. In all these cases nothing was changed.
+    """
+    if not (run / SCAN).is_file() or not (run / CONFIG).is_file():
+        raise ConfigError(f"{run} is no folder of a run: it has no {SCAN} with a {CONFIG}. {_UNTOUCHED}")
+    try:
+        lock = WriterLock(run / CONFIG, exclusive=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{run} cannot be held ({error.strerror}): another process goes on with it, or it cannot be written to. "
+            f"{_UNTOUCHED}"
+        ) from None
+    try:
+        yield _series(run, given)
+    finally:
+        lock.release()
+
+
+def _series(run: Path, given: Config | None) -> ResumableRun:
+    found, left_out = _files(run)
+    for part in found:
+        if held(part):
+            raise ConfigError(f"{part} is open in another process: a scan that still runs, or a reader. {_UNTOUCHED}")
+    config = load(run / CONFIG, environment={})
+    views, planned, last_frame_time, parts = set[int](), 0, 0.0, list[Path]()
+    for part in found:
+        with hdf5.open_hdf5(part) as file, hdf5.readable(part):
+            if layout.COMMITTED not in file:
+                raise DataError(f"{part} is no scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
+            for other in (config, given):
+                if other is not None:
+                    _require_same_config(run, file["/entry/record/config"].asstr()[()], resolved_yaml(other))
+            if not (angles := views_planned(file)):
+                raise DataError(f"{part} does not hold its plan: its views are not known. {_UNTOUCHED}")
+            planned = angles
+            if file[layout.COMMITTED][()]:
+                parts.append(part)
+                views |= views_in(file)
+                last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
+    if not parts:
+        raise ConfigError(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
+    if len(views) >= planned:
+        raise ConfigError(f"{run} has all {planned} views: nothing is missing. {_UNTOUCHED}")
+    return ResumableRun(run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out))
+
+
+def _files(run: Path) -> tuple[list[Path], list[str]]:
+    """The files of the parts, without those of later parts that ended before their first frame, and a sentence on each
+    of these."""
+    files, left_out = [], []
+    for part in parts_of(run):
+        if not (part / SCAN).is_file():
+            continue
+        if part == run or _took_frames(part):
+            files.append(part / SCAN)
+        else:
+            left_out.append(f"{part / SCAN} is left out: no frame can be read in it, and its {EVENTS} names none.")
+    return files, left_out
+
+
+def _took_frames(part: Path) -> bool:
+    """Whether a part may hold frames: its file has one, or its events (which may lack the last ones) name one."""
+    with suppress(DataError), hdf5.open_hdf5(part / SCAN) as file, hdf5.readable(part / SCAN):
+        if file[layout.COMMITTED][()]:
+            return True
+    with suppress(OSError):
+        return '"event": "frame"' in (part / EVENTS).read_text(encoding="utf-8", errors="replace")
+    return True
+
+
+def _require_same_config(run: Path, stored: str, other: str) -> None:
+    """Refuse another configuration; the first line of each is the version of the program."""
+    pairs = zip(stored.splitlines()[1:], other.splitlines()[1:], strict=False)
+    differ = next(((a.strip(), b.strip()) for a, b in pairs if a != b), None)
+    if differ is not None or len(stored.splitlines()) != len(other.splitlines()):
+        said = " `{}`, not `{}`,".format(*differ) if differ else ""
+        raise ConfigError(f"{run} was taken with another configuration:{said} in its {SCAN}. {_UNTOUCHED}")
+
+
+def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> None:
+    if stored["/entry/record/plan"].asstr()[()] != ready.info.plan:
+        raise ConfigError(f"{run} was planned with other angles: has their file changed? {_UNTOUCHED}")
+    if (frames := stored[layout.DATA].shape[1:]) != tuple(ready.timing.shape):
+        raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
+    devices = stored["/entry/instrument/devices"]
+    for device, said in ready.info.devices.items():
+        group = hdf5.resolve(devices, device.replace("/", "_")) or {}
+        before, now = _identity({key: group[key][()] for key in group}), _identity(said)
+        if before != now:
+            raise ConfigError(
+                f"{run} was taken with another {device}: {_words(before)}; now there is {_words(now)}. {_UNTOUCHED}"
+            )
+
+
+def _identity(said: Mapping[str, Any]) -> dict[str, str]:
+    return {key: hdf5.text(said[key]) for key in _IDENTITY if key in said}
+
+
+def _words(identity: Mapping[str, str]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in identity.items()) or "none"
+
+
+def recover_run(run: Path) -> tuple[list[Recovered], list[str]]:
+    """Recover every part of a run, and join them where there are several: the joined file comes last.
+
+    Returns:
+        what became of each file, and a sentence on each part that was left out.
+
+    Raises:
+        DataError: no run, or a part that cannot be recovered; those before it are recovered.
+    """
+    found, left_out = _files(run)
+    if not found:
+        raise DataError(f"{run} is no folder of a run: it has no {SCAN}. {_UNTOUCHED}")
+    done = [recover(part) for part in found]
+    if len(parts := [one.path for one in done if one.frames]) > 1:
+        frames = join(parts, run / JOINED)
+        with hdf5.open_hdf5(run / JOINED) as file:
+            done.append(Recovered(run / JOINED, True, frames, 0, (views_planned(file) or 0) - len(views_in(file))))
+    return done, left_out

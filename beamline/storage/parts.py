@@ -1,0 +1,133 @@
+"""Parts: a scan that was resumed lies in several files; the views that each holds, and one file that joins them.
+
+The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view): it
+holds no frame itself, so that it can be made again at any time, and the files that do are never written again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.storage import hdf5
+from beamline.storage.writers import layout
+from beamline.storage.writers.exchange_view import add_exchange_view
+from drivers.frame import FrameKind
+
+_VIRTUAL = (layout.DATA, layout.PREVIEW)
+_READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
+_MADE_ANEW = ("/exchange", "/implements", f"{layout.DETECTOR}/image_key_control")
+
+
+def views_in(file: h5py.File) -> frozenset[int]:
+    """The views of the plan that a file holds, counted from 0: not those whose frame became invalid."""
+    n = int(file[layout.COMMITTED][()])
+    triggers, replaces = (file[path][:n] for path in (layout.TRIGGER, layout.REPLACES))
+    views = set()
+    for row in np.flatnonzero(file[layout.KIND][:n] == FrameKind.PROJECTION):
+        while replaces[row] >= 0:  # a view that was taken again has the number of the first one
+            row = replaces[row]
+        views.add(int(triggers[row]))
+    return frozenset(views)
+
+
+def views_planned(file: h5py.File) -> int | None:
+    """How many views the scan has when it is whole; None where the file does not hold its plan."""
+    angles = json.loads(file["/entry/record/plan"].asstr()[()]).get("angles_deg")
+    return None if angles is None else len(angles)
+
+
+def join(parts: Sequence[Path], joined: Path) -> int:
+    """Make, or make again, the file that has the frames of all parts, in this order. Returns how many these are.
+
+    Args:
+        parts: closed files of one scan, each with a frame at least. They are only read.
+
+    Raises:
+        DataError: one cannot be read, or the disk does not take the file: what was there stays.
+    """
+    with whole_file(joined, replace=True) as partial, ExitStack() as opened:
+        files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
+        try:
+            with hdf5.created(partial, layout.LIBVER) as file:
+                return _join(files, [os.path.relpath(part, joined.parent) for part in parts], file)
+        except hdf5.ALTERED as error:
+            raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
+
+
+def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:
+    rows = [int(file[layout.COMMITTED][()]) for file in files]
+    firsts = np.cumsum([0, *rows])
+    values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in layout.GROWING}
+    for column, first in zip(values[layout.REPLACES], firsts, strict=False):
+        column[column >= 0] += first
+    values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
+    _copy(files[0]["/"], joined, {path: np.concatenate(parts) for path, parts in values.items()})
+    for path in _VIRTUAL:
+        item = files[0][path]
+        virtual = h5py.VirtualLayout((firsts[-1], *item.shape[1:]), item.dtype)
+        for file, name, first, n in zip(files, names, firsts, rows, strict=False):
+            virtual[first : first + n] = h5py.VirtualSource(Path(name).as_posix(), path, file[path].shape)[:n]
+        _copy_attributes(item, joined.create_virtual_dataset(path, virtual))
+    for path, item in _links(files[0]):
+        joined[path] = joined[item]
+    for path in (layout.END_TIME, layout.STATUS):
+        del joined[path]
+        files[-1].copy(path, joined, path)
+    joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
+    joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
+    _name_missing(files, joined)
+    layout.settle(joined)
+    add_exchange_view(joined)
+    return int(firsts[-1])
+
+
+def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
+    """Copy a group, with these values for the datasets named; without what is virtual, made anew, or a link."""
+    _copy_attributes(source, target)
+    for name, item in source.items():
+        path = f"{source.name.rstrip('/')}/{name}"
+        if path in _MADE_ANEW or path in _VIRTUAL or _target(item) not in ("", path):
+            continue
+        if isinstance(item, h5py.Group):
+            _copy(item, target.create_group(name), values)
+        elif path in values:
+            _copy_attributes(item, target.create_dataset(name, data=values[path]))
+        else:
+            source.copy(name, target)
+
+
+def _links(file: h5py.File) -> list[tuple[str, str]]:
+    """Paths of links, and what they lead to."""
+    data = file["/entry/data"]
+    return [(f"/entry/data/{name}", target) for name, item in data.items() if (target := _target(item))]
+
+
+def _target(item: h5py.HLObject) -> str:
+    return hdf5.attribute(item, "target")
+
+
+def _copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
+    for name, value in source.attrs.items():
+        target.attrs[name] = value
+
+
+def _name_missing(files: Sequence[h5py.File], joined: h5py.File) -> None:
+    """Of the triggers that gave no frame, those that gave none in a later part either."""
+    plan = json.loads(files[0]["/entry/record/plan"].asstr()[()])
+    before = sum(plan[kind]["count"] for kind in ("darks", "flats") if plan[kind]["at"] in ("start", "both"))
+    stored = {before + view for file in files for view in views_in(file)}
+    missing = {int(trigger) for file in files for trigger in file[layout.MISSING][()]} - stored
+    del joined[layout.MISSING]
+    joined[layout.MISSING] = np.array(sorted(missing), np.int64)
+    _copy_attributes(files[0][layout.MISSING], joined[layout.MISSING])

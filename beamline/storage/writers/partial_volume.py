@@ -1,0 +1,177 @@
+"""Partial volumes: the slabs of a volume that are finished, in a file that stays readable however its writer ends.
+
+An NXtomoproc file whose places are all allocated when it is made, and written through memory maps, so that nothing of
+its structure changes later. Slices that two slabs share are kept beside while one of them is added: a slab that was
+added by half is taken out again when the file is opened.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.storage import hdf5
+from beamline.storage.scratch import reserve
+from beamline.storage.writer_lock import WriterLock, held
+from beamline.storage.writers.recon_file import ReconRecord, Value, value_of, write_record
+from recon.base.slabs import Slab
+
+_SLABS = "entry/reconstruction/slabs"
+_PLACES = {
+    "volume": "entry/data/data",
+    "done_text": "entry/reconstruction/parameters/partial",
+    "state": f"{_SLABS}/state",
+    "shared_before": f"{_SLABS}/shared_before",
+}
+_MISSING, _ADDING, _DONE = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class PartialVolume:
+    """A volume of which some slabs are finished; nobody else opens it so while this value lives.
+
+    Attributes:
+        slabs: all of them.
+        made_from: data and settings, by name; the slabs to come must be made from the same.
+        kept: what else the slabs to come need, as JSON holds it.
+    """
+
+    path: Path
+    slabs: Sequence[Slab]
+    made_from: Mapping[str, Value]
+    kept: Mapping[str, Any]
+    _maps: Mapping[str, np.memmap[Any, Any]]
+    _lock: WriterLock
+
+    @property
+    def volume(self) -> NDArray[np.float32]:
+        """float32 [z, y, x], a memory map; slices of slabs to come are zero."""
+        return self._maps["volume"]
+
+    def has(self, n: int) -> bool:
+        """Whether slab n is finished."""
+        return bool(self._maps["state"][n] == _DONE)
+
+    @property
+    def n_slices_done(self) -> int:
+        """Slices of the slabs that are finished."""
+        return sum(slab.own.stop - slab.own.start for n, slab in enumerate(self.slabs) if self.has(n))
+
+    def add(self, n: int, data: NDArray[np.float32] | None) -> None:
+        """Slab n, [z, y, x] of all slices that were reconstructed for it; None: zero."""
+        slab, state, volume = self.slabs[n], self._maps["state"], self.volume
+        if data is not None:
+            shared = _shared(slab)
+            self._maps["shared_before"][: len(shared)] = volume[shared]
+            self._written("shared_before")
+            state[n] = _ADDING
+            self._written("state")
+            for z, share, values in zip(range(*slab.slices.indices(len(volume))), slab.share, data, strict=True):
+                if share == 1:
+                    volume[z] = values
+                elif share > 0:
+                    volume[z] += share * values
+            self._written("volume")
+        state[n] = _DONE
+        self._written("state")
+        self._maps["done_text"][0] = f"{self.n_slices_done} of {len(volume)} slices"
+
+    def _written(self, name: str) -> None:
+        """Return when it is on the disk: after a loss of power no slab counts that is not there."""
+        self._maps[name].flush()
+
+    def _take_out(self) -> None:
+        """Take out the slab that was added by half, if there is one."""
+        for n in np.flatnonzero(self._maps["state"] == _ADDING).tolist():
+            shared = _shared(self.slabs[n])
+            self.volume[shared] = self._maps["shared_before"][: len(shared)]
+            self._maps["state"][n] = _MISSING
+
+
+def create_partial(
+    path: Path, record: ReconRecord, slabs: Sequence[Slab], made_from: Mapping[str, Value], kept: Mapping[str, Any]
+) -> PartialVolume:
+    """A new file without any slab; the arguments are the attributes of `PartialVolume`, `record` without its voxels.
+
+    Raises:
+        DataError: the path exists, or the disk has no room; nothing is left there.
+    """
+    nz, *shape = record.volume.grid.shape
+    with whole_file(path) as partial:
+        try:
+            write_record(partial, record, empty=True)
+            with h5py.File(partial, "r+") as file:
+                file.create_dataset(_PLACES["done_text"], (), "S40", data=f"0 of {nz} slices".encode())
+                file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
+                deepest = max(1, *(len(_shared(slab)) for slab in slabs))
+                file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)[-1, -1, -1] = (
+                    0  # allocates it
+                )
+                group = file[_SLABS]
+                group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
+                group["kept"] = json.dumps(kept, default=_plain)
+                for name, value in made_from.items():
+                    group[f"made_from/{name}"] = value
+            with partial.open("r+b") as whole:
+                reserve(whole.fileno(), partial.stat().st_size, path.parent)
+        except OSError as error:
+            raise DataError(f"{path} could not be written ({hdf5.reason(error)}). Check the disk.") from error
+    return open_partial(path)
+
+
+def open_partial(path: Path) -> PartialVolume:
+    """Open the file to add slabs to it.
+
+    Raises:
+        DataError: it is no such file, is damaged, or another process adds to it.
+    """
+    if not is_partial(path):
+        raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
+    if held(path):
+        raise DataError(
+            f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."
+        )
+    lock = WriterLock(path)
+    with hdf5.readable(path), h5py.File(path, "r") as file:
+        group = file[_SLABS]
+        rows = group["table"][()].tolist()
+        slabs = [Slab(slice(a, b), slice(c, d), fade) for a, b, c, d, fade in rows]
+        made_from = {name: value_of(node) for name, node in group["made_from"].items()}
+        kept = json.loads(group["kept"][()])
+        maps = {
+            name: np.memmap(path, item.dtype, "r+", item.id.get_offset(), item.shape or (1,))
+            for name, item in ((name, file[place]) for name, place in _PLACES.items())
+        }
+    found = PartialVolume(path, slabs, made_from, kept, maps, lock)
+    found._take_out()
+    return found
+
+
+def is_partial(path: Path) -> bool:
+    """Whether a file is a partial volume, by its content."""
+    if not path.is_file() or not hdf5.is_hdf5(path):
+        return False
+    try:
+        with hdf5.open_hdf5(path) as file:
+            return isinstance(hdf5.resolve(file, _SLABS), h5py.Group)
+    except (DataError, OSError):
+        return False
+
+
+def _shared(slab: Slab) -> list[int]:
+    """Slices to which another slab adds, too."""
+    return [slab.slices.start + k for k, share in enumerate(slab.share) if 0 < share < 1]
+
+
+def _plain(value: Any) -> Any:
+    """What JSON has no type for: numbers and arrays of numpy, and text for all else."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

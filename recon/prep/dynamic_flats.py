@@ -1,0 +1,175 @@
+"""Dynamic flats: how the beam's shape changes from flat to flat, and how much of each change a view was taken with.
+
+After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975: principal components
+of the flats, as many as parallel analysis finds, and for each view the weights at which the corrected view has the
+least total variation. [our own: components of the logarithm, so that a flat is mean * exp(weights @ parts) and the
+weights of a view are a convex fit of its line integrals]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_FEWEST = 4  # flats
+_MOST = 10  # parts
+_RANDOM = 10  # draws of parallel analysis
+_SAMPLED = 1 << 16  # pixels for the components, and for the weights of a view
+_APART = 4  # pixels between which differences are taken: a beam changes more slowly than noise does
+_ROUNDS = 20  # of reweighting
+_SMOOTHED = 5  # pixels a side, to tell air
+_LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1  # percentile of line integrals that is air's, its range, and its least share
+_FITS = 3.0  # times the noise: what is left of air that is none is more
+_DARKEST = 0.05  # of the median flat; darker pixels tell nothing
+
+
+@dataclass(frozen=True, eq=False)
+class DynamicFlats:
+    """What the flats of a scan have in common, and how they differ.
+
+    Attributes:
+        mean: float32 [row, col], of the flats without their dark.
+        parts: float32 [part, row, col], changes of the logarithm of the flat, RMS 1; 0 in dark pixels.
+    """
+
+    mean: F32
+    parts: F32
+
+    def rows(self, rows: slice) -> DynamicFlats:
+        """The same of some detector rows."""
+        return DynamicFlats(self.mean[rows], self.parts[:, rows])
+
+    def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
+        """The flat that this view [row, col], without its dark, was taken with; its level is that of the mean."""
+        w = self.weights_of(view, floor)
+        return np.asarray(self.mean * np.exp(np.tensordot(w, self.parts, axes=1)), np.float32)
+
+    def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
+        """Weights [part] at which the line integrals of this view vary least from pixel to pixel (sum of absolutes),
+        and then least squares of those pixels that so turn out to be air, where there are some.
+
+        Args:
+            view: float32 [row, col], counts without the dark.
+            floor: lowest transmission; darker pixels tell nothing.
+        """
+        light = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
+        known = light > floor
+        if not len(self.parts) or known.mean() < _ENOUGH:
+            return np.zeros(len(self.parts), np.float32)
+        integral = -np.log(np.where(known, light, 1.0))
+        share = np.sqrt(np.where(known, light, 0))  # the noise of a line integral goes with one over this
+        targets, columns = [], []
+        for axis in [axis for axis, size in enumerate(view.shape) if size > 1]:
+            apart = min(_APART, view.shape[axis] - 1)
+            first, second = _shifted(axis, apart)
+            step = max(1, 2 * view.size // _SAMPLED)
+            weight = np.minimum(share[first], share[second])
+            change = (self.parts[:, *second] - self.parts[:, *first]) * weight
+            columns.append(change.reshape(len(self.parts), -1)[:, ::step])
+            targets.append(((integral[first] - integral[second]) * weight).ravel()[::step])
+        w = _least_absolute(np.concatenate(columns, axis=1).T, np.concatenate(targets))
+        return self._by_air(w, integral, known).astype(np.float32)
+
+    def _by_air(self, w: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
+        """The weights by the pixels that have no sample before them; `w` where these are few, or do not fit."""
+        found: NDArray[Any] = w
+        for _ in range(2):
+            left = integral + np.tensordot(found, self.parts, axes=1)
+            smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
+            air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
+            if air.mean() < _ENOUGH:
+                return w
+            at = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
+            matrix = np.column_stack((self.parts.reshape(len(self.parts), -1)[:, at].T, np.ones(at.size)))
+            found = np.linalg.lstsq(matrix.astype(np.float64), -integral.ravel()[at].astype(np.float64), rcond=None)[0]
+            found, level = found[:-1], found[-1]
+        left = integral + np.tensordot(found, self.parts, axes=1) + np.float32(level)
+        smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
+        noise = float(np.median(np.abs(left - smooth)[air])) / _SMOOTHED
+        return found if float(np.median(np.abs(smooth[air]))) < _FITS * noise else w
+
+
+def find_dynamic_flats(
+    flats: Callable[[], Iterable[F32]], rng: np.random.Generator, masked: NDArray[np.bool_] | None = None
+) -> DynamicFlats:
+    """Mean and principal components of flats.
+
+    Args:
+        flats: gives them, float32 [row, col] without the dark, one after another, at each of three calls alike.
+        rng: for parallel analysis.
+        masked: bool [row, col], pixels that tell nothing; None: none.
+
+    Raises:
+        ValueError: for fewer than four flats, which show no components.
+    """
+    total, n = np.zeros((1, 1)), 0
+    for flat in flats():
+        total, n = total + flat, n + 1
+    if n < _FEWEST:
+        raise ValueError(f"dynamic flats need at least {_FEWEST} flats, got {n}")
+    mean = np.asarray(total / n, np.float32)
+    good = mean > _DARKEST * np.median(mean)
+    if masked is not None:
+        good &= ~masked
+    some = np.flatnonzero(good)[:: max(1, int(good.sum()) // _SAMPLED)]
+    samples = np.stack([_shape(flat, mean, good).ravel()[some] for flat in flats()]).astype(np.float64)
+    loadings = _components(samples - samples.mean(axis=0), rng)
+    parts = np.zeros((len(loadings), *mean.shape), np.float32)
+    for i, flat in enumerate(flats()):
+        shape = _shape(flat, mean, good)
+        for part, share in zip(parts, loadings[:, i], strict=True):
+            part += np.float32(share) * shape
+    for part in parts:
+        part /= np.sqrt(np.mean(part[good] ** 2))
+    return DynamicFlats(mean, parts)
+
+
+def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
+    """The logarithm of a flat over the mean, without its level; 0 where it tells nothing."""
+    ratio = np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0))
+    shape = np.log(ratio)
+    return np.asarray(np.where(good, shape - shape[good].mean(), 0), np.float32)
+
+
+def _components(samples: F64, rng: np.random.Generator) -> F64:
+    """Shares [component, flat] of the flats in each component that stands out of noise (Horn's parallel analysis)."""
+    values, vectors = np.linalg.eigh(samples @ samples.T)
+    deviation = samples.std(axis=0, ddof=1)
+    drawn = []
+    for _ in range(_RANDOM):
+        noise = rng.standard_normal(samples.shape) * deviation
+        noise -= noise.mean(axis=0)
+        drawn.append(np.linalg.eigvalsh(noise @ noise.T))
+    limit = np.mean(drawn, axis=0) + 2 * np.std(drawn, axis=0)
+    stands_out = (values > limit)[::-1]
+    found = int(np.argmin(np.append(stands_out, False)))
+    return vectors[:, ::-1].T[: min(found, _MOST)]
+
+
+def _least_absolute(matrix: F64 | F32, target: F64 | F32) -> F64:
+    """x with the least sum of |matrix @ x - target|, by iteratively reweighted least squares."""
+    matrix, target = matrix.astype(np.float64), target.astype(np.float64)
+    weight: NDArray[Any] = np.ones(len(target))
+    x = np.zeros(matrix.shape[1])
+    for _ in range(_ROUNDS):
+        weighted = matrix * weight[:, None]
+        x = np.linalg.lstsq(weighted.T @ matrix, weighted.T @ target, rcond=None)[0]
+        off = np.abs(target - matrix @ x)
+        weight = 1 / np.maximum(off, 1e-3 * max(float(np.median(off)), 1e-12))
+    return x
+
+
+def _shifted(axis: int, apart: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Where the first and the second pixel of each pair along an axis are."""
+    whole = (slice(None), slice(None))
+    first, second = list(whole), list(whole)
+    first[axis], second[axis] = slice(None, -apart), slice(apart, None)
+    return tuple(first), tuple(second)

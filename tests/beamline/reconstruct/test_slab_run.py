@@ -1,0 +1,167 @@
+"""Slabs that are stopped and resumed: the same volume to the bit, and nothing lost of what was finished."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from weakref import WeakSet
+
+import numpy as np
+import pytest
+
+from beamline.projections.selection import Selection
+from beamline.reconstruct import slabs as module
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.slab_run import _as_they_come
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.partial_volume import PartialVolume, open_partial
+from beamline.storage.writers.recon_file import read_reconstruction
+from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+FISTA = ("recon", "scan.h5", "-m", "fista-tv", "--iterations", "2", "--tv-weight", "0.002", "--no-report")
+FISTA += ("--memory", "4.1M")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> Path:
+    """A noisy scan of 96 rows, scan.h5, that takes several slabs."""
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(96, 32), axis_col=15.7)
+    counts = 100 + rng.poisson(scan.counts().astype(float) - 100)
+    write_exchange(Path("scan.h5"), scan, {"data": counts.astype(np.uint16)})
+    return tmp_path
+
+
+def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool = False) -> None:
+    """Ctrl-C when so many slabs were added; `half`: in the middle of adding the next one."""
+    add, added = PartialVolume.add, []
+
+    def adding(self: PartialVolume, n: int, data: np.ndarray | None) -> None:
+        if len(added) == slabs and not half:
+            raise KeyboardInterrupt
+        if len(added) == slabs:
+            assert data is not None
+            add(self, n, data)
+            self._maps["state"][n] = 1
+            raise KeyboardInterrupt
+        added.append(n)
+        add(self, n, data)
+
+    monkeypatch.setattr(PartialVolume, "add", adding)
+
+
+def test_resumed_is_uninterrupted_to_the_bit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped within the second slab, resumed, stopped after another one, resumed."""
+    assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
+    resume = ("-o", "parts.h5", "--resume", "parts.partial.h5")
+    for slabs, half, more in ((1, True, resume[:2]), (1, False, resume)):
+        with monkeypatch.context() as patch:
+            interrupt_after(patch, slabs, half=half)
+            stopped = beamline(*FISTA, *more)
+        assert stopped.exit_code == 4 and "--resume parts.partial.h5" in stopped.stderr, stopped.output
+        assert left(folder) == {"scan.h5", "whole.h5", "parts.partial.h5"}
+    said, found = beamline("info", "parts.partial.h5"), beamline("validate", "parts.partial.h5")
+    assert said.exit_code == 0 and "64 of 96 slices" in said.stdout
+    assert found.exit_code == 5 and "64 of 96 slices are there" in found.output
+
+    resumed = beamline(*FISTA, *resume)
+    assert resumed.exit_code == 0 and "64 of 96 slices are there." in resumed.stderr, resumed.output
+    whole, parts = (read_reconstruction(Path(name)) for name in ("whole.h5", "parts.h5"))
+    np.testing.assert_array_equal(parts.volume.data, whole.volume.data)
+    assert parts.metrics["residual"] == whole.metrics["residual"]
+    assert parts.parameters["resumed_from"] == "parts.partial.h5"
+    assert "--resume" not in str(parts.parameters["command"])  # the file is gone
+    assert left(folder) == {"scan.h5", "whole.h5", "parts.h5"}
+
+
+def test_other_data_or_options_are_refused_and_nothing_is_touched(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 1)
+        beamline(*FISTA, "-o", "out.h5")
+    before = Path("out.partial.h5").read_bytes()
+    for options, said in {
+        ("--seed", "3"): "seed (3, 0 in the file)",
+        ("--tv-weight", "0.01"): "tv_weight (0.01, 0.002 in the file)",
+        ("--air", "none"): "projections (other content)",
+        ("--rows", "0:80"): "detector_shape ([80, 32], [96, 32] in the file)",
+        ("--memory", "3.5M"): "Give --memory 5M if",
+    }.items():
+        refused = beamline(*FISTA, "-o", "out.h5", "--resume", "out.partial.h5", *options)
+        assert refused.exit_code == 5 and said in refused.stderr, refused.output
+    again = beamline(*FISTA, "-o", "out.h5")
+    assert again.exit_code == 5 and "Go on from it with --resume" in again.stderr
+    busy = open_partial(Path("out.partial.h5"))
+    assert "is open in another process" in beamline(*FISTA, "-o", "out.h5", "--resume", "out.partial.h5").stderr
+    del busy
+    assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}
+
+
+def test_a_partial_volume_in_the_way_of_a_run_without_slabs_stays(folder: Path) -> None:
+    Path("out.partial.h5").write_text("of somebody else")
+    result = beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "--memory", "1G", "-o", "out.h5")
+    assert result.exit_code == 0 and Path("out.partial.h5").read_text() == "of somebody else"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_a_killed_run_is_resumed_to_the_bit(folder: Path) -> None:
+    """By SIGKILL, which nothing in the program sees."""
+    sirt = ("recon", "scan.h5", "-m", "sirt", "--iterations", "60", "--no-report", "--memory", "1M")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "beamline.cli.main", *sirt, "-o", "parts.h5"], cwd=folder, stderr=subprocess.DEVNULL
+    )
+    partial, deadline = folder / "parts.partial.h5", time.monotonic() + 120
+    while process.poll() is None and not partial.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    assert beamline(*sirt, "-o", "parts.h5", "--resume", "parts.partial.h5").exit_code == 0
+    assert beamline(*sirt, "-o", "whole.h5").exit_code == 0
+    whole, parts = (read_reconstruction(Path(name)).volume.data for name in ("whole.h5", "parts.h5"))
+    np.testing.assert_array_equal(parts, whole)
+
+
+def test_no_more_slabs_wait_to_be_written_than_are_made_at_a_time() -> None:
+    """Each is let go of when it was taken; an error of one is raised in its place."""
+    alive: WeakSet[Made] = WeakSet()
+    most = 0
+
+    def make(n: int) -> Made:
+        nonlocal most
+        alive.add(made := Made(n))
+        most = max(most, len(alive))
+        return made
+
+    taken = []
+    for n, made in _as_they_come(make, range(20), 3):
+        assert made.n == n
+        taken.append(n)
+        time.sleep(0.002)  # the disk is slower than the workers
+    assert sorted(taken) == list(range(20)) and most <= 3 + 1  # and the one that was just taken
+    with pytest.raises(ZeroDivisionError):
+        list(_as_they_come(lambda n: 1 / n, [1, 0], 1))
+
+
+@dataclass(eq=False)
+class Made:
+    """A slab."""
+
+    n: int
+
+
+def test_processes_on_this_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "free_memory", lambda: 10**9)
+    options = ReconOptions(SourceOptions(Path("scan.h5")), OutputPaths(Path("out.h5"), None), Selection())
+    alone = module.memory_of(options)
+    assert alone == module.SHARE * 10**9
+    assert module.memory_of(replace(options, cluster="local:4")) == round(alone / 5)
+    assert module.memory_of(replace(options, cluster="tcp://host:8786")) == alone
+    assert module.memory_of(replace(options, cluster="local:4", memory=7)) == 7

@@ -1,0 +1,305 @@
+"""A run that ended early goes on: its missing views, and no others, join those that it has, whose files stay as they
+are."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import BeamlineError, ConfigError
+from beamline.core.stop import StopRequest
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.scan import control
+from beamline.scan.control import Verb, running, tell
+from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
+from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run_folder import parts_of
+from beamline.scan.states import State
+from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest
+from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.overlay import Overlay
+from beamline.storage.recover import QUIET
+from beamline.storage.rules.validate import validate
+from beamline.storage.writer_lock import WriterLock
+from beamline.storage.writers import layout
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.frame import FrameKind
+from recon.prep.correct import CorrectionSettings
+from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
+from tests.beamline.ran import Ran, small
+
+FIRST = 5  # 3 darks and 2 flats
+VIEWS = 12
+MODES = {
+    "fly": ("scan.mode=fly",),
+    "step": ("scan.mode=step",),
+    "interlaced": ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 2}"),
+    "backwards": ("scan.mode=fly", "scan.angles={scheme: fixed, views: 12, start_deg: 90, span_deg: -180}"),
+}
+
+
+def _stopped(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int, abort: bool) -> Path:
+    stop = StopRequest()
+    act = stop.abort if abort else stop.stop
+    ran = Ran(runs, FakeInstrument(on_frame=lambda n: act() if n == at else None), *overrides, stop=stop)
+    assert ran.folder is not None
+    return ran.folder
+
+
+def _killed(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int) -> Path:
+    """As kill -9 leaves it: with the frames so far, marked as being written, a while ago."""
+
+    def die(writer: NXtomoWriter, *_: object) -> None:
+        shutil.copy(writer.path, writer.path.with_name("died.h5"))
+        close(writer)
+
+    close = NXtomoWriter.close
+    with monkeypatch.context() as patch:
+        patch.setattr(NXtomoWriter, "close", die)
+        folder = _stopped(runs, monkeypatch, *overrides, at=at, abort=True)
+    (folder / "died.h5").replace(folder / "scan.h5")
+    when = (folder / "scan.h5").stat().st_mtime - 2 * QUIET
+    os.utime(folder / "scan.h5", (when, when))
+    return folder
+
+
+def _lossy(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int) -> Path:
+    """To its end, with three views lost, two of them side by side, one the last."""
+    ran = Ran(runs, FakeInstrument(Faults(lost={FIRST + 2}, ignored={FIRST + 3, FIRST + VIEWS - 1})), *overrides)
+    assert ran.folder is not None
+    return ran.folder
+
+
+ENDS: dict[str, Callable[..., Path]] = {
+    "killed": _killed,
+    "stopped": lambda *given, at: _stopped(*given, at=at, abort=False),
+    "aborted": lambda *given, at: _stopped(*given, at=at, abort=True),
+    "lossy": _lossy,
+}
+
+
+def _go_on(run: Path, instrument: FakeInstrument | None = None, **more: object) -> RunResult:
+    instrument = instrument or FakeInstrument()
+    instrument.clock.sleep(1000.0 * len(parts_of(run)))  # the clock of each begins at the same time
+    with open_for_resume(run) as series:
+        return run_scan(series.config, series, instrument=instrument.connected(), **more)  # type: ignore[arg-type]
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _assert_whole(path: Path, references: int) -> None:
+    """Every view once, at its angle and with the pixels of its angle, and so many darks and flats."""
+    with open_scan(path) as source:
+        frames = list(source.frames())
+    views = [frame for frame in frames if frame.kind is FrameKind.PROJECTION]
+    assert sorted(frame.trigger for frame in views) == list(range(VIEWS))
+    assert sum(frame.kind in (FrameKind.DARK, FrameKind.FLAT) for frame in frames) == references
+    for frame in frames:
+        count, is_open, is_in, _ = decode(frame.counts)
+        assert is_open is (frame.kind is not FrameKind.DARK)
+        assert is_in is (frame.kind is not FrameKind.FLAT)
+        assert frame.angle == pytest.approx(count * COUNT, abs=COUNT)
+
+
+@pytest.mark.parametrize(
+    ("end", "mode"),
+    [("killed", "fly"), ("killed", "step"), ("stopped", "interlaced"), ("aborted", "backwards"), ("lossy", "fly")],
+)
+def test_only_the_missing_views_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, mode: str) -> None:
+    run = ENDS[end](tmp_path, monkeypatch, *MODES[mode], at=FIRST + 4)
+    with open_for_resume(run) as series:
+        assert 0 < len(series.views) < VIEWS
+        missing = VIEWS - len(series.views)
+    if end == "killed":
+        recover_run(run)
+    before = _digest(run / "scan.h5")
+    result = _go_on(run)
+    assert result.path == run / "joined.h5"
+    assert (result.missing, _digest(run / "scan.h5")) == ((), before)
+    with h5py.File(run / "part-2/scan.h5") as part, h5py.File(run / "scan.h5") as first:
+        assert (part[layout.KIND][()] == FrameKind.PROJECTION).sum() == missing
+        references = (first[layout.KIND][()] != FrameKind.PROJECTION).sum() + 7
+    _assert_whole(run / "joined.h5", references)
+    assert [finding.severity for finding in validate(run / "joined.h5", lambda done, of: None)] in ([], ["warning"])
+    said = describe(run / "joined.h5")
+    assert said["kinds"]["projection"] == VIEWS
+    assert said["attributes"]["status"] == "complete"
+    assert (said["missing_triggers"], said["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
+    with h5py.File(run / "joined.h5") as file:  # as another program reads it
+        assert len(file["exchange/data"]) == VIEWS
+        np.testing.assert_array_equal(file["exchange/data"][-1], file["entry/data/data"][-3])
+    with pytest.raises(ConfigError, match="nothing is missing"):
+        _go_on(run)
+
+
+def test_a_killed_run_is_recovered_by_the_way_and_can_be_resumed_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = _killed(tmp_path, monkeypatch, at=FIRST + 3)
+    stop = StopRequest()
+    with pytest.raises(BeamlineError, match="Stopped after 8 of 12 projections"):
+        _go_on(run, FakeInstrument(on_frame=lambda n: stop.stop() if n == FIRST + 3 else None), stop=stop)
+    with open_for_resume(run) as series:
+        assert (len(series.parts), series.views) == (2, frozenset(range(8)))
+    assert _go_on(run).path == run / "joined.h5"
+    _assert_whole(run / "joined.h5", 5 + 5 + 7)
+    (run / "joined.h5").unlink()
+    assert [done.path.parent.name for done in recover_run(run)[0]] == [run.name, "part-2", "part-3", run.name]
+    _assert_whole(run / "joined.h5", 5 + 5 + 7)
+
+
+def test_a_view_that_became_invalid_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 8, abort=True)
+    with h5py.File(run / "scan.h5", "r+", libver=layout.LIBVER) as file:
+        file[layout.KIND][FIRST + 2] = file[layout.IMAGE_KEY][FIRST + 2] = FrameKind.INVALID
+    with open_for_resume(run) as series:
+        assert 2 not in series.views
+    _go_on(run)
+    with open_scan(run / "joined.h5") as source:
+        assert sorted(f.trigger for f in source.frames() if f.kind is FrameKind.PROJECTION) == list(range(VIEWS))
+
+
+def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    _go_on(run)
+    ingest(run / "joined.h5", tmp_path / "ingested.h5")
+    images = np.zeros((2, 8, 12), np.uint16)
+    for path in (run / "joined.h5", tmp_path / "ingested.h5"):
+        with open_scan(path) as source, h5py.File(run / "scan.h5") as part:
+            frames = int(part[layout.COMMITTED][()])
+            assert source.part_starts.tolist() == [0, frames]
+            assert Overlay(source, darks=images).part_starts.tolist() == [0, frames + 2]
+            assert Overlay(source, flats=images).part_starts.tolist() == [0]
+    with open_scan(run / "joined.h5") as source:
+        selection = Selection(axis_col=5.5, correction=CorrectionSettings(air="none"), use_flags=False)
+        prepared = prepare_projections(source, selection, lambda said: None)
+    assert len(prepared.projections.data) == VIEWS
+
+
+def test_verbs_reach_the_newest_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    monkeypatch.setattr(control, "_EFFECT", 0.2)
+    told: list[tuple[list[Path], str]] = []
+
+    def stop(number: int) -> None:
+        if number == FIRST:
+            told.append((running(tmp_path), tell(run, Verb.ABORT)))
+
+    with pytest.raises(BeamlineError, match="Aborted"):
+        _go_on(run, FakeInstrument(on_frame=stop))
+    assert told == [([run], State.ACQUIRING)]
+
+
+def _unreadable(run: Path) -> None:
+    (run / "config.resolved.yaml").unlink()
+
+
+def _other_exposure(run: Path) -> None:
+    said = (run / "config.resolved.yaml").read_text()
+    (run / "config.resolved.yaml").write_text(said.replace("exposure_s: 0.02", "exposure_s: 0.03"))
+
+
+def _other_camera(run: Path) -> None:
+    with h5py.File(run / "scan.h5", "r+", libver=layout.LIBVER) as file:
+        del file["/entry/instrument/devices/camera/model"]
+        file["/entry/instrument/devices/camera/model"] = "another one"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_unreadable, "no folder of a run"),
+        (_other_exposure, "another configuration: `exposure_s: 0.02`, not `exposure_s: 0.03`"),
+        (_other_camera, "another camera: model another one; now there is model fake camera"),
+    ],
+)
+def test_what_cannot_go_on_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[Path], None], said: str
+) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    change(run)
+    before = {path: _digest(path) for path in run.rglob("*") if path.is_file()}
+    with pytest.raises(BeamlineError, match=said) as refused:
+        _go_on(run)
+    assert "\n" not in str(refused.value)
+    assert "Nothing was changed" in str(refused.value)
+    assert {path: _digest(path) for path in run.rglob("*") if path.is_file()} == before
+
+
+def test_a_run_that_another_process_holds_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    lock = WriterLock(run / "scan.h5")
+    with pytest.raises(ConfigError, match="open in another process"):
+        _go_on(run)
+    lock.release()
+    with open_for_resume(run), pytest.raises(ConfigError, match="another process goes on"):
+        _go_on(run)
+    with (
+        pytest.raises(ConfigError, match="configuration: `views: 12`"),
+        open_for_resume(run, small("scan.angles.views=24")),
+    ):
+        pass
+    assert not (run / "part-2").exists()
+
+
+def test_a_new_part_that_took_nothing_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    stop = StopRequest()
+
+    def began(series: ResumableRun) -> None:
+        run_scan(
+            series.config, series, [lambda event: stop.abort() if event.event == "run_started" else None], stop,
+            instrument=FakeInstrument().connected(),
+        )  # fmt: skip
+
+    with open_for_resume(run) as series, pytest.raises(BeamlineError):
+        began(series)
+    (run / "part-2" / "scan.h5").write_bytes(b"")  # as if it was killed while the file was made
+    with (run / "part-2" / "events.jsonl").open("ab") as events:
+        events.write(b"\xff")  # and a block of the disk was lost
+    _, left_out = recover_run(run)
+    assert len(left_out) == 1 and "part-2" in left_out[0]
+    with open_for_resume(run) as series:
+        assert list(series.left_out) == left_out
+    _go_on(run)
+    with open_scan(run / "joined.h5") as source:
+        assert (source.image_key == FrameKind.PROJECTION).sum() == VIEWS
+
+
+def test_a_run_that_ended_in_its_darks_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _killed(tmp_path, monkeypatch, at=1)
+    _go_on(run)
+    _assert_whole(run / "joined.h5", 2 + 7)
+    assert [finding for finding in validate(run / "joined.h5") if finding.severity == "error"] == []
+
+
+def test_a_part_counts_by_its_file_where_its_events_were_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    stop = StopRequest()
+    with pytest.raises(BeamlineError):
+        _go_on(run, FakeInstrument(on_frame=lambda n: stop.abort() if n == FIRST + 3 else None), stop=stop)
+    with open_for_resume(run) as series:
+        views = series.views
+    (run / "part-2" / "events.jsonl").write_bytes(b"")
+    with open_for_resume(run) as series:
+        assert (len(series.parts), series.views, series.left_out) == (2, views, ())
+    assert [done.path.parent.name for done in recover_run(run)[0]] == [run.name, "part-2", run.name]
+
+
+def test_a_file_without_its_plan_is_not_taken_for_a_whole_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + 4, abort=True)
+    with h5py.File(run / "scan.h5", "r+", libver=layout.LIBVER) as file:
+        file["/entry/record/plan"][()] = "{}"
+    with pytest.raises(BeamlineError, match="does not hold its plan"):
+        _go_on(run)
