@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -221,40 +221,54 @@ def test_a_scan_waits_for_space_on_its_disk(tmp_path: Path, monkeypatch: pytest.
     ran.assert_good_file(3 + 2 + 12 + 2, "complete")
 
 
-@pytest.mark.parametrize("mode", ["fly", "step"])
-def test_a_slow_disk_loses_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str) -> None:
-    """A fly scan pauses before frames find no room, a step scan just waits."""
-    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (8, 8))
-    append, waiting = NXtomoWriter.append, []
-    put = recorder_module.Recorder.put
+class SlowDisk:
+    """A writer that waits at the first frame of some kinds until `behind` is true for them; the queue holds `room`."""
 
-    def slowly(writer: NXtomoWriter, *row: Any) -> None:
-        time.sleep(0.02)
-        append(writer, *row)
+    def __init__(self, patch: pytest.MonkeyPatch, room: int, behind: Mapping[FrameKind, Callable[[], bool]]) -> None:
+        self.waiting, self.most_waiting, self.paused = 0, 0, False
+        behind = dict(behind)
+        append, put = NXtomoWriter.append, recorder_module.Recorder.put
 
-    def noted(recorder: recorder_module.Recorder, frame: Frame) -> None:
-        put(recorder, frame)
-        waiting.append(recorder._waiting.qsize())
+        def late(writer: NXtomoWriter, frame: Frame, *row: Any) -> None:
+            is_behind = behind.pop(frame.kind, lambda: True)
+            end = time.monotonic() + 30.0
+            while not is_behind() and time.monotonic() < end:
+                time.sleep(0.001)
+            append(writer, frame, *row)
 
-    monkeypatch.setattr(NXtomoWriter, "append", slowly)
-    monkeypatch.setattr(recorder_module.Recorder, "put", noted)
-    ran = Ran(tmp_path, FakeInstrument(), f"scan.mode={mode}", "scan.angles.views=36")
+        def noted(recorder: recorder_module.Recorder, frame: Frame) -> None:
+            put(recorder, frame)
+            self.waiting = recorder._waiting.qsize()
+            self.most_waiting = max(self.most_waiting, self.waiting)
+
+        patch.setattr(recorder_module, "WAITING_FRAMES", (room, room))
+        patch.setattr(NXtomoWriter, "append", late)
+        patch.setattr(recorder_module.Recorder, "put", noted)
+
+    def heard(self, event: Event) -> None:
+        self.paused |= event.data.get("state") is State.PAUSED
+
+
+def test_a_fly_scan_pauses_before_frames_find_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = SlowDisk(monkeypatch, 8, {FrameKind.PROJECTION: lambda: disk.paused})
+    ran = Ran(tmp_path, FakeInstrument(), "scan.mode=fly", "scan.angles.views=36", heard=disk.heard)
     assert ran.error is None
-    assert (State.PAUSED in ran.states) is (mode == "fly")
-    assert max(waiting) < 8 if mode == "fly" else max(waiting) == 8
+    assert disk.paused and disk.most_waiting < 8
     ran.assert_good_file(3 + 2 + 36 + 2, "complete")
 
 
-def test_a_slow_disk_pauses_no_darks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (4, 4))
-    append = NXtomoWriter.append
+def test_a_step_scan_waits_for_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk = SlowDisk(monkeypatch, 8, {FrameKind.PROJECTION: lambda: disk.waiting == 8})
+    ran = Ran(tmp_path, FakeInstrument(), "scan.mode=step", "scan.angles.views=36", heard=disk.heard)
+    assert ran.error is None
+    assert disk.most_waiting == 8 and not disk.paused
+    ran.assert_good_file(3 + 2 + 36 + 2, "complete")
 
-    def slowly(writer: NXtomoWriter, *row: Any) -> None:
-        time.sleep(0.02)
-        append(writer, *row)
 
-    monkeypatch.setattr(NXtomoWriter, "append", slowly)
-    ran = Ran(tmp_path, FakeInstrument(), "scan.mode=fly", "scan.darks.count=12")
+def test_a_slow_disk_pauses_views_but_no_darks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    behind = {FrameKind.DARK: lambda: disk.waiting == 4, FrameKind.PROJECTION: lambda: disk.paused}
+    disk = SlowDisk(monkeypatch, 4, behind)
+    ran = Ran(tmp_path, FakeInstrument(), "scan.mode=fly", "scan.darks.count=12", heard=disk.heard)
     assert ran.error is None
     assert ran.states[:4] == [State.PREPARING, State.DARKS, State.FLATS, State.TAXI]
     assert State.PAUSED in ran.states
