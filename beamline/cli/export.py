@@ -10,7 +10,7 @@ import numpy as np
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import json_option
-from beamline.cli.recon import refuse_shared, whole_output
+from beamline.cli.recon import parsed, refuse_shared, volume_path
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.files import refuse_existing
@@ -21,16 +21,14 @@ from beamline.storage.writers.recon_file import ReconRecord
 from drivers.clock import SystemClock
 
 
-def window_of(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, float] | None:
-    """LOW:HIGH, two finite numbers."""
-    if value is None:
-        return None
+def window_of(text: str) -> tuple[float, float]:
+    """LOW:HIGH, two finite numbers. ValueError for anything else."""
     try:
-        low, high = map(float, value.split(":"))
+        low, high = map(float, text.split(":"))
     except ValueError:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise click.BadParameter(f"{value!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
+        raise ValueError(f"{text!r} is no window; expected LOW:HIGH, such as 0:0.5, with LOW below HIGH")
     return low, high
 
 
@@ -39,8 +37,8 @@ def window_of(ctx: click.Context, param: click.Parameter, value: str | None) -> 
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
-    callback=whole_output,
+    metavar="PATH",
+    callback=parsed(volume_path),
     required=True,
     help="Its suffix names the format: .tif, .npy, .nrrd, .h5, or none: a folder of TIFFs.",
 )
@@ -48,7 +46,7 @@ def window_of(ctx: click.Context, param: click.Parameter, value: str | None) -> 
 @click.option(
     "--window",
     metavar="LOW:HIGH",
-    callback=window_of,
+    callback=parsed(window_of),
     help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
 )
 @click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")

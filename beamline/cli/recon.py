@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -44,50 +44,47 @@ if TYPE_CHECKING:
     from beamline.reconstruct.region import Region
 
 
-def whole_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
-    """An output whose suffix names the format of a volume."""
-    if value is not None:
-        from beamline.storage.volumes.files import format_of  # here: help needs none of it
+def parsed(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, str | None], Any]:
+    """A callback that gives what `parse` makes of an option; its ValueError is bad usage."""
 
+    def callback(ctx: click.Context, param: click.Parameter, value: str | None) -> Any:
         try:
-            format_of(value)
+            return None if value is None else parse(value)
         except ValueError as error:
             raise click.BadParameter(str(error)) from error
-    return value
+
+    return callback
 
 
-def memory_size(ctx: click.Context, param: click.Parameter, value: str | None) -> int | None:
-    """Bytes of a size such as 8G, 500M or 1.5GB (decimal units)."""
-    if value is None:
-        return None
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", value.strip(), re.IGNORECASE)
+def volume_path(text: str) -> Path:
+    """A path whose suffix names the format of a volume. ValueError for another."""
+    from beamline.storage.volumes.files import format_of  # here: help needs none of it
+
+    format_of(Path(text))
+    return Path(text)
+
+
+def memory_size(text: str) -> int:
+    """Bytes of a size such as 8G, 500M or 1.5GB (decimal units). ValueError for anything else."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
     if match is None or not float(match[1]) > 0:
-        raise click.BadParameter(f"{value!r} is no size; expected a number and K, M, G or T, such as 8G")
+        raise ValueError(f"{text!r} is no size; expected a number and K, M, G or T, such as 8G")
     return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
 
 
-def cluster_of(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
-    """Workers, `local:N` or an address."""
-    if value is not None:
-        from beamline.reconstruct.cluster import check_cluster  # here: help needs none of it
+def cluster_of(text: str) -> str:
+    """Workers, `local:N` or an address. ValueError for anything else."""
+    from beamline.reconstruct.cluster import check_cluster  # here: help needs none of it
 
-        try:
-            check_cluster(value)
-        except ValueError as error:
-            raise click.BadParameter(str(error)) from error
-    return value
+    check_cluster(text)
+    return text
 
 
-def region_of(ctx: click.Context, param: click.Parameter, value: str | None) -> Region | None:
-    """A box of voxels, `z0:z1,y0:y1,x0:x1`."""
-    if value is None:
-        return None
+def region_of(text: str) -> Region:
+    """A box of voxels, `z0:z1,y0:y1,x0:x1`. ValueError for anything else."""
     from beamline.reconstruct.region import Region  # here: help needs none of it
 
-    try:
-        return Region.parse(value)
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from error
+    return Region.parse(text)
 
 
 @click.command(cls=Repeatable)
@@ -124,8 +121,8 @@ def region_of(ctx: click.Context, param: click.Parameter, value: str | None) -> 
 @click.option(
     "-o",
     "--output",
-    type=click.Path(path_type=Path),
-    callback=whole_output,
+    metavar="PATH",
+    callback=parsed(volume_path),
     help="Output: .h5 (with all settings), .tif, .npy, .nrrd, or no suffix: a folder of TIFFs. Default: FILE's stem + "
     "_METHOD.h5, in this folder.",
 )
@@ -149,21 +146,21 @@ def region_of(ctx: click.Context, param: click.Parameter, value: str | None) -> 
 @click.option(
     "--memory",
     metavar="SIZE",
-    callback=memory_size,
+    callback=parsed(memory_size),
     help="Memory to use, such as 8G or 500M: a larger scan of a parallel beam lies on the disk of the output "
     "meanwhile, and is reconstructed slab by slab. Default: 70 % of what is free, within a container's limit.",
 )
 @click.option(
     "--cluster",
     metavar="local:N|tcp://HOST:PORT",
-    callback=cluster_of,
+    callback=parsed(cluster_of),
     help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, or "
     "those of a scheduler.",
 )
 @click.option(
     "--roi",
     metavar="Z0:Z1,Y0:Y1,X0:X1",
-    callback=region_of,
+    callback=parsed(region_of),
     help="Box of voxels to write, of the volume that the same options give without this one. It is made of the rows "
     "that show it; fbp makes these voxels alone.",
 )

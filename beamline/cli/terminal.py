@@ -80,9 +80,9 @@ class Terminal:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
-            self._show("frames", event.data["n"], event.data["of"], copied(event.data))
+            self._show("frames", event.data["n"], event.data["of"], rate_text(event.data))
         elif event.event == "progress" and event.data.get("stage") == "axes":
-            self._show("axes", event.data["n"], event.data["of"], copied(event.data, "axes"))
+            self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
         elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study", "batch"):
             what = "scans" if event.data["stage"] == "batch" else "trials"
             self._show(what, event.data["n"], event.data["of"], trials(event.data, what))
@@ -147,7 +147,7 @@ def rates(data: Mapping[str, Any]) -> str:
     return f"{data['n']}/{data['of']}  {speed}  {_clock_time(data['eta_s'])} left"
 
 
-def copied(data: Mapping[str, Any], what: str = "frames") -> str:
+def rate_text(data: Mapping[str, Any], what: str = "frames") -> str:
     """n/N, frames/s and the time left, of a `progress` event of a copy, an energy scan or trials of axes."""
     return f"{data['n']}/{data['of']}  {data['per_s']:.1f} {what}/s  {_clock_time(data['eta_s'])} left"
 

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from enum import Enum
 
 from beamline.core.errors import INTERRUPTED, ScanStopped
 
@@ -47,12 +48,20 @@ class ScanAborted(ScanStopped):
     exit_code = INTERRUPTED
 
 
+class Cause(Enum):
+    """What holds a scan back until it is over."""
+
+    BEAM = "beam"
+    SPACE = "space on the disk"
+    BACKLOG = "frames that wait for the disk"
+
+
 class PauseRequest:
     """A request to pause a scan, from any thread: until somebody resumes it, or until what holds it back is over."""
 
     def __init__(self) -> None:
         self._by_operator = ""
-        self._held_by: dict[str, str] = {}
+        self._held_by: dict[Cause, str] = {}
         self._unlit_since, self._lock = math.inf, threading.Lock()
 
     @property
@@ -63,7 +72,7 @@ class PauseRequest:
     @property
     def ends_by_itself(self) -> bool:
         """The causes are the disk alone: nobody is needed to end the pause."""
-        return not self._by_operator and self._held_by.keys() <= {"space", "backlog"}
+        return not self._by_operator and self._held_by.keys() <= {Cause.SPACE, Cause.BACKLOG}
 
     def pause(self, reason: str = "the operator asked for it") -> None:
         self._by_operator = (
@@ -78,16 +87,16 @@ class PauseRequest:
         """There is none, and may have been none since that time (s since the Unix epoch)."""
         with self._lock:
             self._unlit_since = min(self._unlit_since, since)
-        self.hold("beam", reason)
+        self.hold(Cause.BEAM, reason)
 
     def beam_back(self) -> None:
-        self.release("beam")
+        self.release(Cause.BEAM)
 
-    def hold(self, by: str, reason: str) -> None:
+    def hold(self, by: Cause, reason: str) -> None:
         """Pause until the same cause is released."""
         self._held_by[by] = reason
 
-    def release(self, by: str) -> None:
+    def release(self, by: Cause) -> None:
         self._held_by.pop(by, None)
 
     def take_unlit_since(self) -> float:

@@ -181,10 +181,10 @@ class ScanCorrection:
                 f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
             )
         if self._references is not None and self._references.dynamic is not None:
-            parts = len(self._references.dynamic.parts)
+            n = len(self._references.dynamic.components)
             said.append(
-                f"Flats: {count(parts, 'component')} of their changes, weighed for each view (dynamic)."
-                if parts
+                f"Flats: {count(n, 'component')} of their changes, weighed for each view (dynamic)."
+                if n
                 else "Flats: they do not differ by more than noise; their mean is used."
             )
         return " ".join(said)

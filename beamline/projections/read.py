@@ -116,8 +116,7 @@ def light_scale(source: ScanSource, use_current: bool = False) -> NDArray[np.flo
     Of projections that differ the median counts. With `use_current` also from its own ring current.
     """
     scale = _to_median(source.exposures, source.image_key)
-    currents = source.currents if use_current else None
-    return scale if currents is None else scale * _to_median(currents, source.image_key)
+    return scale * current_scale(source) if use_current else scale
 
 
 def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDArray[np.float64]:

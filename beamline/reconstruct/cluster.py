@@ -29,7 +29,7 @@ _CONNECT_TIMEOUT = 30  # for a scheduler to answer
 _TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
 
 
-class WorkersLost(BeamlineError):  # noqa: N818 - what happened
+class WorkersLostError(BeamlineError):
     """Workers did not come back with a slab."""
 
     exit_code = 5
@@ -61,7 +61,7 @@ class Cluster:
         """As `recon.reconstruct`, by a worker with as many threads as there are here; without progress and stop.
 
         Raises:
-            WorkersLost: one after the other, with this work, or the scheduler.
+            WorkersLostError: one after the other, with this work, or the scheduler.
         """
         import numba
         from distributed import KilledWorker
@@ -71,7 +71,7 @@ class Cluster:
         try:
             found: Reconstruction = future.result()
         except (KilledWorker, CancelledError) as error:
-            raise WorkersLost(
+            raise WorkersLostError(
                 f"The scheduler, or several workers with the same slab, were lost ({error}). They may lack memory: "
                 "give a smaller --memory, or fewer workers. Slabs that are finished stay: see --resume."
             ) from error

@@ -22,7 +22,7 @@ from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
-from beamline.reconstruct.region import Placed, placed
+from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
@@ -88,7 +88,7 @@ def reconstruct_file(
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
-    region = None if options.region is None else placed(options.region, selection, prepared.geometry)
+    region = None if options.region is None else locate(options.region, selection, prepared.geometry)
     with keeping(options.partial_path) if slabs else nullcontext():
         # A direct method and a slab have no volume so far: a signal interrupts them.
         with (never_stopped if options.method.traits.direct or slabs else stop_scope)() as stopped:
@@ -167,13 +167,13 @@ class _Job:
     clock: Clock
     stop_latch: StopLatch
     warn: Warnings
-    region: Placed | None = None
+    region: RegionOfRows | None = None
 
     @property
     def grid(self) -> Grid:
         """Of the volume; a direct method takes the voxels of a region alone."""
         grid = Grid.matching(self.prepared.geometry)
-        return self.region.of_rows(grid) if self.region is not None and self.options.method.traits.direct else grid
+        return self.region.grid_of(grid) if self.region is not None and self.options.method.traits.direct else grid
 
     def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
         return progress_events(self.sink, self.clock, seconds)

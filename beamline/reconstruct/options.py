@@ -8,7 +8,7 @@ from pathlib import Path
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
-from beamline.reconstruct.region import Region, around
+from beamline.reconstruct.region import Region, selection_around
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
@@ -74,11 +74,11 @@ class ReconOptions:
         """The same with the rows that show the region; the same options where all of the volume is wanted.
 
         Raises:
-            ConfigError: see `region.around`.
+            ConfigError: see `region.selection_around`.
         """
         if self.region is None:
             return self
-        return replace(self, selection=around(source, self.selection, self.region, self.method.traits.halo))
+        return replace(self, selection=selection_around(source, self.selection, self.region, self.method.traits.halo))
 
     @property
     def partial_path(self) -> Path:

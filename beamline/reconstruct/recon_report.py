@@ -15,7 +15,7 @@ from beamline.core.text import spans
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.region import Placed
+from beamline.reconstruct.region import RegionOfRows
 from beamline.report import figures
 from beamline.report.contact_sheet import FlaggedFrame, contact_sheet, reference_sheet
 from beamline.report.html import Picture, Report
@@ -131,7 +131,7 @@ class ReportContext:
     started: float = 0.0
     scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
-    region: Placed | None = None
+    region: RegionOfRows | None = None
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
@@ -231,14 +231,14 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
-        pictures=[*_pictures(made, prepared, truth, volumes, left), *_frames(context.facts)],
+        pictures=[*_pictures(made, prepared, truth, volumes, left), *_frame_pictures(context.facts)],
         command=context.command,
         recipe=context.recipe,
         footnotes=footnotes,
     )
 
 
-def _frames(facts: ScanFacts) -> list[Picture]:
+def _frame_pictures(facts: ScanFacts) -> list[Picture]:
     """Darks, flats and flagged frames, as far as there are any."""
     pictures = []
     if facts.references:

@@ -25,45 +25,46 @@ class Region:
     @classmethod
     def parse(cls, text: str) -> Region:
         """Of `z0:z1,y0:y1,x0:x1`. ValueError for anything else."""
-        spans = [tuple(map(int, span)) for span in re.findall(r"(?:^|,)(\d+):(\d+)(?=,|$)", text)]
+        spans = [(int(first), int(end)) for first, end in re.findall(r"(?:^|,)(\d+):(\d+)(?=,|$)", text)]
         if len(spans) != 3 or text.count(",") != 2 or any(first >= end for first, end in spans):
             raise ValueError(
                 f"{text!r} is not Z0:Z1,Y0:Y1,X0:X1 with whole numbers, first < end, e.g. 40:80,100:300,0:90"
             )
-        return cls(*spans)  # type: ignore[arg-type]
+        z, y, x = spans
+        return cls(z, y, x)
 
     def __str__(self) -> str:
         return ",".join(f"{first}:{end}" for first, end in (self.z, self.y, self.x))
 
 
 @dataclass(frozen=True)
-class Placed:
+class RegionOfRows:
     """A region in the volume of the rows that are read for it.
 
     Attributes:
         region: in the whole volume.
-        part: the same slices (z, y, x) of the volume of these rows.
-        lift: mm by which z = 0 of these rows lies above that of all rows.
+        slices: the same slices (z, y, x) of the volume of these rows.
+        z_offset: mm by which z = 0 of these rows lies above that of all rows.
     """
 
     region: Region
-    part: tuple[slice, slice, slice]
-    lift: float
+    slices: tuple[slice, slice, slice]
+    z_offset: float
 
-    def of_rows(self, grid: Grid) -> Grid:
+    def grid_of(self, grid: Grid) -> Grid:
         """The region's box in the frame of these rows, whose volume has this grid."""
-        return grid.part(*self.part)
+        return grid.part(*self.slices)
 
     def cut(self, volume: Volume) -> Volume:
         """The region alone, in the frame of all rows, of the volume of these rows or of its own box."""
         grid, data = volume.grid, volume.data
-        if grid.shape != tuple(part.stop - part.start for part in self.part):
-            grid, data = self.of_rows(grid), data[self.part]
+        if grid.shape != tuple(part.stop - part.start for part in self.slices):
+            grid, data = self.grid_of(grid), data[self.slices]
         z, y, x = grid.centre
-        return Volume(data, replace(grid, centre=(z + self.lift, y, x)))
+        return Volume(data, replace(grid, centre=(z + self.z_offset, y, x)))
 
 
-def around(source: ScanSource, selection: Selection, region: Region, halo: int) -> Selection:
+def selection_around(source: ScanSource, selection: Selection, region: Region, halo: int) -> Selection:
     """The rows of the selection that show the region, and so many slices beside it; the axis is that of all rows.
 
     Raises:
@@ -80,8 +81,8 @@ def around(source: ScanSource, selection: Selection, region: Region, halo: int) 
     return replace(selection, rows=near, axis_rows=(rows.start, rows.stop))
 
 
-def placed(region: Region, selection: Selection, geometry: Geometry) -> Placed:
-    """Where the region lies in the volume of `geometry`, which is of the selection that `around` gave.
+def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOfRows:
+    """Where the region lies in the volume of `geometry`, which is of the selection that `selection_around` gave.
 
     Raises:
         ConfigError: it lies outside.
@@ -99,4 +100,4 @@ def placed(region: Region, selection: Selection, geometry: Geometry) -> Placed:
         if end > width:
             raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in the volume's 0:{width}.")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)
-    return Placed(region, part, ((low + high) - slices) / 2 * geometry.sample_pitch)
+    return RegionOfRows(region, part, ((low + high) - slices) / 2 * geometry.sample_pitch)

@@ -100,7 +100,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
     heights = [max(ny / nx, _THIN), max(nz / nx, _THIN), max(nz / ny, _THIN)]
     column = min((WIDTH - 1.2) / len(volumes), 4.6, 12 / sum(heights))
     size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
-    figure = Figure(figsize=size, dpi=finest(nx, column - 0.35), layout="constrained")
+    figure = Figure(figsize=size, dpi=dpi_for(nx, column - 0.35), layout="constrained")
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
     z, y, x = (_edges(first.centre[i], first.shape[i], first.voxel_size) for i in range(3))
     planes = (("x", "y", x, y), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1]))
@@ -143,7 +143,7 @@ def differences(volumes: Mapping[str, Volume], unit: str) -> bytes:
     (_, cy, cx), (_, ny, nx), size = reference.grid.centre, reference.grid.shape, reference.grid.voxel_size
     column = min((WIDTH - 1.2) / len(images), 5.4)
     figure = Figure(
-        figsize=(1.2 + column * len(images), 0.9 + column * ny / nx), dpi=finest(nx, column), layout="constrained"
+        figsize=(1.2 + column * len(images), 0.9 + column * ny / nx), dpi=dpi_for(nx, column), layout="constrained"
     )
     for axes, image, (name, _) in zip(figure.subplots(1, len(images), squeeze=False)[0], images, others, strict=True):
         shown = axes.imshow(
@@ -238,7 +238,7 @@ def _edges(centre: float, n: int, size: float) -> tuple[float, float]:
     return centre - n / 2 * size, centre + n / 2 * size
 
 
-def finest(voxels: int, inches: float) -> float:
+def dpi_for(voxels: int, inches: float) -> float:
     """Pixels an inch that show every voxel of a row of them."""
     return float(np.clip(voxels / inches, DPI, _FINEST))
 

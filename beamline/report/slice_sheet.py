@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from beamline.report.figures import WIDTH, bright_centre, finest, grey_window, png
+from beamline.report.figures import WIDTH, bright_centre, dpi_for, grey_window, png
 
 F32 = NDArray[np.float32]
 _COLUMNS = 4
@@ -43,7 +43,7 @@ class Slices:
         # One image: a panel for each slice takes ten times as long to draw.
         sheet = np.full((down * (rows + head), _COLUMNS * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
-        figure = Figure(figsize=size, dpi=finest(sheet.shape[1], WIDTH))
+        figure = Figure(figsize=size, dpi=dpi_for(sheet.shape[1], WIDTH))
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
         for i, label in enumerate(labels):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from beamline.core.events import Emit
-from beamline.core.stop import PauseRequest, StopRequest
+from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.core.text import size
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.plan.retake import Retake
@@ -112,12 +112,12 @@ class SpaceGuard:
         again = min(2 * self._reserve, left) + CLOSING
         if left and free < min(self._reserve, left) + CLOSING:
             self._pause.hold(
-                "space",
+                Cause.SPACE,
                 f"{size(free)} are free on the scan's disk, and {size(left)} are still to come. Free some: at "
                 f"{size(again)} the scan goes on by itself",
             )
         elif not left or free >= again:
-            self._pause.release("space")
+            self._pause.release(Cause.SPACE)
 
 
 class BacklogGuard:
@@ -134,12 +134,12 @@ class BacklogGuard:
         """Take note of the frames that wait."""
         if 4 * waiting >= 3 * self._room:
             self._pause.hold(
-                "backlog",
+                Cause.BACKLOG,
                 f"the disk is behind, {waiting} of at most {self._room} frames wait in memory. The scan goes on by "
                 "itself when most of them are written; a longer period_s or a faster disk spares the pauses",
             )
         elif 4 * waiting <= self._room:
-            self._pause.release("backlog")
+            self._pause.release(Cause.BACKLOG)
 
 
 @dataclass(frozen=True)

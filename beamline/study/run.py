@@ -150,7 +150,8 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
             def say(event: str, data: Mapping[str, Any]) -> None:
                 sink(Event(event, clock.now(), data))
 
-            for table in _each(table, rig, judge, slices, say, now):  # noqa: B020 - each has one more row than the last
+            for grown in _each(table, rig, judge, slices, say, now):
+                table = grown
                 write_table(folder, table)
         except KeyboardInterrupt:
             if not table.done:

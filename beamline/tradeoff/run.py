@@ -113,7 +113,8 @@ def run_tradeoff(
             state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
             sink(Event("state", clock.now(), state))
             compile_kernels(trials, work)
-            for table in _each(table, work, slices, options, sink, clock, now):  # noqa: B020 - each has one more trial than the last
+            for grown in _each(table, work, slices, options, sink, clock, now):
+                table = grown
                 write_table(folder, table)
         except KeyboardInterrupt:
             if table.n_done == 0:

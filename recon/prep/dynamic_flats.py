@@ -2,7 +2,7 @@
 
 After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975: principal components
 of the flats, as many as parallel analysis finds, and for each view the weights at which the corrected view has the
-least total variation. [our own: components of the logarithm, so that a flat is mean * exp(weights @ parts) and the
+least total variation. [our own: components of the logarithm, so that a flat is mean * exp(weights @ components) and the
 weights of a view are a convex fit of its line integrals]
 """
 
@@ -20,14 +20,14 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _FEWEST = 4  # flats
-_MOST = 10  # parts
+_MOST = 10  # components
 _RANDOM = 10  # draws of parallel analysis
 _SAMPLED = 1 << 16  # pixels for the components, and for the weights of a view
 _APART = 4  # pixels between which differences are taken: a beam changes more slowly than noise does
 _ROUNDS = 20  # of reweighting
 _SMOOTHED = 5  # pixels a side, to tell air
 _LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1  # percentile of line integrals that is air's, its range, and its least share
-_FITS = 3.0  # times the noise: what is left of air that is none is more
+_MOST_LEFT = 3.0  # times the noise: what is left of air that is none is more
 _DARKEST = 0.05  # of the median flat; darker pixels tell nothing
 
 
@@ -37,20 +37,20 @@ class DynamicFlats:
 
     Attributes:
         mean: float32 [row, col], of the flats without their dark.
-        parts: float32 [part, row, col], changes of the logarithm of the flat, RMS 1; 0 in dark pixels.
+        components: float32 [component, row, col], changes of the logarithm of the flat, RMS 1; 0 in dark pixels.
     """
 
     mean: F32
-    parts: F32
+    components: F32
 
     def rows(self, rows: slice) -> DynamicFlats:
         """The same of some detector rows."""
-        return DynamicFlats(self.mean[rows], self.parts[:, rows])
+        return DynamicFlats(self.mean[rows], self.components[:, rows])
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
         """The flat that this view [row, col], without its dark, was taken with; its level is that of the mean."""
         w = self.weights_of(view, floor)
-        return np.asarray(self.mean * np.exp(np.tensordot(w, self.parts, axes=1)), np.float32)
+        return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
 
     def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
         """Weights [part] at which the line integrals of this view vary least from pixel to pixel (sum of absolutes),
@@ -62,8 +62,8 @@ class DynamicFlats:
         """
         light = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
         known = light > floor
-        if not len(self.parts) or known.mean() < _ENOUGH:
-            return np.zeros(len(self.parts), np.float32)
+        if not len(self.components) or known.mean() < _ENOUGH:
+            return np.zeros(len(self.components), np.float32)
         integral = -np.log(np.where(known, light, 1.0))
         share = np.sqrt(np.where(known, light, 0))  # the noise of a line integral goes with one over this
         targets, columns = [], []
@@ -72,8 +72,8 @@ class DynamicFlats:
             first, second = _shifted(axis, apart)
             step = max(1, 2 * view.size // _SAMPLED)
             weight = np.minimum(share[first], share[second])
-            change = (self.parts[:, *second] - self.parts[:, *first]) * weight
-            columns.append(change.reshape(len(self.parts), -1)[:, ::step])
+            change = (self.components[:, *second] - self.components[:, *first]) * weight
+            columns.append(change.reshape(len(self.components), -1)[:, ::step])
             targets.append(((integral[first] - integral[second]) * weight).ravel()[::step])
         w = _least_absolute(np.concatenate(columns, axis=1).T, np.concatenate(targets))
         return self._by_air(w, integral, known).astype(np.float32)
@@ -82,19 +82,19 @@ class DynamicFlats:
         """The weights by the pixels that have no sample before them; `w` where these are few, or do not fit."""
         found: NDArray[Any] = w
         for _ in range(2):
-            left = integral + np.tensordot(found, self.parts, axes=1)
+            left = integral + np.tensordot(found, self.components, axes=1)
             smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
                 return w
             at = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
-            matrix = np.column_stack((self.parts.reshape(len(self.parts), -1)[:, at].T, np.ones(at.size)))
+            matrix = np.column_stack((self.components.reshape(len(self.components), -1)[:, at].T, np.ones(at.size)))
             found = np.linalg.lstsq(matrix.astype(np.float64), -integral.ravel()[at].astype(np.float64), rcond=None)[0]
             found, level = found[:-1], found[-1]
-        left = integral + np.tensordot(found, self.parts, axes=1) + np.float32(level)
+        left = integral + np.tensordot(found, self.components, axes=1) + np.float32(level)
         smooth = ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")
         noise = float(np.median(np.abs(left - smooth)[air])) / _SMOOTHED
-        return found if float(np.median(np.abs(smooth[air]))) < _FITS * noise else w
+        return found if float(np.median(np.abs(smooth[air]))) < _MOST_LEFT * noise else w
 
 
 def find_dynamic_flats(
@@ -122,14 +122,14 @@ def find_dynamic_flats(
     some = np.flatnonzero(good)[:: max(1, int(good.sum()) // _SAMPLED)]
     samples = np.stack([_shape(flat, mean, good).ravel()[some] for flat in flats()]).astype(np.float64)
     loadings = _components(samples - samples.mean(axis=0), rng)
-    parts = np.zeros((len(loadings), *mean.shape), np.float32)
+    components = np.zeros((len(loadings), *mean.shape), np.float32)
     for i, flat in enumerate(flats()):
         shape = _shape(flat, mean, good)
-        for part, share in zip(parts, loadings[:, i], strict=True):
-            part += np.float32(share) * shape
-    for part in parts:
-        part /= np.sqrt(np.mean(part[good] ** 2))
-    return DynamicFlats(mean, parts)
+        for component, share in zip(components, loadings[:, i], strict=True):
+            component += np.float32(share) * shape
+    for component in components:
+        component /= np.sqrt(np.mean(component[good] ** 2))
+    return DynamicFlats(mean, components)
 
 
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:

@@ -321,8 +321,3 @@ def nanoseconds(
 def columns_of(views: int, cols: int) -> F32:
     """Zeros [view, 1 + col + 1, 16], with each edge twice, for filtered views, aligned to cache lines."""
     return _line_of_lanes.py_func(views * (cols + 2)).reshape(views, cols + 2, SLICES)
-
-
-def bytes_of_gridding(plan: Gridding, slices: int) -> int:
-    """Memory that `by_gridding` takes for so many slices beside its plan, columns and volume: spectra and plane."""
-    return 8 * SLICES * plan.phase.size + 8 * min(slices, SLICES) * plan.plane[0] * plan.plane[1]

@@ -14,7 +14,7 @@ import pytest
 
 import recon
 from beamline.core.errors import DataError
-from beamline.reconstruct.cluster import Cluster, WorkersLost, check_cluster, connected
+from beamline.reconstruct.cluster import Cluster, WorkersLostError, check_cluster, connected
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -98,9 +98,9 @@ def test_a_slab_that_nobody_returns_is_an_error_and_not_left_to_another_method()
     views = Geometry.parallel([0.0, 1.0], (1, 4))
     rest = {"grid": Grid.matching(views), "seed": 0, "device": "cpu", "use": DataUse(), "control": RunControl()}
     for error in (killed, CancelledError("gone")):
-        with pytest.raises(WorkersLost, match="were lost"):
+        with pytest.raises(WorkersLostError, match="were lost"):
             Cluster(1, Losing(error)).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
-    assert not issubclass(WorkersLost, DataError)
+    assert not issubclass(WorkersLostError, DataError)
 
 
 @pytest.mark.parametrize("spec", ["local", "local:0", "slurm", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])

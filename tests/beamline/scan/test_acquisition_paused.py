@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import ScanStopped
-from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
+from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.states import State, StateMachine
 from beamline.scan.supervision import BacklogGuard, Supervision
@@ -56,7 +56,7 @@ class Paused:
             self.at_rest.append(not self.instrument.is_open and not self.instrument.stage.moving())
             self.pause.resume()
             self.pause.beam_back()
-            self.pause.release("backlog")
+            self.pause.release(Cause.BACKLOG)
 
     def at_frame(self, number: int) -> Paused:
         self.instrument.on_frame = lambda seen: self.pause.pause() if seen == number else None
@@ -267,8 +267,12 @@ def test_a_pause_taken_back_at_once_is_no_silent_camera() -> None:
     assert cast(Moment, paused.pause).left > 0  # there were not so many looks
 
 
-@pytest.mark.parametrize(("cause", "asked_in_pause"), [("space", 0), ("backlog", 0), ("beam", 1), ("", 1)])
-def test_a_shutter_moved_by_hand_stays_as_it_is_in_a_pause_for_the_disk(cause: str, asked_in_pause: int) -> None:
+@pytest.mark.parametrize(
+    ("cause", "asked_in_pause"), [(Cause.SPACE, 0), (Cause.BACKLOG, 0), (Cause.BEAM, 1), (None, 1)]
+)
+def test_a_shutter_moved_by_hand_stays_as_it_is_in_a_pause_for_the_disk(
+    cause: Cause | None, asked_in_pause: int
+) -> None:
     paused, asked = Paused(), list[tuple[str, State]]()
 
     def put(request: str) -> None:
@@ -276,11 +280,11 @@ def test_a_shutter_moved_by_hand_stays_as_it_is_in_a_pause_for_the_disk(cause: s
         paused.instrument.is_open = request.startswith("Open")
         if paused.machine.state is State.PAUSED and paused.pause.reason:
             paused.pause.resume()
-            paused.pause.release(cause)
+            paused.pause.release(cause or Cause.SPACE)
 
     def wait() -> bool:
         if paused.machine.state is State.PAUSED and not asked_in_pause:
-            paused.pause.release(cause)
+            paused.pause.release(cause or Cause.SPACE)
         return False
 
     def at_frame(number: int) -> None:

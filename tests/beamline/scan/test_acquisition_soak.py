@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError, InstrumentError
-from beamline.core.stop import ScanAborted, ScanStopped, StopRequest
+from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.ledger import LedgerError
 from drivers.errors import DeviceError
@@ -50,8 +50,8 @@ def scheduled(seed: int) -> None:
     acts = [
         paused.pause.pause,
         lambda: paused.pause.no_beam("no beam", clock.now() - rng.uniform(0, 2)),
-        lambda: paused.pause.hold("backlog", "a slow disk"),
-        lambda: paused.pause.release("backlog"),
+        lambda: paused.pause.hold(Cause.BACKLOG, "a slow disk"),
+        lambda: paused.pause.release(Cause.BACKLOG),
     ]
     planned = [(float(rng.uniform(0, SECONDS)), acts[int(rng.integers(4))]) for _ in range(rng.integers(0, 5))]
     if rng.random() < 0.3:

@@ -15,7 +15,7 @@ import pytest
 
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
-from beamline.core.stop import PauseRequest, StopRequest
+from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import Instrument
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
@@ -189,13 +189,13 @@ def test_a_scan_pauses_before_its_disk_is_full_and_goes_on_when_there_is_space()
 
 def test_what_holds_a_scan_ends_by_itself_alone() -> None:
     pause = PauseRequest()
-    pause.hold("space", "full")
+    pause.hold(Cause.SPACE, "full")
     pause.no_beam("dark", 0.0)
     pause.pause()
     pause.resume()
     pause.beam_back()
     assert pause.reason == "full"
-    pause.release("space")
+    pause.release(Cause.SPACE)
     assert pause.reason == ""
 
 

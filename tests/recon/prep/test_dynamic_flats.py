@@ -48,7 +48,7 @@ def test_a_moving_beam_is_corrected_as_by_its_true_flat(rng: np.random.Generator
     """Three components: sine, cosine and slope. Errors of the mean flat are 4 to 12 times those of the true one."""
     flats = _flats(rng, 1.0)
     found, mean = _dynamic(flats), np.mean(flats, axis=0)
-    assert len(found.parts) == 3
+    assert len(found.components) == 3
     for angle in np.radians([0, 40, 80, 120]):
         truth, beam = _line_integrals(angle), _beam(*rng.normal(size=2))
         view = rng.poisson(beam * np.exp(-truth)).astype(np.float32)
@@ -78,7 +78,7 @@ def test_total_variation_alone_takes_out_stripes_where_there_is_no_air(rng: np.r
 def test_flats_that_differ_by_noise_have_no_components(rng: np.random.Generator) -> None:
     flats = _flats(rng, 0.0)
     found = _dynamic(flats)
-    assert len(found.parts) == 0
+    assert len(found.components) == 0
     np.testing.assert_allclose(found.flat_of(flats[0]), np.mean(flats, axis=0), rtol=1e-6)
     with pytest.raises(ValueError, match="at least 4 flats, got 3"):
         _dynamic(flats[:3])
@@ -89,7 +89,7 @@ def test_the_level_of_flats_is_no_component_and_dark_pixels_tell_nothing(rng: np
     for flat in flats:
         flat[:5] = rng.normal(0, 3, (5, COLS))  # no beam here
     found = _dynamic(flats)
-    assert len(found.parts) == 0 and np.isfinite(found.flat_of(flats[0])).all()
+    assert len(found.components) == 0 and np.isfinite(found.flat_of(flats[0])).all()
 
 
 def test_the_correction_takes_them(rng: np.random.Generator) -> None:
