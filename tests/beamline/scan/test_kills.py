@@ -28,9 +28,13 @@ WORDS = (f"scan.angles.views={VIEWS}", "scan.period_s=0.05")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a process that is forked is killed")
 
 
+@pytest.fixture(autouse=True)
+def _no_pause_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a virtual clock frames come faster than any disk takes them; a pause for it exposes frames not kept."""
+    monkeypatch.setattr(recorder, "BacklogGuard", lambda room, pause: lambda waiting: None)
+
+
 def _scan(runs: Path, step: bool) -> None:
-    # On a virtual clock frames come faster than any disk takes them; a pause for it exposes frames that are not kept.
-    recorder.BacklogGuard = lambda room, pause: lambda waiting: None
     instrument = FakeInstrument(on_frame=lambda number: time.sleep(SECONDS))
     run_scan(small(*WORDS, f"scan.mode={'step' if step else 'fly'}"), runs, instrument=instrument.connected())
 
