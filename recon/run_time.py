@@ -42,11 +42,13 @@ class Extent:
     Attributes:
         views, cols: of the scan.
         heights: slices of each slab, with its halo.
+        decided: another slab has already decided what follows from the data.
     """
 
     views: int
     cols: int
     heights: Sequence[int]
+    decided: bool = False
 
     @property
     def rows(self) -> int:
@@ -80,7 +82,8 @@ def _of_iterations(method: Method, iterations: int, extent: Extent, now: Clock) 
     at = (extent.views - _VIEWS[0]) / (_VIEWS[1] - _VIEWS[0])
     sweep, start = (max(a + at * (b - a), 0.0) for a, b in zip(few, many, strict=True))
     rays = extent.views * extent.cols**2 / (_TRIED[0] * _TRIED[1] ** 2)
-    once = rays * max(deciding - following, 0.0)  # trials on sixteen rows; how many depends on the data
+    # Trials on sixteen rows; how many depends on the data.
+    once = 0.0 if extent.decided else rays * max(deciding - following, 0.0)
     return (2 * extent.cols / _COLS) ** 2 * extent.rows / height * (start + iterations * sweep) + once
 
 

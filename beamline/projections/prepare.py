@@ -168,7 +168,11 @@ class Spill:
 
 
 def prepare_projections(
-    source: ScanSource, selection: Selection, warn: Warn, spill: Spill | None = None
+    source: ScanSource,
+    selection: Selection,
+    warn: Warn,
+    spill: Spill | None = None,
+    check: Callable[[Geometry], object] | None = None,
 ) -> PreparedProjections:
     """Read, correct and align what `selection` asks for.
 
@@ -178,6 +182,8 @@ def prepare_projections(
         warn: is told, in a sentence, of everything that is not as it should be though work goes on.
         spill: where line integrals lie. Rays that were not measured, or weigh nothing by the flags, are filled there as
             a direct method does it, and `shares` is None.
+        check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
+            corrected.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
@@ -204,6 +210,9 @@ def prepare_projections(
     scan_frames = jumps.frames
     period = geometry_of(source, selection, axis_col, source.angles[scan_frames]).period
     chosen = choose_views(source, scan_frames, selection, period)
+    if check is not None:
+        ids = scan_frames[chosen]
+        check(jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids))
     if spill is None:
         projections = correction.at_once(scan_frames[chosen])
     else:

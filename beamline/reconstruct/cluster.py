@@ -23,9 +23,11 @@ from recon.base.volume import Grid
 from recon.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
-_CONNECT_TIMEOUT = 30  # for a scheduler to answer
+_CONNECT_TIMEOUT = 30  # s for a scheduler to answer, and to get its first worker
+_PATIENCE = 60.0  # s that work goes without any worker
+_LOOK = 2.0  # s between two looks whether there is one
 _TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
 
 
@@ -41,10 +43,12 @@ class Cluster:
 
     Attributes:
         workers: how many.
+        patience: s after which work without any worker is given up.
     """
 
     workers: int
     _client: Client
+    patience: float = _PATIENCE
 
     def reconstruct(
         self,
@@ -61,7 +65,7 @@ class Cluster:
         """As `recon.reconstruct`, by a worker with as many threads as there are here; without progress and stop.
 
         Raises:
-            WorkersLostError: one after the other, with this work, or the scheduler.
+            WorkersLostError: one after the other, with this work, or all of them, or the scheduler.
         """
         import numba
         from distributed import KilledWorker
@@ -69,6 +73,7 @@ class Cluster:
         work = (np.array(projections), geometry, method, grid, seed, device, use, control.decide)
         future = self._client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
         try:
+            self._wait_for(future)
             found: Reconstruction = future.result()
         except (KilledWorker, CancelledError) as error:
             raise WorkersLostError(
@@ -76,6 +81,27 @@ class Cluster:
                 "give a smaller --memory, or fewer workers. Slabs that are finished stay: see --resume."
             ) from error
         return found
+
+    def _wait_for(self, future: Future) -> None:
+        """Return when it is done; raises WorkersLostError where no worker has been there for `patience`."""
+        look, alone = min(_LOOK, self.patience), 0.0
+        while not future.done():
+            try:
+                future.result(look)
+            except TimeoutError:
+                alone = 0.0 if _count(self._client) else alone + look
+                if alone >= self.patience:
+                    raise WorkersLostError(
+                        f"All workers have left, and none came for {self.patience:g} s. Start some again; slabs that "
+                        "are finished stay: see --resume."
+                    ) from None
+
+
+def _count(client: Client) -> int:
+    try:
+        return len(client.scheduler_info(n_workers=-1)["workers"])
+    except OSError:  # the scheduler does not answer
+        return 0
 
 
 def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
@@ -105,11 +131,11 @@ def local_workers(spec: str | None) -> int:
 
 
 @contextmanager
-def connected(spec: str) -> Iterator[Cluster]:
+def connected(spec: str, patience: float = _CONNECT_TIMEOUT) -> Iterator[Cluster]:
     """The cluster that `spec` names; workers on this machine end with the block.
 
     Raises:
-        ConfigError: the scheduler does not answer or has no workers.
+        ConfigError: the scheduler does not answer, or has no workers within 30 s.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -121,13 +147,21 @@ def connected(spec: str) -> Iterator[Cluster]:
             if n := local_workers(spec):
                 # Without a page on a port, and without a limit of its own: --memory is that of a slab.
                 address = LocalCluster(
-                    n, threads_per_worker=1, dashboard_address=None, memory_limit=0, silence_logs=logging.ERROR
+                    n_workers=n,
+                    threads_per_worker=1,
+                    dashboard_address=None,
+                    memory_limit=0,
+                    silence_logs=logging.ERROR,
                 )
                 closing.enter_context(address)
             client = closing.enter_context(Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False))
-            workers = len(client.scheduler_info(n_workers=-1)["workers"])
         except (OSError, RuntimeError, ValueError) as error:
             raise ConfigError(f"--cluster {spec}: no scheduler answers ({error}).") from error
-        if not workers:
-            raise ConfigError(f"--cluster {spec}: the scheduler has no workers. Start some: dask worker {spec}.")
-        yield Cluster(workers, client)
+        try:
+            client.wait_for_workers(1, patience)
+        except TimeoutError:
+            raise ConfigError(
+                f"--cluster {spec}: the scheduler has no workers, and none came in {patience:g} s. Start some: dask "
+                f"worker {spec}."
+            ) from None
+        yield Cluster(max(1, _count(client)), client)

@@ -9,7 +9,8 @@ from beamline.core.errors import DataError
 from beamline.core.text import count, size
 from beamline.projections.selection import cone_of
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.slabs import memory_of, needs_of, refuse_smallest, refuse_whole
+from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole
+from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.slabs import slabs_of
@@ -28,7 +29,8 @@ class Estimate:
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
         memory: bytes that will be used.
-        slabs: how many.
+        slabs: how many are still to be made.
+        done: slices that a partial volume has.
         scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
         output: bytes of the result.
         free: bytes on that disk.
@@ -42,6 +44,7 @@ class Estimate:
     allowed: int
     memory: int
     slabs: int
+    done: int
     scratch: int
     output: int
     free: int
@@ -49,6 +52,8 @@ class Estimate:
 
     def lines(self) -> list[str]:
         in_slabs = f"in {count(self.slabs, 'slab')}; all at once would take {size(self.at_once)}"
+        if self.done:
+            in_slabs = f"in {count(self.slabs, 'slab')} that are left; {self.done} of {self.shape[0]} slices are there"
         how = in_slabs if self.scratch else "all at once"
         return [
             f"{'volume':<10}{' x '.join(str(n) for n in self.shape)} voxels by {self.method}, from {self.views} views",
@@ -59,10 +64,11 @@ class Estimate:
 
 
 def estimate(options: ReconOptions, clock: Clock) -> Estimate:
-    """What a reconstruction of a finished scan of a parallel beam will take.
+    """What a reconstruction of a finished scan of a parallel beam will take; of a partial volume, what is left of it.
 
     Raises:
-        DataError: it does not fit into the memory or on the disk, with the option that would make it fit; for a cone.
+        DataError: it does not fit into the memory or on the disk, with the option that would make it fit; for a cone; a
+            partial volume is of another number of slices.
         ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
     """
     with options.source.open() as source:
@@ -71,16 +77,20 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
         options = options.around_region(source)
         allowed, needs = memory_of(options), needs_of(source, options)
         rows = needs.rows
-        slabs = slabs_of(rows, rows, 0)
-        fits = needs.at_once <= allowed
+        slabs = left = slabs_of(rows, rows, 0)
+        fits = needs.at_once <= allowed and options.partial is None
         if not fits:
             refuse_whole(source, options, needs, allowed)
             needs = replace(needs, weighted=False)  # as it is unless a part of the detector is dead, or a view flagged
             refuse_smallest(source, needs, allowed, options.selection.binning)
-            slabs = slabs_of(rows, needs.height(allowed), needs.method.traits.halo)
-    direct = needs.method.traits.direct
-    volumes = 1 if direct or options.target.report is None else 2
-    scratch = 0 if fits else needs.line_integrals + volumes * needs.volume
+            slabs = left = slabs_of(rows, needs.height(allowed), needs.method.traits.halo)
+        if options.partial is not None:
+            slabs, left = slabs_of_partial(options.partial)
+            if slabs[-1].own.stop != rows:
+                raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {rows}.")
+            refuse_slabs(options.partial, slabs, needs, allowed)
+    compared = not needs.method.traits.direct and options.target.report is not None
+    scratch = 0 if fits else needs.line_integrals + ((options.partial is None) + compared) * needs.volume
     free = shutil.disk_usage(options.target.output.parent).free
     if scratch + needs.volume > free:
         raise DataError(
@@ -88,10 +98,13 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             f"with -o to another disk, or give --bin {2 * options.selection.binning}."
         )
     shape = Grid.matching(needs.geometry).shape
-    heights = [slab.slices.stop - slab.slices.start for slab in slabs]
-    seconds = run_seconds(needs.method, Extent(needs.geometry.n_views, shape[2], heights), clock.now)
+    heights = [slab.slices.stop - slab.slices.start for slab in left]
+    extent = Extent(needs.geometry.n_views, shape[2], heights, decided=options.partial is not None)
+    seconds = run_seconds(needs.method, extent, clock.now) if left else 0.0
+    done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in left)
+    height = slabs[0].own.stop
     return Estimate(
         options.method.name, needs.geometry.n_views, shape, needs.at_once, allowed,
-        needs.at_once if fits else max(needs.slab(needs.height(allowed)), needs.least), len(slabs), scratch,
-        needs.volume, free, seconds,
+        needs.at_once if fits else max(needs.slab(height), needs.least), len(left), done, scratch, needs.volume, free,
+        seconds,
     )  # fmt: skip

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.selection import Selection, cone_of, rows_of
+from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -68,7 +70,8 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     """The rows of the selection that show the region, and so many slices beside it; the axis is that of all rows.
 
     Raises:
-        ConfigError: a cone, or a region that the rows do not show.
+        ConfigError: a cone, or a region beyond the rows, or beyond the widest volume; `locate` refuses what only the
+            rotation axis tells.
     """
     if cone_of(source, selection) is not None:
         raise ConfigError(f"--roi is for a parallel beam; {source.path} is a cone. Give --rows instead.")
@@ -76,6 +79,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     slices = (rows.stop - rows.start) // side
     if end > slices:
         raise ConfigError(f"--roi {region}: slices {first}:{end} do not lie in the volume's 0:{slices}.")
+    _refuse_beyond(region, _widest(source, selection), "the widest volume's")
     low, high = max(first - halo, 0), min(end + halo, slices)
     near = rows.start + low * side, rows.start + high * side
     return replace(selection, rows=near, axis_rows=(rows.start, rows.stop))
@@ -96,8 +100,25 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
         raise DataError(
             "The views are shifted along the axis, by jumps of the sample: --roi takes rows for slices. Give --rows."
         )
-    for name, (first, end), width in zip("yx", (region.y, region.x), grid.shape[1:], strict=True):
-        if end > width:
-            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in the volume's 0:{width}.")
+    _refuse_beyond(region, grid.shape[2], "the volume's")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)
     return RegionOfRows(region, part, ((low + high) - slices) / 2 * geometry.sample_pitch)
+
+
+def _refuse_beyond(region: Region, width: int, whose: str) -> None:
+    """Raises ConfigError for voxels beyond a volume so many voxels wide."""
+    for name, (first, end) in (("y", region.y), ("x", region.x)):
+        if end > width:
+            raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in {whose} 0:{width}.")
+
+
+def _widest(source: ScanSource, selection: Selection) -> int:
+    """Voxels across that the volume has at most, before anything is read.
+
+    An axis that is still to be found may stand at an edge of the detector, and so may that of a sample that jumped.
+    """
+    flags = source.flags
+    moved = selection.judge or (flags is not None and bool(flags.flagged.any()))
+    if selection.axis_col is None or moved:
+        return 2 * (source.shape[1] // selection.binning)
+    return Grid.matching(geometry_of(source, selection, selection.axis_col, np.zeros(1))).shape[2]

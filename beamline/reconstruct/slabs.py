@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -17,9 +19,10 @@ from beamline.projections.prepare import PreparedProjections, Spill, prepare_pro
 from beamline.projections.selection import choose_views, cone_of, rows_of
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.region import locate
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
-from beamline.storage.writers.partial_volume import open_partial
+from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.clock import Clock
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -217,6 +220,15 @@ def refuse_smallest(source: ScanSource, needs: Needs, memory: int, binning: int)
     )
 
 
+def refuse_slabs(path: Path, slabs: Sequence[Slab], needs: Needs, memory: int) -> None:
+    """Raises DataError where the slabs of a partial volume do not fit."""
+    if (wanted := needs.slab(slabs[0].own.stop)) > memory:
+        raise DataError(
+            f"The slabs of {path} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
+            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
+        )
+
+
 def prepare_within(
     source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn
 ) -> tuple[PreparedProjections, list[Slab]]:
@@ -234,7 +246,8 @@ def prepare_within(
 
     memory = memory_of(options)
     spill = spill_of(source, options, told, said)
-    prepared = prepare_projections(source, options.selection, warn, spill)
+    check = None if options.region is None else partial(locate, options.region, options.selection)
+    prepared = prepare_projections(source, options.selection, warn, spill, check)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if spill is None:
         if options.partial is not None:
@@ -248,12 +261,8 @@ def prepare_within(
     refuse_smallest(source, needs, memory, options.selection.binning)
     if options.partial is None:
         return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)
-    slabs = list(open_partial(options.partial).slabs)
-    if (wanted := needs.slab(slabs[0].own.stop)) > memory:
-        raise DataError(
-            f"The slabs of {options.partial} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
-            f"{math.ceil(wanted / 1e6)}M if there is as much. Nothing was touched."
-        )
+    slabs, _ = slabs_of_partial(options.partial)
+    refuse_slabs(options.partial, slabs, needs, memory)
     return prepared, slabs
 
 

@@ -7,6 +7,7 @@ import itertools
 import pytest
 
 import recon
+from recon import run_time
 from recon.auto import Auto
 from recon.run_time import Extent, run_seconds
 
@@ -24,3 +25,17 @@ def test_iterations_cost_by_their_number() -> None:
         run_seconds(recon.Sirt(iterations=n), Extent(108, 64, [16]), itertools.count().__next__) for n in (3, 300)
     )
     assert few == many == pytest.approx(1.0)
+
+
+def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where deciding takes 4 s of a small run, whatever its size."""
+
+    def took(*arguments: object, twice: bool = False) -> tuple[float, dict[str, list[float]]]:
+        return (5.0 if twice else 1.0), {}
+
+    monkeypatch.setattr(run_time, "_took", took)
+    rest, whole = (
+        run_seconds(recon.FistaTv(), Extent(72, 64, [16], decided=decided), itertools.count().__next__)
+        for decided in (True, False)
+    )
+    assert (rest, whole) == (1.0, 5.0)

@@ -134,17 +134,11 @@ def open_partial(path: Path) -> PartialVolume:
     Raises:
         DataError: it is no such file, is damaged, or another process adds to it.
     """
-    if not is_partial(path):
-        raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
-    if held(path):
-        raise DataError(
-            f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."
-        )
+    _refuse_unusable(path)
     lock = WriterLock(path)
     with hdf5.readable(path), h5py.File(path, "r") as file:
         group = file[_SLABS]
-        rows = group["table"][()].tolist()
-        slabs = [Slab(slice(a, b), slice(c, d), fade) for a, b, c, d, fade in rows]
+        slabs = _slabs_in(group)
         made_from = {name: value_of(node) for name, node in group["made_from"].items()}
         kept = json.loads(group["kept"][()])
         maps = {
@@ -154,6 +148,31 @@ def open_partial(path: Path) -> PartialVolume:
     found = PartialVolume(path, slabs, made_from, kept, maps, lock)
     found._take_out()
     return found
+
+
+def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
+    """All slabs, and those that are not finished, of a file that stays as it is.
+
+    Raises:
+        DataError: as `open_partial`.
+    """
+    _refuse_unusable(path)
+    with hdf5.readable(path), h5py.File(path, "r") as file:
+        slabs, state = _slabs_in(file[_SLABS]), file[_PLACES["state"]][()]
+    return slabs, [slab for slab, is_at in zip(slabs, state, strict=True) if is_at != _DONE]
+
+
+def _refuse_unusable(path: Path) -> None:
+    if not is_partial(path):
+        raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
+    if held(path):
+        raise DataError(
+            f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."
+        )
+
+
+def _slabs_in(group: h5py.Group) -> list[Slab]:
+    return [Slab(slice(a, b), slice(c, d), fade) for a, b, c, d, fade in group["table"][()].tolist()]
 
 
 def is_partial(path: Path) -> bool:

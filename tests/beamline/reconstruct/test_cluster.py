@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 import recon
-from beamline.core.errors import DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.reconstruct.cluster import Cluster, WorkersLostError, check_cluster, connected
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.decisions import Decisions
@@ -88,6 +89,9 @@ class Losing:
     def submit(self, *work: object, **options: object) -> Losing:
         return self
 
+    def done(self) -> bool:
+        return True
+
     def result(self) -> None:
         raise self.error
 
@@ -101,6 +105,31 @@ def test_a_slab_that_nobody_returns_is_an_error_and_not_left_to_another_method()
         with pytest.raises(WorkersLostError, match="were lost"):
             Cluster(1, Losing(error)).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
     assert not issubclass(WorkersLostError, DataError)
+
+
+def test_there_are_as_many_workers_as_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not as many as processors; in this process, which is quick."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(distributed, "LocalCluster", partial(distributed.LocalCluster, processes=False))
+    n = (os.cpu_count() or 1) + 1
+    with connected(f"local:{n}") as cluster:
+        assert cluster.workers == n
+
+
+def test_without_any_worker_it_ends_after_the_time_stated() -> None:
+    """A scheduler that answers and has none, at the start and during work."""
+    distributed = pytest.importorskip("distributed")
+    views = Geometry.parallel([0.0, 1.0], (1, 4))
+    rest = {"grid": Grid.matching(views), "seed": 0, "device": "cpu", "use": DataUse(), "control": RunControl()}
+    alone = distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=None, protocol="tcp")
+    with alone, distributed.Client(alone, set_as_default=False) as client:
+        with (
+            pytest.raises(ConfigError, match=r"none came in 0\.2 s\. Start some: dask worker tcp://"),
+            connected(alone.scheduler_address, patience=0.2),
+        ):
+            pytest.fail("there is nobody to do anything")
+        with pytest.raises(WorkersLostError, match=r"left, and none came for 0\.2 s"):
+            Cluster(1, client, patience=0.2).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("spec", ["local", "local:0", "slurm", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])

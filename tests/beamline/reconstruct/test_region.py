@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamline.projections import prepare
 from beamline.reconstruct.region import Region
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import beamline, left
@@ -79,6 +80,30 @@ def test_refused_with_nothing_written(folder: Path, options: tuple[str, ...], co
     result = beamline("recon", "scan.h5", *method, *options, "-o", "out.h5")
     assert result.exit_code == code and said in result.stderr, result.output
     assert left(folder) == {"scan.h5"}
+
+
+@pytest.mark.parametrize(
+    ("options", "step", "said"),
+    [
+        (("--roi", "38:60,10:40,4:49", "--axis", "23.2"), "ScanCorrection", "x 4:49 does not lie"),
+        (("--roi", "38:60,10:97,4:29"), "ScanCorrection", "y 10:97 does not lie in the widest volume's 0:96"),
+        (("--roi", "38:60,10:40,4:49"), "remove_rings", "x 4:49 does not lie in the volume's 0:48"),
+    ],
+    ids=["by the axis given", "by the detector", "by the axis found"],
+)
+def test_beyond_the_width_is_refused_before(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], step: str, said: str
+) -> None:
+    """Before anything is read; where only the axis that is found tells, before all views are corrected."""
+    monkeypatch.setattr(prepare, step, lambda *_: pytest.fail("too late"))
+    result = beamline("recon", "scan.h5", "-m", "fbp", *options, "-o", "out.h5")
+    assert result.exit_code == 2 and said in result.stderr, result.output
+    assert left(folder) == {"scan.h5"}
+
+
+def test_a_wide_field_has_regions_beyond_the_detector(folder: Path) -> None:
+    """Its volume is as wide as a full turn sees: 77 voxels of 48 columns."""
+    assert made("-m", "fbp", "--axis", "9", "--roi", "38:60,10:40,50:77", "-o", "out.h5").volume.data.shape[2] == 27
 
 
 def test_a_region_says_what_it_was_parsed_from() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from beamline.projections.selection import Selection
+from beamline.reconstruct import estimate
 from beamline.reconstruct import slabs as module
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
@@ -22,6 +24,7 @@ from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
 from beamline.storage.writers.recon_file import read_reconstruction
+from recon.run_time import Extent
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -102,6 +105,32 @@ def test_other_data_or_options_are_refused_and_nothing_is_touched(
     busy = open_partial(Path("out.partial.h5"))
     assert "is open in another process" in beamline(*FISTA, "-o", "out.h5", "--resume", "out.partial.h5").stderr
     del busy
+    assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}
+
+
+def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of three slabs: that much of the time, and no disk for the slabs that are there. The file stays as it is."""
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 1)
+        beamline(*FISTA, "-o", "out.h5")
+    before, seen = Path("out.partial.h5").read_bytes(), list[Extent]()
+
+    def seconds(method: object, extent: Extent, now: object) -> float:
+        seen.append(extent)
+        return float(extent.rows)
+
+    monkeypatch.setattr(estimate, "run_seconds", seconds)
+    all_of_it, rest = (
+        json.loads(beamline(*FISTA, "-o", "out.h5", *more, "--dry-run", "--json").stdout.splitlines()[-1])
+        for more in ((), ("--resume", "out.partial.h5"))
+    )
+    assert (all_of_it["slabs"], all_of_it["done"], rest["slabs"], rest["done"]) == (3, 0, 2, 32)
+    assert sorted([*seen[1].heights, 44]) == sorted(seen[0].heights) == [44, 44, 56]
+    assert seen[1].decided and not seen[0].decided
+    assert all_of_it["scratch"] - rest["scratch"] == rest["output"] and rest["memory"] == all_of_it["memory"]
+    assert "2 slabs that are left; 32 of 96" in beamline(*FISTA, "--resume", "out.partial.h5", "--dry-run").stdout
+    other = beamline(*FISTA, "--rows", "0:80", "--resume", "out.partial.h5", "--dry-run")
+    assert other.exit_code == 5 and "is of 96 slices, this volume has 80" in other.stderr
     assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}
 
 
