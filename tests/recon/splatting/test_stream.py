@@ -162,27 +162,29 @@ def test_a_large_volume_is_placed_from_a_coarser_one(data: np.ndarray, monkeypat
     assert left[1] < 1.2 * left[0] < 0.4, left
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
-def test_a_second_placement_gains_by_what_the_model_knows(
-    data: np.ndarray, phantom: Phantom, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    order, first = np.argsort(np.arange(40) * 0.618 % 1).argsort(), StreamingFit._place_first
-    truth, placements = phantom.attenuation(GRID), list[bool]()
+def test_a_second_placement_gains_by_what_the_model_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Particles after 22 views in golden order: 0.32 to 0.51 dB for seeds 0 to 4."""
+    from tests.bench.test_anytime_curve import ORDERS, particles  # here: it takes the clock of this module
 
-    def quality(seed: int, knows: bool) -> float:
+    data, geometry, truth = particles(ORDERS["golden"])
+    first, placements = StreamingFit._place_first, list[bool]()
+
+    def quality(knows: bool) -> float:
         def place(model: StreamingFit, known: fit.FitState | None = None) -> None:
             placements.append(known is not None)
             first(model, known if knows else None)
 
         monkeypatch.setattr(StreamingFit, "_place_first", place)
-        model = StreamingFit(VIEWS, GRID, seed, gaussians=1500, now=StepClock())
-        for views, seconds in ((order[:8], 1.4), (order[8:12], 3.0)):
-            model.add_views(data[views], ANGLES[views])
-            model.advance(seconds)
+        model = StreamingFit(geometry, Grid.matching(geometry), now=StepClock(0.5))
+        for view in range(22):
+            model.add_views(data[view : view + 1], geometry.angles[view : view + 1])
+            model.advance(25.0)
         return psnr(truth, model.snapshot().data)
 
-    knows, forgets = (np.mean([quality(seed, known) for seed in (0, 1)]) for known in (True, False))
-    assert placements == [False, True] * 4
+    knows, forgets = quality(True), quality(False)
+    assert placements == [False, True] * 2
     assert knows > forgets + 0.2
 
 
