@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import json_option
+from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.options import POSITIVE, json_option
+from beamline.cli.terminal import Terminal
+from beamline.config.load import load
+from beamline.config.monitor import configured_checks
 from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
+from beamline.core.text import size
+from beamline.scan.rate import Load, RateRow, rates, summary
+from drivers import orca_quest
 from drivers.clock import SystemClock
+from drivers.protocols import CameraSettings, TriggerSource
 from recon.bench import N_GAUSSIANS, SIDE, Timing, VolumeRow, kernel_timings, step_timing, volume_rows
 from recon.methods import by_name, names
 from recon.splatting.r2 import R2
@@ -25,6 +34,105 @@ _STEPS = (125, 500, 2000)
 @click.group()
 def bench() -> None:
     """Measure this machine."""
+
+
+def _frame_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    words = value.lower().split("x")
+    if len(words) != 2 or not all(word.isdecimal() and 16 <= int(word) <= 32_768 for word in words):
+        raise click.BadParameter(
+            f"{value!r} is no size of a frame; expected rows x columns, of 16 to 32768, as in 2304x4096."
+        )
+    return int(words[0]), int(words[1])
+
+
+@bench.command(short_help="Measure how fast frames are taken, checked and written.")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--config",
+    "file",
+    type=click.Path(path_type=Path),
+    help="Frame, preview, flushes and checks of this configuration; else the full sensor, and the defaults.",
+)
+@click.option(
+    "--size",
+    "shape",
+    metavar="ROWSxCOLS",
+    callback=_frame_size,
+    help="Rows and columns of a frame, instead of the camera's.",
+)
+@click.option("--seconds", type=POSITIVE, default=60.0, show_default=True, help="For all rounds together, about.")
+@click.option(
+    "--rounds", type=click.IntRange(1, 100), default=5, show_default=True, help="In each, every stage is measured once."
+)
+@json_option
+def acquire(
+    folder: Path, file: Path | None, shape: tuple[int, int] | None, seconds: float, rounds: int, as_json: bool
+) -> None:
+    """Measure how fast frames are taken, checked and written to FOLDER, which is on the disk for scans.
+
+    Five stages, one part of the acquisition more in each: a plain file with the same bytes, the writer of scans, its
+    digest of each frame, the monitor, and all of it behind the queue that a scan feeds. Half of the free disk is used
+    at most, and every file is removed. Run it on an idle machine; ratios of one round are more reliable than rates.
+    """
+    clock, taken = SystemClock(), []
+    with terminated_like_interrupted(), json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
+        work = _load(file, shape)
+        found = machine()
+        start = {"machine": found, "folder": folder.absolute(), "rows": work.shape[0], "cols": work.shape[1]}
+        if as_json:
+            sinks[0](Event("bench_started", clock.now(), start))
+        else:
+            frame = f"{work.shape[0]} x {work.shape[1]} pixels, {size(work.frame_bytes)} a frame"
+            click.echo(f"{machine_line(found)}\n{frame}, previews of {work.preview_bin} x {work.preview_bin}\n")
+        began = clock.now()
+
+        def said(n: int, of: int, stage: str) -> None:
+            per_min = 60 * n / max(clock.now() - began, 1e-9)
+            left = (of - n) * 60 / per_min if n else None
+            data = {"stage": "bench", "n": n, "of": of, "per_min": per_min, "eta_s": left, "label": stage}
+            (sinks[0] if as_json else terminal)(Event("progress", clock.now(), data))
+
+        for one in rates(work, folder, clock, seconds, rounds, said):
+            taken.append(one)
+        rows = summary(work, taken)
+        for row in rows if as_json else ():
+            sinks[0](Event("bench", clock.now(), asdict(row)))
+        if as_json:
+            sinks[0](Event("done", clock.now(), {}))
+    if not as_json:
+        click.echo(_rate_table(rows, rounds))
+
+
+def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
+    if file is None:
+        return Load(shape or orca_quest.SENSOR_SHAPE)
+    config = load(file)
+    camera, storage = config.devices.camera, config.storage
+    settings = CameraSettings(
+        config.scan.exposure_s, TriggerSource.EXTERNAL, camera.roi, camera.binning, camera.readout
+    )
+    work = Load(
+        orca_quest.timing(settings).shape, storage.preview_bin, storage.flush_every, configured_checks(config.monitor)
+    )
+    return work if shape is None else replace(work, shape=shape)
+
+
+def _rate_table(rows: list[RateRow], rounds: int) -> str:
+    plain = rows[0].stage
+    lines = [f"{'':<27}{'MB/s':>7}{'frames/s':>10}{'ms':>8}{'CPU ms':>8}   of {plain:<22}{'lost':>5}{'memory':>9}"]
+    for row in rows:
+        ratio = f"{row.ratio:.2f}  ({row.lowest:.2f} to {row.highest:.2f})"
+        memory = "-" if row.peak is None else size(row.peak)
+        rate = f"{row.mb_per_s:>7.0f}{row.frames_per_s:>10.1f}{row.ms:>8.2f}{row.cpu_ms:>8.2f}"
+        lines.append(f"{row.stage:<27}{rate}   {ratio:<25}{row.lost:>5}{memory:>9}")
+    times = "1 round" if rounds == 1 else f"{rounds} rounds in turn"
+    lines.append(
+        f"\nMedians of {times} (ratios: lowest to highest) of {rows[0].frames} frames, ms a frame until all are on the "
+        "disk;\nmemory: the largest of this process."
+    )
+    return "\n".join(lines)
 
 
 @bench.command(short_help="Measure kernels, a fit, and methods on a small sample.")

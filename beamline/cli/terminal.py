@@ -28,6 +28,7 @@ SAY_EVERY = 0.2
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
 _OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
+_OF_TRIALS = {"tradeoff": "trials", "study": "trials", "batch": "scans", "bench": "runs"}  # what that of others counts
 
 
 class Terminal:
@@ -83,8 +84,8 @@ class Terminal:
             self._show("frames", event.data["n"], event.data["of"], rate_text(event.data))
         elif event.event == "progress" and event.data.get("stage") == "axes":
             self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
-        elif event.event == "progress" and event.data.get("stage") in ("tradeoff", "study", "batch"):
-            what = "scans" if event.data["stage"] == "batch" else "trials"
+        elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:
+            what = _OF_TRIALS[event.data["stage"]]
             self._show(what, event.data["n"], event.data["of"], trials(event.data, what))
         elif event.event == "progress" and event.data.get("stage") == "kernels":
             note = f"{event.data['n']} compiled in {event.data['seconds']:.0f} s; once on a machine, 1 to 2 minutes"
