@@ -231,6 +231,8 @@ def recon(
         raise click.UsageError("--rings is for a finished scan: it needs all views.")
     if follow and values["hardening"] is not None:
         raise click.UsageError("--hardening is for a finished scan: its curve is of all views.")
+    if follow and values["tilt"] == "auto":
+        raise click.UsageError("--tilt auto is for a finished scan: it needs all views. Give it in degrees.")
     enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
     if enough is not None and not follow:
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from beamline.projections.selection import Hardening, Phase, Selection
     from beamline.reconstruct.axis_trials import AxisRange
     from beamline.storage.readers.open import SourceOptions
+    from recon.prep.resample import Distortion
 
 
 def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
@@ -67,6 +68,31 @@ def distances(ctx: click.Context, param: click.Parameter, value: str | None) -> 
     return sod, sdd
 
 
+def degrees(ctx: click.Context, param: click.Parameter, value: str | None) -> float | str | None:
+    """An angle within 45 degrees, or "auto"."""
+    if value is None or value == "auto":
+        return value
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not abs(number) <= _STEEPEST:
+        raise click.BadParameter(f"{value!r} is neither auto nor degrees from -{_STEEPEST:g} to {_STEEPEST:g}")
+    return number
+
+
+def distortion_of(ctx: click.Context, param: click.Parameter, value: Path | None) -> Distortion | None:
+    """The distortion that a text file says."""
+    if value is None:
+        return None
+    from recon.prep.resample import Distortion
+
+    try:
+        return Distortion.parse(value.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise click.BadParameter(f"{value}: {error}") from error
+
+
 def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str | tuple[int, int]:
     """Which columns at the detector's edges show air: auto, none, or counts `left,right`."""
     match = re.fullmatch(r"(\d+),(\d+)", value)
@@ -96,7 +122,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
     rest = dict(said)
     if rest["axis"] is not None and not isinstance(rest["axis"], float):
         raise click.UsageError("--axis try is for beamline recon.")
-    pixel_size_um = rest.pop("pixel_size_um")
+    pixel_size_um, tilt = rest.pop("pixel_size_um"), rest.pop("tilt")
     selection = Selection(
         views=rest.pop("views"),
         rows=rest.pop("rows"),
@@ -116,6 +142,9 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         gain=rest.pop("gain"),
         phase=_phase(rest),
         hardening=_hardening(rest.pop("hardening")),
+        tilt_deg=tilt if isinstance(tilt, float) else None,
+        find_tilt=tilt == "auto",
+        distortion=rest.pop("distortion"),
     )
     if selection.gain is not None and selection.noise == "log":
         raise click.UsageError("--gain is for counted photons; it does not go with --noise log.")
@@ -186,6 +215,8 @@ def _hardening(value: str | None) -> Hardening | None:
         raise click.UsageError(f"--hardening {value}: {error}.") from error
 
 
+_STEEPEST = 45.0
+
 _BEFORE = (
     click.option(
         "--views",
@@ -219,6 +250,21 @@ _BEFORE = (
     ),
 )
 _AFTER = (
+    click.option(
+        "--tilt",
+        callback=degrees,
+        metavar="DEGREES|auto",
+        help="By how much the rotation axis leans in the detector's plane (its column grows with the rows): views are "
+        "turned. auto finds it by all rows. Default: views are used as they are, with a warning if they show a tilt.",
+    ),
+    click.option(
+        "--distortion",
+        type=click.Path(path_type=Path),
+        callback=distortion_of,
+        metavar="FILE",
+        help="Radial distortion of the lens, which is taken out of the views: the text file that discorpy writes "
+        "(backward model: xcenter, ycenter, factor0 ...).",
+    ),
     click.option(
         "--pixel-size-um",
         type=POSITIVE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -21,12 +22,13 @@ from beamline.projections.read import (
     read_references,
     with_dynamic_flats,
 )
-from beamline.projections.selection import Selection, rows_of
+from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from drivers.frame import FrameKind
 from recon.prep.correct import Correction, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
+from recon.prep.resample import Resampling
 
 Warn = Callable[[str], None]
 """Takes a sentence about something that is wrong though work goes on."""
@@ -50,11 +52,11 @@ class ScanCorrection:
         """
         self.rows, self.binning = rows_of(source, selection), selection.binning
         self._filter, self.phase = filter_of(source, selection)
-        if self._filter is not None:
+        self._resampling = resampling_of(source, selection)
+        if self._filter is not None or self._resampling is not None:
             if selection.noise == "counts":
-                raise ConfigError(
-                    "--phase mixes neighbouring pixels, so that --noise counts has no likelihood for them."
-                )
+                what = "--tilt and --distortion mix" if self._filter is None else "--phase mixes"
+                raise ConfigError(f"{what} neighbouring pixels, so that --noise counts has no likelihood for them.")
             selection = replace(selection, noise="log")
         self._source, self._selection, self._warn = source, selection, warn
         self._current_factor = current_scale(source) if selection.use_current else None  # [frame], by the ring current
@@ -264,24 +266,30 @@ class ScanCorrection:
             raise self._refusal(error) from error
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
-        """Detector rows to read for some binned rows (None: all), with those that a filter takes from; and which of
-        what is read are wanted, in binned rows."""
+        """Detector rows to read for some binned rows (None: all), with those that a filter or new pixels take from; and
+        which of what is read are wanted, in binned rows."""
         first, end = self.rows.start, self.rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // self.binning)
             first, end = first + start * self.binning, first + stop * self.binning
-        reach, n = 0 if self._filter is None else self._filter.reach, self.binning
+        n, steps = self.binning, (self._filter, self._resampling)
+        reach = sum(step.reach for step in steps if step is not None)
         above = min(reach, first // n)
         below = min(reach, (self._source.shape[0] - end) // n)
         return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
 
     def _retrieved(self, part: Projections, rows: slice | None) -> Projections:
-        """The views through the filter, in the rows wanted."""
-        if self._filter is None or not part.view_ids.size:
+        """The views resampled and through the filter, in the rows wanted."""
+        if (self._filter is None and self._resampling is None) or not part.view_ids.size:
             return part
-        self._filter.retrieve(part.data, self._selection.correction.floor)
-        _, wanted = self._widened(rows)
-        return replace(part, data=np.ascontiguousarray(part.data[:, wanted]), masked=part.masked[wanted])
+        read, wanted = self._widened(rows)
+        masked = part.masked
+        if self._resampling is not None:
+            self._resampling.apply(part.data, read.start)
+            masked = self._resampling.nearest(masked, read.start)
+        if self._filter is not None:
+            self._filter.retrieve(part.data, self._selection.correction.floor)
+        return replace(part, data=np.ascontiguousarray(part.data[:, wanted]), masked=masked[wanted])
 
     def _corrected(
         self,
@@ -319,6 +327,21 @@ class ScanCorrection:
 
     def _refusal(self, error: ValueError) -> DataError:
         return DataError(f"{self._source.path} cannot be corrected: {error}")
+
+
+def resampling_of(source: ScanSource, selection: Selection) -> Resampling | None:
+    """How views are resampled; None where they are used as they are.
+
+    Raises:
+        ConfigError: a cone's axis is to be levelled.
+    """
+    tilt = selection.tilt_deg or 0.0
+    if (tilt or selection.find_tilt) and cone_of(source, selection) is not None:
+        raise ConfigError(f"--tilt is for a parallel beam; {source.path} is a cone. Leave it out.")
+    if not tilt and selection.distortion is None:
+        return None
+    height, width = source.shape
+    return Resampling((height, width), math.radians(tilt), selection.distortion, selection.binning)
 
 
 def _count_references(source: ScanSource) -> int:

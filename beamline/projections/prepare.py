@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import ScanCorrection, Warn
+from beamline.projections.correction import ScanCorrection, Warn, resampling_of
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.hardening import curve_of
 from beamline.projections.jumps import find_jumps, longest_part
 from beamline.projections.replay import judged_flags
+from beamline.projections.resampling import spread, spread_views, warn_of_tilt, with_tilt
 from beamline.projections.selection import (
     Hardening,
     Selection,
@@ -73,6 +74,8 @@ class PreparedProjections:
         flats: what was done about changes of the beam; empty where nothing was asked.
         phase: what was done about phase; empty where nothing was asked.
         hardening: what was done about beam hardening; empty where nothing was asked.
+        tilt: what was done about a tilt of the axis; empty where nothing was asked.
+        tilt_deg: by which views were turned.
         shares_of: `shares` of some rows [view, row, col], where line integrals lie on disk and these are made when
             wanted; None: as `shares` says.
     """
@@ -96,6 +99,8 @@ class PreparedProjections:
     flats: str = ""
     phase: str = ""
     hardening: str = ""
+    tilt: str = ""
+    tilt_deg: float = 0.0
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
 
     @property
@@ -193,7 +198,9 @@ def prepare_projections(
     scan_frames = usable.frames
     pixel_size(source, selection)
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
+    selection, tilt = with_tilt(source, selection, scan_frames, warn)
     correction = ScanCorrection(source, selection, warn)
+    warn_of_tilt(source, selection, correction, scan_frames, warn)
     axis_col, axis = selection.axis_col, None
     if axis_col is None:
         if cone_of(source, selection) is not None:
@@ -228,7 +235,7 @@ def prepare_projections(
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     held_out = None
     if rest.size:
-        others = correction.at_once(scan_frames[_spread(rest, _HELD_OUT_VIEWS)])
+        others = correction.at_once(scan_frames[spread(rest, _HELD_OUT_VIEWS)])
         unseen = geometry_of(source, selection, axis_col, source.angles[others.view_ids])
         others.data[...] -= taken
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
@@ -241,6 +248,7 @@ def prepare_projections(
         flats=correction.flats,
         phase=correction.phase,
         rings=rings,
+        tilt=tilt,
         shares_of=shares_of,
     )
     if selection.hardening is not None:
@@ -346,6 +354,10 @@ def assemble(
         raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
     axis_col, estimate = axis
     rows, shape = rows_of(source, selection), projections.data.shape[1:]
+    unknown, resampling = projections.masked, resampling_of(source, selection)
+    if resampling is not None:
+        unknown = unknown | resampling.unseen((shape[0], shape[1]), rows.start)
+    unknown = areas(unknown)
     return PreparedProjections(
         projections=projections,
         geometry=geometry_of(source, selection, axis_col, source.angles[projections.view_ids]),
@@ -359,7 +371,8 @@ def assemble(
         left_out=usable.left_out,
         flags=usable.flags,
         shares=usable.regions.weights(projections.view_ids, rows, selection.binning, (shape[0], shape[1])),
-        measured=~unknown if (unknown := areas(projections.masked)).any() else None,
+        measured=~unknown if unknown.any() else None,
+        tilt_deg=selection.tilt_deg or 0.0,
     )
 
 
@@ -402,7 +415,7 @@ def locate_axis(
     """
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
-    frames = frames[_axis_views(source.angles[frames], _AXIS_VIEWS)]
+    frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)))
     try:
         estimate = find_axis(band.data, source.angles[band.view_ids])
@@ -444,20 +457,3 @@ def report_defects(projections: Projections, warn: Warn) -> None:
 def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
     """The values of views, and ones for others after them."""
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
-
-
-def _axis_views(angles: NDArray[np.float64], n: int) -> NDArray[np.int64]:
-    """At most `n` views, evenly spread; of a full turn half as many, and with each the one opposite to it."""
-    every = np.arange(angles.size)
-    if angles.size <= n or np.ptp(angles) < 1.5 * np.pi:
-        return _spread(every, n)
-    some = _spread(every, n // 2)
-    away = np.abs(np.mod(angles[some][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
-    return np.union1d(some, away.argmax(axis=1))
-
-
-def _spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """At most `n` of the items, evenly spread, with the first and the last."""
-    if items.size <= n:
-        return items
-    return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]

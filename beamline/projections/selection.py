@@ -16,6 +16,7 @@ from recon.base.choices import Noise as Noise
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
+from recon.prep.resample import Distortion
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
 
@@ -79,6 +80,10 @@ class Selection:
         phase: None: it is not retrieved.
         hardening: None: it is not corrected.
         axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
+        tilt_deg: by how much the axis leans in the detector's plane: its column grows by tan(tilt) a row; None: nobody
+            knows, and views are used as they are.
+        find_tilt: the tilt is found.
+        distortion: of the lens; None: none.
     """
 
     views: str = "all"
@@ -100,6 +105,9 @@ class Selection:
     phase: Phase | None = None
     hardening: Hardening | None = None
     axis_rows: tuple[int, int] | None = None
+    tilt_deg: float | None = None
+    find_tilt: bool = False
+    distortion: Distortion | None = None
 
 
 def choose_views(

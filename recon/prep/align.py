@@ -101,6 +101,21 @@ def axis_from_opposites(
         ValueError: fewer than 8 pairs of opposite views, or values that are not finite.
         AxisError: where the best match lies at the edge of the search range or outside it.
     """
+    a, b = _opposites(projections, angles)
+    candidates = _opposite_candidates(projections.shape[2])
+    curve = _mirror_mismatch(_rows_of(a), _rows_of(b), candidates - 0.5)
+    value, depth = _optimum(candidates, curve, search)
+    halves = [_mirror_mismatch(_rows_of(a[i::2]), _rows_of(b[i::2]), candidates - 0.5) for i in (0, 1)]
+    apart = max(abs(_lowest(candidates, half)[0] - value) for half in halves)
+    return AxisEstimate(value, *_within(search, candidates, curve), depth > 0.5 and apart < _AGREE, "opposite views")
+
+
+def _opposite_candidates(cols: int) -> Floats:
+    return np.arange(2 * cols // _EDGE, 2 * (cols - 1) - 2 * cols // _EDGE) / 2
+
+
+def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Floats, Floats]:
+    """Slopes along the columns [pair, row, col - 1] of some rows of views, and of those half a turn on, negated."""
     theta, cols = np.mod(np.asarray(angles, np.float64), 2 * np.pi), projections.shape[2]
     away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
     opposite = away.argmax(axis=1)
@@ -113,13 +128,7 @@ def axis_from_opposites(
     if not np.isfinite(data).all():
         raise ValueError("the views hold NaN or infinite values; correct them first")
     slopes = np.diff(uniform_filter1d(data, 3, axis=2), axis=2)
-    a, b = slopes[: first.size], -slopes[first.size :]
-    candidates = np.arange(2 * cols // _EDGE, 2 * (cols - 1) - 2 * cols // _EDGE) / 2
-    curve = _mirror_mismatch(_rows_of(a), _rows_of(b), candidates - 0.5)
-    value, depth = _optimum(candidates, curve, search)
-    halves = [_mirror_mismatch(_rows_of(a[i::2]), _rows_of(b[i::2]), candidates - 0.5) for i in (0, 1)]
-    apart = max(abs(_lowest(candidates, half)[0] - value) for half in halves)
-    return AxisEstimate(value, *_within(search, candidates, curve), depth > 0.5 and apart < _AGREE, "opposite views")
+    return slopes[: first.size], -slopes[first.size :]
 
 
 def _rows_of(views: Floats) -> Floats:
@@ -183,9 +192,7 @@ def axis_from_sinogram(
         )
     if not (np.isfinite(data).all() and np.isfinite(theta).all()):
         raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")
-    half_turn = np.sort(np.mod(theta, np.pi))
-    gap = np.diff(half_turn, append=half_turn[0] + np.pi).max()
-    if gap > max(_WIDEST_GAP, 4 * np.pi / len(theta)):
+    if not _over_half_a_turn(theta):
         return _axis_from_mass(data, theta, search)
     wedge = _axis_from_wedge(data, theta, search)
     if wedge.confident:
@@ -227,12 +234,61 @@ def _axis_from_mass(data: Floats, theta: Floats, search: tuple[float, float] | N
     return AxisEstimate(value, *_within(search, candidates, curve), bool(confident), "centre of mass")
 
 
-def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | None) -> AxisEstimate:
+def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
+    """Candidates [n] for the axis, and the mismatch [row, n] of each row of [view, row, col] by the double wedge.
+
+    Raises:
+        ValueError: the views have a wider gap than it bears.
+    """
+    if not _over_half_a_turn(theta):
+        raise ValueError("the views do not go round half a turn evenly")
+    part, theta, bin_ = _for_wedge(data, theta)
+    omega, fits = _wedge_residuals(part, theta)
+    candidates = np.arange(0, part.shape[2] - 1 + _STEP / 2, _STEP)
+    phase = 2 * np.outer(candidates, omega)
+    fits = fits * omega ** _power(part)
+    curves = fits[0].sum(axis=1)[:, None] + fits[1] @ np.cos(phase).T + fits[2] @ np.sin(phase).T
+    return candidates * bin_ + (bin_ - 1) / 2, curves / np.maximum(fits[0].sum(axis=1), 1e-30)[:, None]
+
+
+def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
+    """As `wedge_curves`, by pairs of opposite views.
+
+    Raises:
+        ValueError: see `axis_from_opposites`.
+    """
+    a, b = _opposites(data, theta)
+    candidates = _opposite_candidates(data.shape[2])
+    rows = range(data.shape[1])
+    return candidates, np.stack([_mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
+
+
+def _over_half_a_turn(theta: Floats) -> bool:
+    half_turn = np.sort(np.mod(theta, np.pi))
+    gap = np.diff(half_turn, append=half_turn[0] + np.pi).max()
+    return bool(gap <= max(_WIDEST_GAP, 4 * np.pi / len(theta)))
+
+
+def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
+    """Views and columns, as many as are needed; their angles; and the columns that were averaged."""
     views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
     bin_ = -(-data.shape[2] // _MOST_COLS)
     cols = data.shape[2] // bin_
     part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
-    omega, fit = _wedge_residuals(part, theta[views])
+    return part, theta[views], bin_
+
+
+def _power(part: Floats) -> int:
+    """By which frequencies weigh: low ones suffer from bad air and truncation, high ones from noise."""
+    rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
+    return 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
+
+
+def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | None) -> AxisEstimate:
+    part, theta, bin_ = _for_wedge(data, theta)
+    cols = part.shape[2]
+    omega, fits = _wedge_residuals(part, theta)
+    fit = fits.sum(axis=1)
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
     phase = 2 * np.outer(candidates, omega)
     basis = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
@@ -241,9 +297,7 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    # Low frequencies suffer from bad air and truncation, high ones from noise: both must give the same axis.
-    rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
-    power = 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
+    power = _power(part)  # one more and one less must give the same axis
     curve = curve_for(power)
     full = candidates * bin_ + (bin_ - 1) / 2
     value, depth = _optimum(full, curve, search)
@@ -252,7 +306,7 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
 
 
 def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
-    """Frequencies ω [k] and coefficients [3, k] of the residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
+    """Frequencies ω [k], coefficients [3, row, k] of each row's residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
     views, rows, cols = data.shape
     # Subtract air that is not at zero: it is a box fixed to the detector, symmetric about its middle.
     edge = max(2, cols // 40)
@@ -268,7 +322,7 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     re, im = spectrum.real.copy(), spectrum.imag.copy()
 
     def residual_power(first: int) -> list[Floats]:
-        """re·re, im·im and re·im after the fit of harmonics first, first + 2 ... up to each frequency's limit."""
+        """[row, k] re·re, im·im and re·im after the fit of harmonics first, first + 2 ... up to a frequency's limit."""
         order = np.repeat(np.arange(first, harmonics[-1] + 1, 2), 2)
         columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
         if first == 0:  # sin 0
@@ -281,7 +335,7 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
         allowed = order[:, None] <= harmonics
         in_re, in_im = ((q.T @ torch.from_numpy(part)).numpy().reshape(-1, rows, k.size) for part in (re, im))
         return [
-            (x * y).reshape(views, rows, -1).sum(axis=(0, 1)) - ((u * v).sum(axis=1) * allowed).sum(axis=0)
+            (x * y).reshape(views, rows, -1).sum(axis=0) - (u * v * allowed[:, None]).sum(axis=0)
             for x, y, u, v in ((re, re, in_re, in_re), (im, im, in_im, in_im), (re, im, in_re, in_im))
         ]
 

@@ -230,6 +230,33 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     assert left(folder) == {"scan.h5", "scan_fbp.h5"}
 
 
+def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None:
+    lens = "xcenter = 20.0\nycenter = 0.5\nfactor0 = 1.0\nfactor1 = 1e-5\n"
+    (folder / "lens.txt").write_text(lens, encoding="utf-8")
+    options = ("-m", "fbp", "--tilt", "-0.5", "--distortion", "lens.txt")
+    assert beamline("recon", "scan.h5", *options, "--dry-run").exit_code == 0
+    recipe = beamline("recon", "scan.h5", *options, "--write-config", "recipe.yaml")
+    assert recipe.exit_code == 0, recipe.output
+    result = beamline("recon", "scan.h5", "--config", "recipe.yaml")
+    assert result.exit_code == 0, result.output
+    found = read_reconstruction(folder / "scan_fbp.h5").parameters
+    assert (found["tilt_deg"], found["distortion_col"], found["distortion_factors"]) == (-0.5, 20.0, "(1.0, 1e-05)")
+    assert "Views are turned by -0.5 degrees." in result.stderr
+    assert "Views are turned by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
+    for options, error, code in (
+        (("--tilt", "90"), "neither auto nor degrees from -45 to 45", 2),
+        (("--tilt", "auto", "--follow"), "--tilt auto is for a finished scan", 2),
+        (("--tilt", "auto"), "the tilt of the axis was not found: 2 bands of rows", 5),
+        (("--tilt", "1", "--cone", "5:7"), "--tilt is for a parallel beam; scan.h5 is a cone", 2),
+        (("--distortion", "scan.h5"), "scan.h5:", 2),
+        (("--distortion", "recipe.yaml"), "expected the lines 'xcenter = X'", 2),
+    ):
+        result = beamline("recon", "scan.h5", *options, "-o", "other.h5")
+        text = " ".join(result.stderr.replace("│", " ").split())
+        assert (result.exit_code, error in text) == (code, True), result.stderr
+    assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html", "lens.txt", "recipe.yaml"}
+
+
 def test_hardening_is_corrected_recorded_and_told(folder: Path) -> None:
     result = beamline("recon", "scan.h5", "-m", "fbp", "--hardening", "Al:60kV,Al=1", "--no-report")
     assert result.exit_code == 0, result.output

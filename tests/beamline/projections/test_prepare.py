@@ -11,7 +11,8 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections import prepare as pipeline
-from beamline.projections.prepare import PreparedProjections, _axis_views, prepare_projections
+from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.resampling import spread_views
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
@@ -252,8 +253,8 @@ def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, t
 @pytest.mark.parametrize("views", [1000, 1800, 2161])
 def test_of_a_full_turn_the_axis_is_given_pairs_of_opposite_views(views: int) -> None:
     angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
-    some = angles[_axis_views(angles, 360)]
+    some = angles[spread_views(angles, 360, np.arange(views))]
     apart = np.abs(np.mod(some[:, None] - some + np.pi, 2 * np.pi) - np.pi).max(axis=1)
     assert some.size <= 360 and (np.pi - apart).max() <= np.pi / views + 1e-9
     half = np.linspace(0, np.pi, views, endpoint=False)
-    assert _axis_views(half, 360).size == 360
+    assert spread_views(half, 360, np.arange(views)).size == 360

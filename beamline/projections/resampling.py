@@ -1,0 +1,149 @@
+"""How views of a scan are resampled: the distortion of the lens, and the tilt of the axis, given or found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.projections.correction import ScanCorrection, Warn, resampling_of
+from beamline.projections.selection import Selection, cone_of
+from beamline.storage.readers.base import ScanSource
+from recon.prep.tilt import FEWEST_BANDS, STEEPEST, TiltEstimate, find_tilt
+
+_BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240
+_LOOK_BANDS, _LOOK_VIEWS = 8, 90  # for a warning
+_FEWEST_ROWS = 32  # that are looked at for a warning: half a pixel over fewer is no tilt of a stage
+_MATTERS = 0.5  # px over the rows
+_NOTHING = 0.05  # px over the rows, not worth new pixels
+_SURE = 3.0  # standard deviations from which on a tilt is one
+_ROUNDS = 5
+
+
+def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> tuple[Selection, str]:
+    """The selection with its tilt found, if it wants that, by all rows of the detector; and a sentence about the tilt.
+
+    Args:
+        frames: views that may be used.
+
+    Raises:
+        ConfigError: a cone.
+        DataError: the views do not tell it.
+    """
+    resampling_of(source, selection)  # refuses a cone
+    if not selection.find_tilt:
+        return selection, "" if not selection.tilt_deg else f"Views are turned by {selection.tilt_deg:g} degrees."
+    rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
+    try:
+        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, _BANDS, 0.0, _ROUNDS)
+    except ValueError as error:
+        raise DataError(
+            f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
+        ) from error
+    if abs(tilt) > STEEPEST:
+        raise DataError(
+            f"{source.path}: the axis seems to lean by {math.degrees(tilt):.1f} degrees, more than the "
+            f"{math.degrees(STEEPEST):g} that are looked for. Look at the views; give the tilt with --tilt DEGREES."
+        )
+    said = f"The axis leans by {_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
+    if uncertainty * rows > _MATTERS:
+        warn(f"{said}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
+    if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
+        return replace(selection, find_tilt=False, tilt_deg=0.0), f"{said}: not corrected."
+    return replace(selection, find_tilt=False, tilt_deg=math.degrees(tilt)), f"{said}; views are turned."
+
+
+def warn_of_tilt(
+    source: ScanSource, selection: Selection, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
+) -> None:
+    """Warn where the rows chosen show a tilt that matters, and nobody said what it is."""
+    rows = (correction.rows.stop - correction.rows.start) // correction.binning
+    if selection.tilt_deg is not None or cone_of(source, selection) is not None or rows < _FEWEST_ROWS:
+        return
+    frames = spread_views(source.angles[frames], _LOOK_VIEWS, frames)
+    try:
+        found = _look(source, correction, frames, _LOOK_BANDS)
+        if abs(found.tilt) * rows < _MATTERS or abs(found.tilt) < found.uncertainty:
+            return
+        tilt, uncertainty = _refined(source, selection, frames, _LOOK_BANDS, found.tilt, 1)
+    except (ValueError, DataError):
+        return  # nothing is known, and nothing was asked
+    if abs(tilt) * rows > _MATTERS and abs(tilt) > _SURE * uncertainty:
+        warn(
+            f"The rotation axis seems to lean by {_text(tilt, uncertainty)} in the detector's plane, "
+            f"{abs(tilt) * rows:.1f} px over {rows} rows: edges double in the first and last slices. Give --tilt auto, "
+            "or --tilt 0 if it is straight."
+        )
+
+
+def spread_views(angles: NDArray[np.float64], n: int, frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """At most `n` of the frames, evenly spread; of a full turn half as many, and with each the one opposite to it."""
+    every = np.arange(angles.size)
+    if angles.size <= n:
+        return frames
+    if np.ptp(angles) < 1.5 * np.pi:
+        return frames[spread(every, n)]
+    some = spread(every, n // 2)
+    away = np.abs(np.mod(angles[some][:, None] - angles + np.pi, 2 * np.pi) - np.pi)
+    return frames[np.union1d(some, away.argmax(axis=1))]
+
+
+def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """At most `n` of the items, evenly spread, with the first and the last."""
+    if items.size <= n:
+        return items
+    return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
+
+
+def _refined(
+    source: ScanSource, selection: Selection, frames: NDArray[np.int64], bands: int, tilt: float, rounds: int
+) -> tuple[float, float]:
+    """The tilt by views that were levelled by what is known of it, and its uncertainty; radians.
+
+    Raises:
+        ValueError: see `find_tilt`.
+    """
+    plain = replace(selection, phase=None, noise="log", find_tilt=False)
+    rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
+    for _ in range(rounds):
+        levelled = ScanCorrection(source, replace(plain, tilt_deg=math.degrees(tilt)), lambda _: None)
+        found = _look(source, levelled, frames, bands)
+        tilt += found.tilt
+        if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
+            break
+    return tilt, found.uncertainty
+
+
+def _look(source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], bands: int) -> TiltEstimate:
+    """The tilt that is left in corrected views, by bands of their rows that can be corrected.
+
+    Raises:
+        ValueError: see `find_tilt`.
+    """
+    rows = (correction.rows.stop - correction.rows.start) // correction.binning
+    thick = max(1, min(_BAND_ROWS, rows // bands))
+    means: list[NDArray[np.float32]] = []
+    heights, ids = [], np.empty(0, np.int64)
+    for first in np.unique(np.linspace(0, rows - thick, min(bands, rows)).round().astype(int)).tolist():
+        try:
+            band = correction.at_once(frames, slice(first, first + thick))
+        except DataError:
+            continue  # no light there
+        if not means:
+            ids = band.view_ids
+        if np.array_equal(band.view_ids, ids):
+            means.append(band.data.mean(axis=1))
+            heights.append(first + (thick - 1) / 2)
+    if len(means) < FEWEST_BANDS:
+        raise ValueError(f"{len(means)} bands of rows, 4 are needed")
+    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])
+
+
+def _text(tilt: float, uncertainty: float) -> str:
+    """Degrees with their uncertainty, as many digits as that has."""
+    sigma = math.degrees(uncertainty)
+    digits = min(max(1 - math.floor(math.log10(max(sigma, 1e-4))), 2), 4)
+    return f"{math.degrees(tilt):.{digits}f} ± {sigma:.{digits}f} degrees"

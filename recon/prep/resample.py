@@ -1,0 +1,166 @@
+"""Resampling: views of a detector that is turned about the beam, or behind a lens that distorts, as a straight one sees
+them.
+
+Positions are pixels of the whole detector, 0 at the centre of the first one. A pixel (col, row) of the new view is
+taken from where it was seen: first turned about the middle of the detector, then displaced by the lens.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_TAPS = 6  # pixels along each side that a new pixel is made of
+_PHASES = 4096  # steps of a pixel by which weights are tabled
+_LOOKED_AT = 65  # positions along each side at which the reach is measured
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Radial distortion of a lens: a pixel at (x, y) from the centre, without it, is seen at (x, y) * sum a_i r^i.
+
+    The backward model of Vo, Atwood & Drakopoulos 2015 (Opt. Express 23, 32859, equation 7, with even and odd powers).
+
+    Attributes:
+        col, row: the centre.
+        factors: a_0, a_1 ...; r is in pixels.
+    """
+
+    col: float
+    row: float
+    factors: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        values = np.array([self.col, self.row, *self.factors])
+        if not (self.factors and np.isfinite(values).all() and self.factors[0] > 0):
+            raise ValueError(f"expected a centre and finite factors, the first above 0, got {values.tolist()}")
+
+    @classmethod
+    def parse(cls, text: str) -> Distortion:
+        """What discorpy writes to a text file: lines of a name and a value, xcenter, ycenter, factor0, factor1 ...
+
+        Raises:
+            ValueError: there are other lines, or values that are no such model.
+        """
+        lines = [line.replace("=", " ").replace(":", " ").split() for line in text.splitlines() if line.strip()]
+        expected = ["xcenter", "ycenter", *(f"factor{i}" for i in range(len(lines) - 2))]
+        if len(lines) < 3 or [line[0] for line in lines] != expected or any(len(line) != 2 for line in lines):
+            raise ValueError("expected the lines 'xcenter = X', 'ycenter = Y', 'factor0 = A0', 'factor1 = A1' ...")
+        col, row, *factors = (float(line[1]) for line in lines)
+        return cls(col, row, tuple(factors))
+
+    def seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
+        """Where (col, row) are seen."""
+        x, y = col - self.col, row - self.row
+        r = np.hypot(x, y)
+        scale = np.polynomial.polynomial.polyval(r, self.factors)
+        return self.col + x * scale, self.row + y * scale
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """How views are resampled, in one step, by cubic convolution over six pixels.
+
+    Attributes:
+        shape: (rows, cols) of the whole detector.
+        tilt: radians by which the rotation axis leans in the detector's plane: its column grows by tan(tilt) a row.
+        distortion: of the lens; None: none.
+        binning: pixels of the views are the means of so many a side.
+    """
+
+    shape: tuple[int, int]
+    tilt: float = 0.0
+    distortion: Distortion | None = None
+    binning: int = 1
+
+    @property
+    def reach(self) -> int:
+        """Rows, binned, beside a row from which it takes something."""
+        rows, cols = (np.linspace(0, n - 1, _LOOKED_AT) for n in self.shape)
+        seen = self._seen_at(*np.meshgrid(cols, rows))[1]
+        return math.ceil(float(np.abs(seen - rows[:, None]).max()) / self.binning) + _TAPS // 2
+
+    def apply(self, views: F32, first: int) -> None:
+        """Replace views [view, row, col] by resampled ones, in place.
+
+        What lies beyond the rows and columns given is taken from the nearest pixel.
+
+        Args:
+            first: row of the detector at which they begin.
+        """
+        rows, cols = self._places(views.shape[1:], first)
+        table = _weights()
+        for view in views:
+            _resample(view.copy(), *_split(rows), *_split(cols), table, view)
+
+    def nearest(self, image: NDArray[Any], first: int) -> NDArray[Any]:
+        """An image [row, col] resampled without interpolation, for masks."""
+        rows, cols = self._places(image.shape, first)
+        row, col = (
+            np.clip(np.rint(at), 0, n - 1).astype(np.int64) for at, n in zip((rows, cols), image.shape, strict=True)
+        )
+        return np.asarray(image[row, col])
+
+    def unseen(self, shape: tuple[int, int], first: int) -> NDArray[np.bool_]:
+        """Pixels [row, col] of views that begin at row `first`, which the detector did not see."""
+        rows, cols = self._places(shape, first)
+        rows += first / self.binning
+        high, wide = (n // self.binning for n in self.shape)
+        return (rows < -0.5) | (rows > high - 0.5) | (cols < -0.5) | (cols > wide - 0.5)
+
+    def _places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
+        """(row, col) in the views given, of each of their new pixels."""
+        n = self.binning
+        middle = (n - 1) / 2
+        rows, cols = (np.arange(length) * n + middle for length in shape)
+        col, row = self._seen_at(*np.meshgrid(cols, rows + first))
+        return (row - middle) / n - first / n, (col - middle) / n
+
+    def _seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
+        middle_row, middle_col = ((n - 1) / 2 for n in self.shape)
+        c, s = math.cos(self.tilt), math.sin(self.tilt)
+        x, y = col - middle_col, row - middle_row
+        col, row = middle_col + c * x + s * y, middle_row + c * y - s * x
+        return (col, row) if self.distortion is None else self.distortion.seen_at(col, row)
+
+
+def _split(at: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
+    """Whole pixels, and the rest in phases."""
+    steps = np.rint(at * _PHASES)
+    whole = np.floor(steps / _PHASES)
+    return whole.astype(np.int32), (steps - whole * _PHASES).astype(np.int16)
+
+
+def _weights() -> F32:
+    """[phase, tap] of the cubic convolution over six points (Keys 1981, IEEE Trans. ASSP 29, 1153, section VI)."""
+    s = np.abs(np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(_PHASES)[:, None] / _PHASES)
+    near = (4 / 3 * s - 7 / 3) * s**2 + 1
+    middle = ((-7 / 12 * s + 3) * s - 59 / 12) * s + 5 / 2
+    far = ((s / 12 - 2 / 3) * s + 7 / 4) * s - 3 / 2
+    return np.where(s < 1, near, np.where(s < 2, middle, np.where(s < 3, far, 0))).astype(np.float32)
+
+
+@njit(parallel=True, boundscheck=False, cache=True)
+def _resample(view, row, row_phase, col, col_phase, table, out):  # type: ignore[no-untyped-def]
+    """out[i, j] = sum over 6 x 6 pixels of `view` about (row, col)[i, j], those beyond an edge as at the edge."""
+    rows, cols = view.shape
+    for i in prange(rows):
+        for j in range(cols):
+            r0, c0 = row[i, j] - 2, col[i, j] - 2
+            down, along = table[row_phase[i, j]], table[col_phase[i, j]]
+            total = np.float32(0)
+            for k in range(6):
+                line = view[min(max(r0 + k, 0), rows - 1)]
+                part = np.float32(0)
+                for m in range(6):
+                    part += along[m] * line[min(max(c0 + m, 0), cols - 1)]
+                total += down[k] * part
+            out[i, j] = total

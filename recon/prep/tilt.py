@@ -1,0 +1,125 @@
+"""find_tilt: by how much the rotation axis leans in the detector's plane, from its place in bands of rows."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from recon.prep.align import opposite_curves, wedge_curves
+
+F64 = NDArray[np.float64]
+
+STEEPEST = math.radians(5)
+"""Tilts beyond it are not looked for."""
+FEWEST_BANDS = 4
+_DEEP = 0.2  # by which the logarithm of the mismatch must be lower at the axes found than it is typically
+_FLOOR = 1e-3  # mismatch; lower ones say nothing more
+_NEWTON, _CLOSE = 20, 1e-4  # steps, and px at which they end
+
+
+@dataclass(frozen=True)
+class TiltEstimate:
+    """Estimate of the tilt.
+
+    Attributes:
+        tilt: radians; the axis' column grows by tan(tilt) a row.
+        uncertainty: radians, one standard deviation.
+        axis_col: column of the axis at height 0.
+    """
+
+    tilt: float
+    uncertainty: float
+    axis_col: float
+
+
+def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEstimate:
+    """The straight line through the axes of bands of rows with the least sum of the logarithms of their mismatches.
+
+    The mismatch of a band with an axis is that of the double wedge, or where that does not tell it and the views go
+    round the full turn, that of opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band
+    whose noise is not known: it weighs little where a band fits badly with any axis, as air or a clipped row does. The
+    uncertainty is that of the jackknife over bands, or over neighbouring ones together, which see the same sample,
+    where that is larger (Efron & Stein 1981, Ann. Stat. 9, 586).
+
+    A tilt also turns the views: rows mix by tilt times half the width. The estimate is exact where that is little, and
+    is better of views that were levelled by a first one.
+
+    Args:
+        bands: [view, band, col], line integrals of thin bands of rows.
+        heights: [band], px of the bands' middles from the row that `axis_col` is of.
+        angles: [view], radians.
+
+    Raises:
+        ValueError: fewer than 4 bands, or bands that do not tell where the axis is.
+    """
+    data, heights = np.asarray(bands, np.float64), np.asarray(heights, np.float64)
+    if data.ndim != 3 or heights.shape != data.shape[1:2] or len(angles) != len(data):
+        raise ValueError(f"bands {data.shape} must be [view, band, col] for {heights.shape} heights")
+    if len(heights) < FEWEST_BANDS or not np.ptp(heights) > 0:
+        raise ValueError(f"{len(heights)} bands of rows; {FEWEST_BANDS} at different heights are needed")
+    for curves_of in (wedge_curves, opposite_curves):
+        with suppress(ValueError):
+            return _line(*curves_of(data, np.asarray(angles, np.float64)), heights)
+    raise ValueError(
+        f"the axes of {len(heights)} bands of rows lie on no line within {math.degrees(STEEPEST):g} degrees, or the "
+        "views do not go round half a turn"
+    )
+
+
+def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
+    """The line by curves [band, candidate].
+
+    Raises:
+        ValueError: it has no clear optimum.
+    """
+    step, far = float(candidates[1] - candidates[0]), float(np.abs(heights).max())
+    most = math.ceil(math.tan(STEEPEST) * far / step)
+    curves = np.maximum(curves, _FLOOR)
+    padded = np.pad(np.log(curves), ((0, 0), (most, most)), mode="edge")
+    n, best, lowest = candidates.size, (0, 0), math.inf
+    for slope in range(-most, most + 1):
+        shifts = np.rint(slope * heights / far).astype(int) + most
+        total = sum(curve[shift : shift + n] for curve, shift in zip(padded, shifts, strict=True))
+        at = int(np.argmin(total))
+        if total[at] < lowest:
+            best, lowest = (slope, at), float(total[at])
+    slope, at = best
+    typical = float(np.median(np.log(curves).sum(axis=0)))
+    if abs(slope) == most or not 0 < at < n - 1 or typical - lowest < _DEEP * heights.size:
+        raise ValueError("no clear optimum")
+    splines = [CubicSpline(candidates, curve) for curve in curves]
+    start = np.array([candidates[at], slope * step / far])
+    every = np.arange(heights.size)
+    found = _descend(splines, heights, every, start)
+    spread = 0.0
+    for count in (heights.size, max(FEWEST_BANDS, heights.size // 3)):
+        parts = np.array_split(every, count)
+        without = np.array([_descend(splines, heights, np.setdiff1d(every, part), found)[1] for part in parts])
+        spread = max(spread, math.sqrt((count - 1) * float(np.mean((without - without.mean()) ** 2))))
+    return TiltEstimate(math.atan(found[1]), spread / (1 + found[1] ** 2), float(found[0]))
+
+
+def _descend(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64], start: F64) -> F64:
+    """(axis at height 0, slope) of the least sum of logarithms near `start`, by least squares weighted anew."""
+    line, h, far = start.copy(), heights[bands], float(np.abs(heights).max())
+    for _ in range(_NEWTON):
+        at = line[0] + line[1] * h
+        value, first, second = (
+            np.array([splines[b](x, order) for b, x in zip(bands, at, strict=True)]) for order in range(3)
+        )
+        weight = 1 / np.maximum(value, _FLOOR)
+        first, second = weight * first, weight * np.maximum(second, 0)  # beyond its own trough a band bends nothing
+        bend = np.array([[second.sum(), (h * second).sum()], [(h * second).sum(), (h * h * second).sum()]])
+        if np.linalg.det(bend) <= 0:
+            raise ValueError("no clear optimum")
+        move = np.linalg.solve(bend, [first.sum(), (h * first).sum()])
+        move *= min(1.0, 1 / max(abs(move[0]), abs(move[1]) * far, 1e-12))
+        line -= move
+        if max(abs(move[0]), abs(move[1]) * far) < _CLOSE:
+            break
+    return line

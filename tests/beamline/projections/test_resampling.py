@@ -1,0 +1,110 @@
+"""Views of a tilted stage: as good a volume as of a straight one, slab by slab, and a warning where nobody asked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.projections.correction import ScanCorrection
+from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.selection import Selection
+from recon.assess.metrics import psnr
+from recon.base.volume import Grid
+from recon.prep.correct import CorrectionSettings
+from recon.prep.resample import Distortion
+from recon.voxels.fbp import fbp
+from tests.beamline.array_source import ArraySource
+from tests.beamline.scans import BEAM, DARK
+from tests.recon.prep.balls import Balls
+
+SELECTION = Selection(correction=CorrectionSettings(air="none"))
+STRAIGHT = Balls(np.radians(np.arange(0, 180, 2.0)), seed=3)
+
+
+@cache
+def _source(balls_tilt: float) -> ArraySource:
+    balls = replace(STRAIGHT, tilt_deg=balls_tilt)
+    counts = DARK + np.random.default_rng(7).poisson(BEAM * np.exp(-balls.views()))
+    frames = np.concatenate([np.full((1, *balls.shape), DARK), np.full((1, *balls.shape), DARK + BEAM), counts])
+    angles = np.concatenate([[np.nan] * 2, balls.angles])
+    return ArraySource(frames.astype(np.uint16), [2, 1] + [0] * balls.angles.size, angles)
+
+
+def _prepared(source: ArraySource, selection: Selection) -> tuple[PreparedProjections, list[str]]:
+    said: list[str] = []
+    return prepare_projections(source, selection, said.append), said  # type: ignore[arg-type]
+
+
+@cache
+def _truth(shape: tuple[int, int, int]) -> np.ndarray:
+    return STRAIGHT.truth(Grid(shape))
+
+
+def _quality(prepared: PreparedProjections) -> float:
+    """dB of the volume by FBP, in what all views of all these scans see."""
+    grid = Grid.matching(prepared.geometry)
+    inside = np.s_[4:-4, 8:-8, 8:-8]
+    return psnr(fbp(prepared.projections.data, prepared.geometry, grid)[inside], _truth(grid.shape)[inside])
+
+
+def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> None:
+    straight, said = _prepared(_source(0.0), SELECTION)
+    assert not said and straight.tilt == "" and straight.tilt_deg == 0
+    as_it_is, warned = _prepared(_source(1.5), SELECTION)
+    assert [text for text in warned if "seems to lean by 1." in text and "--tilt auto" in text]
+    levelled, said = _prepared(_source(1.5), replace(SELECTION, find_tilt=True))
+    assert not said and levelled.tilt.startswith("The axis leans by 1.") and "views are turned" in levelled.tilt
+    given, _ = _prepared(_source(1.5), replace(SELECTION, tilt_deg=1.5))
+    for found in (levelled, given):
+        assert found.tilt_deg == pytest.approx(1.5, abs=0.05)
+        assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
+        assert _quality(found) > _quality(straight) - 0.3
+    assert _quality(as_it_is) < _quality(straight) - 1
+
+
+def test_no_tilt_changes_nothing() -> None:
+    plain, _ = _prepared(_source(1.5), SELECTION)
+    zero, said = _prepared(_source(1.5), replace(SELECTION, tilt_deg=0.0))
+    assert not said and zero.tilt == "" and zero.measured is None
+    np.testing.assert_array_equal(zero.projections.data, plain.projections.data)
+    found, said = _prepared(_source(0.0), replace(SELECTION, find_tilt=True))
+    assert found.tilt_deg == 0 and found.tilt.endswith("not corrected.") and not said
+
+
+def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
+    prepared, _ = _prepared(_source(0.0), replace(SELECTION, tilt_deg=5.0, axis_col=49.3))
+    assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
+    assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
+    weights = prepared.ray_weights()
+    assert weights is not None and not weights[:, ~prepared.measured].any()
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+@pytest.mark.parametrize("lens", [None, Distortion(50.0, 30.0, (1.0, 3e-4, -4e-6))])
+def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion | None) -> None:
+    plain = CorrectionSettings(air="none", zinger_threshold=1e9)  # zingers are judged by the rows that are there
+    selection = Selection(tilt_deg=1.5, distortion=lens, binning=binning, correction=plain)
+    source, frames = _source(1.5), np.arange(2, 30)
+    correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+    whole = correction.at_once(frames).data
+    np.testing.assert_array_equal(correction.at_once(frames, slice(9, 12)).data, whole[:, 9:12])
+    rows = replace(selection, rows=(8 * binning, 14 * binning))
+    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data  # type: ignore[arg-type]
+    np.testing.assert_array_equal(band, whole[:, 8:14])
+    out = np.empty(whole.shape, np.float32)
+    np.testing.assert_array_equal(correction.in_batches(frames, out, 9, lambda *_: None).data, whole)
+
+
+def test_what_cannot_be_levelled_is_refused() -> None:
+    source = _source(0.0)
+    with pytest.raises(ConfigError, match="--tilt is for a parallel beam; array is a cone"):
+        _prepared(source, replace(SELECTION, tilt_deg=1.0, cone=(100.0, 200.0), pixel_size_mm=0.1))
+    with pytest.raises(ConfigError, match="--tilt and --distortion mix neighbouring pixels"):
+        _prepared(source, replace(SELECTION, tilt_deg=1.0, noise="counts"))
+    few = ArraySource(source._data[:30], source.image_key[:30].tolist(), source.angles[:30])
+    with pytest.raises(DataError, match="the tilt of the axis was not found"):
+        _prepared(few, replace(SELECTION, find_tilt=True, axis_col=49.3))

@@ -1,0 +1,62 @@
+"""Balls, seen by exact chords on a detector that may be turned about the beam: views and volume with a known answer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.volume import Grid
+
+
+@dataclass(frozen=True)
+class Balls:
+    """Balls in a cylinder: lengths in pixels, of 1/50 a pixel.
+
+    Attributes:
+        angles: [view], radians.
+        shape: (rows, cols).
+        axis_col: where the axis crosses the middle row.
+        tilt_deg: by which the axis leans in the detector's plane, column growing with the row.
+        seed, count: of the balls.
+    """
+
+    angles: NDArray[np.float64]
+    shape: tuple[int, int] = (64, 96)
+    axis_col: float = 49.3
+    tilt_deg: float = 0.0
+    seed: int = 0
+    count: int = 24
+
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """[ball, (x, y, z, radius)] about the axis."""
+        rows, cols = self.shape
+        rng = np.random.default_rng(self.seed)
+        turn, away = rng.uniform(0, 2 * np.pi, self.count), 0.32 * cols * np.sqrt(rng.uniform(0, 1, self.count))
+        z, radius = rng.uniform(-rows / 2, rows / 2, self.count), rng.uniform(0.05, 0.12, self.count) * cols
+        return np.stack([away * np.cos(turn), away * np.sin(turn), z, radius], axis=1)
+
+    def views(self) -> NDArray[np.float32]:
+        """Line integrals [view, row, col]."""
+        rows, cols = self.shape
+        x, y = np.meshgrid(np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2)
+        c, s = math.cos(math.radians(self.tilt_deg)), math.sin(math.radians(self.tilt_deg))
+        u, v = c * x - s * y - (self.axis_col - (cols - 1) / 2), s * x + c * y
+        out = np.zeros((self.angles.size, rows, cols))
+        for bx, by, z, radius in self.places:
+            centre = bx * np.cos(self.angles) + by * np.sin(self.angles)
+            out += 0.04 * np.sqrt(np.clip(radius**2 - (u - centre[:, None, None]) ** 2 - (v - z) ** 2, 0, None))
+        return out.astype(np.float32)
+
+    def truth(self, grid: Grid) -> NDArray[np.float32]:
+        """1/pixel, on a grid in pixels."""
+        out, sub = np.zeros(grid.shape), np.array([-0.25, 0.25])
+        for dz, dy, dx in np.stack(np.meshgrid(sub, sub, sub), axis=-1).reshape(-1, 3):
+            z, y, x = (np.asarray(along) + d for along, d in zip(grid.coordinates(), (dz, dy, dx), strict=True))
+            for bx, by, bz, radius in self.places:
+                far = (z[:, None, None] - bz) ** 2 + (y[:, None] - by) ** 2 + (x - bx) ** 2
+                out += 0.02 / 8 * (far <= radius**2)
+        return out.astype(np.float32)
