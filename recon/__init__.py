@@ -1,4 +1,4 @@
-"""Tomographic reconstruction: arrays in, arrays out: `recon.correct`, `recon.find_axis`, `recon.reconstruct`.
+"""Tomographic reconstruction: arrays in, arrays out: `recon.correct`, `find_axis`, `remove_rings`, `reconstruct`.
 
 The values (Geometry, Grid, Volume, RunControl, DataUse) load at once; what computes loads torch and numba on first use,
 so that a program which only plans a scan starts quickly.
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
+    from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.splatting.r2 import R2
     from recon.voxels.direct import Fbp
@@ -56,9 +57,11 @@ __all__ = [
     "Sart",
     "Sirt",
     "Volume",
+    "WithoutRings",
     "correct",
     "find_axis",
     "reconstruct",
+    "remove_rings",
 ]
 
 _LAZY = {
@@ -67,6 +70,7 @@ _LAZY = {
     "find_axis": "recon.prep.align",
     **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
     "Counts": "recon.prep.counts",
+    **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
     **{entry.cls: entry.module for entry in REGISTRY.values()},

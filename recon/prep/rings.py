@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,7 +139,44 @@ def stripe_score(sinogram: F32) -> float:
     return float(spread / max(noise * math.sqrt(math.pi / 2 / len(x)), 1e-12))
 
 
-def remove_rings(views: F32, angles: NDArray[np.float64], rings: Rings) -> tuple[F32, str]:
+@dataclass(frozen=True, eq=False)
+class WithoutRings:
+    """Views without stripes.
+
+    Attributes:
+        data: float32 [view, row, col], line integrals.
+        taken: float32 [row, col], what was taken from a view on average.
+        said: what was done, in a sentence.
+    """
+
+    data: F32
+    taken: F32
+    said: str
+
+
+def remove_rings(projections: NDArray[np.floating], angles: NDArray[np.float64], rings: Rings = "auto") -> WithoutRings:
+    """A copy of line integrals without the stripes that make rings, for use between `recon.correct` and a method.
+
+    Args:
+        projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
+        angles: [view], radians.
+        rings: "sort" for small and medium stripes (Vo et al. 2018, algorithm 3), "vo" also for dead columns and large
+            ones, "wavelet" by wavelets (Münch et al. 2009), "none"; "auto" looks and chooses sort, vo or none.
+
+    Raises:
+        ValueError: shapes that do not fit, values that are not finite, or another way.
+    """
+    views, theta = np.array(projections, np.float32), np.asarray(angles, np.float64)
+    if views.ndim != 3 or theta.shape != views.shape[:1]:
+        raise ValueError(f"projections {views.shape} must be [view, row, col] for angles {theta.shape}")
+    if rings not in get_args(Rings):
+        raise ValueError(f"rings is one of {', '.join(get_args(Rings))}, got {rings!r}")
+    if not (np.isfinite(views).all() and np.isfinite(theta).all()):
+        raise ValueError("projections or angles hold NaN or infinite values; correct them first")
+    return WithoutRings(views, *take_rings_out(views, theta, rings))
+
+
+def take_rings_out(views: F32, angles: NDArray[np.float64], rings: Rings) -> tuple[F32, str]:
     """Stripes out of all rows of line integrals [view, row, col], in place.
 
     Args:
