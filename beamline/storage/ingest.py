@@ -26,6 +26,8 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from drivers.frame import FrameKind
 
+PER_FLUSH = 64  # rows
+
 
 @dataclass(frozen=True)
 class Ingested:
@@ -140,6 +142,9 @@ def _copy(
         rows.write(i, image, statistics, record)
         if progress is not None:
             progress(i + 1, n)
+        if (i + 1) % PER_FLUSH == 0:
+            rows.flush()
+    rows.flush()
     file[layout.COMMITTED][()] = n
     file[layout.STATUS][()] = b"complete"
     file[layout.FINISHED][()] = 1

@@ -22,6 +22,7 @@ Float frames are no NXtomo (its data are NX_INT): they get the same paths under 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -239,24 +240,31 @@ def create(
 
 
 class Rows:
-    """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete."""
+    """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete.
+
+    Pixels are written at once, what is said about them at `flush`: the columns of several rows cost as much as of one.
+    """
 
     def __init__(self, file: h5py.File) -> None:
         self._data: h5py.Dataset = file[DATA]
         self._preview: h5py.Dataset = file[PREVIEW]
         self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in GROWING}
-        self._types = {column: column.dtype for column in self._columns.values()}
+        self._types = {name: column.dtype for name, column in self._columns.items()}
+        self._first, self._said = 0, list[dict[str, Any]]()
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Row `row`, which may exist or be the next: pixels first, then what is said about them.
+        """Row `row`, which may exist or be the next: pixels first, then, at the next `flush`, what is said about them.
 
         A view that it replaces becomes an invalid frame, so that no program takes both.
         """
+        if row != self._first + len(self._said):
+            self.flush()
+            self._first = row
         said = {
             "image_key": 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
             "kind": int(record.kind),
             "count_time": record.exposure,
-            "rotation_angle": np.degrees(record.angle),
+            "rotation_angle": math.degrees(record.angle),
             "trigger": record.trigger,
             "framestamp": record.framestamp,
             "time": record.time,
@@ -269,32 +277,39 @@ class Rows:
         for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
-        for name, column in self._columns.items():
-            self._grow(column, row + 1)
-            self._put(column, row, said[name] if name in said else vars(digest)[name])
+        self._said.append({name: said[name] if name in said else vars(digest)[name] for name in self._columns})
         if record.replaces >= 0:
+            self.flush()
             for name in ("image_key", "kind"):
                 self._columns[name][record.replaces] = int(FrameKind.INVALID)
 
+    def flush(self) -> None:
+        """Write what is said about the rows since the last call. The file's own flush comes after it."""
+        if not self._said:
+            return
+        n = len(self._said)
+        for name, column in self._columns.items():
+            values = np.array([said[name] for said in self._said], self._types[name])
+            self._grow(column, self._first + n)
+            place = column.id.get_space()  # a quarter of the time of h5py's own way, for twenty columns
+            place.select_hyperslab((self._first, *(0,) * (values.ndim - 1)), values.shape)
+            column.id.write(h5py.h5s.create_simple(values.shape), place, values)
+        self._first, self._said = self._first + n, []
+
     def add_flags(self, rows: range, bits: int) -> None:
         """Mark rows that exist: a check that has seen later frames found something in them."""
+        self.flush()
         flags = self._columns["flags"][rows.start : rows.stop]
         marked = flags | np.uint64(bits)
         if (marked != flags).any():
             self._columns["flags"][rows.start : rows.stop] = marked
             self._columns["frame_valid"][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
 
-    def _put(self, column: h5py.Dataset, row: int, value: object) -> None:
-        """column[row] = value, in a quarter of the time that h5py's own takes: a frame has twenty of them."""
-        item = np.asarray(value, self._types[column])
-        place = column.id.get_space()
-        place.select_hyperslab((row, *(0,) * item.ndim), (1, *item.shape))
-        column.id.write(h5py.h5s.create_simple((1, *item.shape)), place, item)
-
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:
-        if dataset.id.shape[0] < n:  # never shrinks: a reader may hold the rows beyond
-            dataset.id.set_extent((n, *dataset.id.shape[1:]))
+        shape = dataset.id.shape
+        if shape[0] < n:  # never shrinks: a reader may hold the rows beyond
+            dataset.id.set_extent((n, *shape[1:]))
 
 
 def settle(file: h5py.File) -> None:

@@ -150,6 +150,7 @@ class NXtomoWriter:
 
     def flush(self) -> None:
         """Commit the rows appended so far, whatever `flush_every` says."""
+        self._table.flush()
         self._file.flush()
         self._progress[()] = self._rows
         self._progress.flush()

@@ -236,6 +236,7 @@ def test_rows_only_grow(tmp_path: Path, frames: list[Frame]) -> None:
         for row in (0, 1, 2, 0):
             counts = frames[row].counts
             rows.write(row, counts, digest(counts), layout.Record(frames[row].kind, 0.0))
+        rows.flush()
         assert {file[path].shape[0] for path in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {3}
 
 
