@@ -123,7 +123,8 @@ class Optics(Section):
 class Storage(Section):
     folder: Annotated[str, Field(min_length=1)] = "runs"
     preview_bin: PositiveInt = 4
-    flush_every: PositiveInt = 1
+    flush_every: PositiveInt = 16
+    """Frames that are flushed together, at most, while others wait to be written; else each is flushed at once."""
 
 
 class StopWhen(Section):

@@ -54,7 +54,7 @@ class Load:
 
     shape: tuple[int, int]
     preview_bin: int = 8
-    flush_every: int = 1
+    flush_every: int = 16
     checks: tuple[Check, ...] = tuple(CHECKS)
 
     @property

@@ -1,4 +1,8 @@
-"""Recorder: the thread that digests, checks and writes every frame, so that taking frames never waits for the disk."""
+"""Recorder: digests, checks and writes every frame beside the scan, so that taking frames never waits for the disk.
+
+Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
+frame before. Both spend nearly all their time in code that lets the other run.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +35,7 @@ from drivers.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # at least and at most
+CHECKED_FRAMES = 2  # that wait between the threads, at most
 LOOK = 1.0  # real s between two looks at the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
 STALL = 60.0  # real s without a frame written, after which the disk is taken for dead
@@ -46,10 +51,16 @@ class Writer(Protocol):
     @property
     def safe(self) -> int: ...
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None: ...
+    def flush(self) -> None: ...
+
+
+_Checked = tuple[Frame, FrameDigest, tuple[Flag, ...]]
 
 
 class Recorder:
     """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
+
+    What was appended is flushed when no frame waits; while some do, the writer decides how often.
 
     No frame is dropped: while the disk is behind, `put` waits. So that it need not in a fly scan, whose frames come
     whether there is room or not, the scan pauses before; and any scan before the disk is full.
@@ -89,15 +100,18 @@ class Recorder:
         low, high = WAITING_FRAMES
         room = min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
         self._waiting: Queue[Frame | threading.Event | None] = Queue(room)
+        self._checked: Queue[_Checked | Exception | threading.Event | None] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames
         pause, views = pause or PauseRequest(), timeline.views
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
-        self._space = SpaceGuard(self._row_bytes * (room + on_the_way), pause)
+        in_work = CHECKED_FRAMES + 2
+        self._space = SpaceGuard(self._row_bytes * (room + in_work + on_the_way), pause)
         self._backlog = BacklogGuard(room, pause) if views.trains else None
         self._flying = False
         self._looked_at, self._busy_since = -math.inf, math.inf
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
         self._thread.start()
+        threading.Thread(target=self._check_frames, name="recorder's checks", daemon=True).start()
 
     def put(self, frame: Frame) -> None:
         """Queue a frame for writing; waits while the queue is full.
@@ -210,19 +224,49 @@ class Recorder:
     def _safe(self) -> str:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
-    def _run(self) -> None:
-        while (frame := self._next()) is not None:
-            if isinstance(frame, threading.Event):
-                frame.set()
-                continue
-            if self._failure is not None:
+    def _check_frames(self) -> None:
+        """The first thread: digests and looks. What it cannot digest is a failure when its turn comes to be written."""
+        while (item := self._next()) is not None:
+            checked: _Checked | Exception | threading.Event
+            if isinstance(item, threading.Event):
+                checked = item
+            elif self._failure is not None:
                 continue  # frames after a failure are discarded, so that `put` does not wait for a place in the queue
-            self._busy_since = time.monotonic()
+            else:
+                try:
+                    found = digest(item.counts, self._monitor.context.saturation, self._preview_bin)
+                    checked = item, found, self._look(item, found)
+                except Exception as error:
+                    checked = error
+            self._checked.put(checked)
+        self._checked.put(None)
+
+    def _write_frames(self) -> None:
+        """The second thread: writes, and tells."""
+        flushed = True
+        while (item := self._checked.get()) is not None:
             try:
-                self._record(frame)
+                if isinstance(item, Exception):
+                    raise item
+                if self._failure is None:
+                    self._busy_since = time.monotonic()
+                    if not isinstance(item, threading.Event):
+                        self._write(*item)
+                        flushed = False
+                    if not flushed and (isinstance(item, threading.Event) or self._nothing_waits):
+                        self._writer.flush()
+                        flushed = True
             except Exception as error:
-                self._failure = error
+                with suppress(Exception):  # the first one counts
+                    self._writer.flush()  # the frames before
+                self._failure = self._failure or error
             self._busy_since = math.inf
+            if isinstance(item, threading.Event):
+                item.set()
+
+    @property
+    def _nothing_waits(self) -> bool:
+        return self._waiting.empty() and self._checked.empty()
 
     def _next(self) -> Frame | threading.Event | None:
         """What comes next in the queue; looks at the disk about once a second meanwhile."""
@@ -240,9 +284,7 @@ class Recorder:
         if self._backlog is not None:
             self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames come when `put` lets them
 
-    def _record(self, frame: Frame) -> None:
-        found = digest(frame.counts, self._monitor.context.saturation, self._preview_bin)
-        flags = self._look(frame, found)
+    def _write(self, frame: Frame, found: FrameDigest, flags: tuple[Flag, ...]) -> None:
         self._writer.append(frame, found, flags)
         self.references.add(frame, found)
         self.n_frames += 1

@@ -129,6 +129,8 @@ class NXtomoWriter:
             if self._rows - self._committed >= self._flush_every:
                 self.flush()
         except FAILURES as error:
+            with suppress(*FAILURES):
+                self.flush()  # the rows before may still fit
             self._broken = True
             raise self._disk_error("take the frame", error) from error
 
@@ -149,7 +151,9 @@ class NXtomoWriter:
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
     def flush(self) -> None:
-        """Commit the rows appended so far, whatever `flush_every` says."""
+        """Commit the rows appended so far, whatever `flush_every` says; nothing after a failed write."""
+        if self._broken:
+            return
         self._table.flush()
         self._file.flush()
         self._progress[()] = self._rows

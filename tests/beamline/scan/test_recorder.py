@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ class Writer:
     def __init__(self, before: Callable[[int], object] = lambda row: None) -> None:
         self.path = Path("runs/scan.h5")
         self.rows: list[int] = []
+        self.flushed: list[int] = []  # rows at each flush
         self._before = before
 
     @property
@@ -39,6 +41,9 @@ class Writer:
         self._before(frame.index)
         assert digest.mean == frame.index
         self.rows.append(frame.index)
+
+    def flush(self) -> None:
+        self.flushed.append(len(self.rows))
 
 
 def record(writer: Writer) -> Recorder:
@@ -107,3 +112,47 @@ def test_a_disk_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch
     assert recorder.hangs
     free.set()
     assert writer.rows[:2] == [0, 1]
+
+
+def test_a_frame_is_digested_while_the_one_before_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    second, together = threading.Event(), list[bool]()
+
+    def spy(counts: np.ndarray, *rest: object) -> FrameDigest:
+        if counts[0, 0] == 1:
+            second.set()
+        return real(counts, *rest)
+
+    real = module.digest
+    monkeypatch.setattr(module, "digest", spy)
+    recorder = record(writer := Writer(lambda row: together.append(second.wait(30)) if row == 0 else None))
+    recorder.put(frame(0))
+    recorder.put(frame(1))
+    recorder.finish()
+    assert together == [True] and writer.rows == [0, 1]
+
+
+def test_frames_before_one_that_cannot_be_digested_are_written() -> None:
+    slow = threading.Event()
+    recorder = record(writer := Writer(lambda row: slow.wait(30) if row == 0 else None))
+    for row in range(3):
+        recorder.put(frame(row))
+    recorder.put(replace(frame(3), counts=np.zeros((2, 2, 2), np.uint16)))
+    slow.set()
+    with pytest.raises(DataError, match=r"not uint16 \(2, 2, 2\).*first 3 frames are safe"):
+        recorder.finish()
+    assert writer.rows == [0, 1, 2]
+
+
+def test_a_frame_that_comes_alone_is_flushed_at_once_and_others_when_none_waits() -> None:
+    slow = threading.Event()
+    recorder = record(writer := Writer(lambda row: slow.wait(30) if row == 1 else None))
+    recorder.put(frame(0))
+    recorder.wait()
+    assert writer.flushed == [1]
+    for row in range(1, 9):
+        recorder.put(frame(row))
+    assert writer.flushed == [1]
+    slow.set()
+    recorder.wait()
+    assert writer.flushed[-1] == 9
+    recorder.finish()

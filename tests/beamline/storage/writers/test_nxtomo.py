@@ -416,3 +416,23 @@ def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(to_disk.os, "fsync", fsync)
     to_disk.to_disk(0)
+
+
+def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=9)
+    for frame in frames[:3]:
+        writer.append(frame, digest(frame.counts))
+    assert writer.committed == 0
+    monkeypatch.setattr(writer._table, "write", full)
+    with pytest.raises(DataError, match="first 3 frames are safe in it"):
+        writer.append(frames[3], digest(frames[3].counts))
+    writer.close("failed")
+    with open_scan(tmp_path / "s.h5") as source:
+        assert source.refresh() == 3
+        assert all((source.read([i])[0] == frames[i].counts).all() for i in range(3))
+        assert source.angles[:3] == pytest.approx([frame.angle for frame in frames[:3]], nan_ok=True)
