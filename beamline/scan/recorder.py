@@ -243,17 +243,17 @@ class Recorder:
 
     def _write_frames(self) -> None:
         """The second thread: writes, and tells."""
-        flushed = True
-        while (item := self._checked.get()) is not None:
+        item, flushed = self._checked.get(), True
+        while True:
             try:
                 if isinstance(item, Exception):
                     raise item
                 if self._failure is None:
                     self._busy_since = time.monotonic()
-                    if not isinstance(item, threading.Event):
+                    if isinstance(item, tuple):
                         self._write(*item)
                         flushed = False
-                    if not flushed and (isinstance(item, threading.Event) or self._nothing_waits):
+                    if not flushed and (self._nothing_waits or not isinstance(item, tuple)):
                         self._writer.flush()
                         flushed = True
             except Exception as error:
@@ -261,8 +261,11 @@ class Recorder:
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
             self._busy_since = math.inf
+            if item is None:
+                return
             if isinstance(item, threading.Event):
                 item.set()
+            item = self._checked.get()
 
     @property
     def _nothing_waits(self) -> bool:
