@@ -89,12 +89,12 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             if slabs[-1].own.stop != rows:
                 raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {rows}.")
             refuse_slabs(options.partial, slabs, needs, allowed)
-    compared = not needs.method.traits.direct and options.target.report is not None
-    scratch = 0 if fits else needs.line_integrals + ((options.partial is None) + compared) * needs.volume
+    output, meanwhile = (needs.volume, 0) if fits else options.disk(needs.volume)
+    scratch = 0 if fits else needs.line_integrals + meanwhile
     free = shutil.disk_usage(options.target.output.parent).free
-    if scratch + needs.volume > free:
+    if scratch + output > free:
         raise DataError(
-            f"{options.target.output.parent} has {size(free)}, and {size(scratch + needs.volume)} are needed. Write "
+            f"{options.target.output.parent} has {size(free)}, and {size(scratch + output)} are needed. Write "
             f"with -o to another disk, or give --bin {2 * options.selection.binning}."
         )
     shape = Grid.matching(needs.geometry).shape
@@ -105,6 +105,6 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     height = slabs[0].own.stop
     return Estimate(
         options.method.name, needs.geometry.n_views, shape, needs.at_once, allowed,
-        needs.at_once if fits else max(needs.slab(height), needs.least), len(left), done, scratch, needs.volume, free,
+        needs.at_once if fits else max(needs.slab(height), needs.least), len(left), done, scratch, output, free,
         seconds,
     )  # fmt: skip

@@ -12,6 +12,7 @@ from beamline.reconstruct.region import Region, selection_around
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.partial_volume import completes
 from recon.assess.plans import Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Method
@@ -69,6 +70,19 @@ class ReconOptions:
     partial: Path | None = None
     command: str = ""
     recipe: str = ""
+
+    @property
+    def completes(self) -> bool:
+        """Whether a volume that is made in slabs becomes the output where it lies."""
+        return self.region is None and completes(self.target.output)
+
+    def disk(self, volume: int) -> tuple[int, int]:
+        """Bytes on the disk for the result of a volume of so many, in slabs, and for what lies there meanwhile."""
+        compared = self.target.report is not None and not self.method.traits.direct
+        slabs = self.partial is None  # else they are there
+        if self.completes:
+            return slabs * volume, compared * volume
+        return volume, (slabs + compared) * volume
 
     def around_region(self, source: ScanSource) -> ReconOptions:
         """The same with the rows that show the region; the same options where all of the volume is wanted.

@@ -23,6 +23,7 @@ from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
+from beamline.storage.writers.partial_volume import complete
 from beamline.storage.writers.recon_file import ReconRecord, Value
 from drivers.clock import Clock
 from recon.base.volume import Grid, Volume
@@ -88,8 +89,12 @@ def write_result(
     context: ReportContext,
     sink: Sink,
     clock: Clock,
+    lies_in: Path | None = None,
 ) -> dict[str, float]:
     """Measure the volume, write its file and the report, and send the event `done`. Returns the metrics.
+
+    Args:
+        lies_in: the partial volume that becomes the output as it is; None: the volume is written.
 
     Raises:
         DataError: a result could not be written; neither is left where one fails.
@@ -140,14 +145,18 @@ def write_result(
         metrics=own,
         history=history_arrays(made.history),
     )
-    write_volume(target.output, record, replace=target.replace)
     if target.report is not None:
         page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
-        try:
-            write_report(target.report, page, replace=target.replace)
-        except BaseException:
-            remove(target.output)
-            raise
+        write_report(target.report, page, replace=target.replace)
+    try:
+        if lies_in is None:
+            write_volume(target.output, record, replace=target.replace)
+        else:
+            complete(lies_in, record, target.output, replace=target.replace)
+    except BaseException:
+        if target.report is not None:
+            remove(target.report)
+        raise
     summary: dict[str, Any] = {
         "output": target.output,
         "report": target.report,

@@ -132,7 +132,19 @@ def never_close(file: h5py.File) -> None:
 @contextmanager
 def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[h5py.File]:
     """A new file, closed at the end. OSError where the disk does not take it: then it is never closed, see above."""
-    file = h5py.File(path, "x", libver=libver)
+    with _closed(h5py.File(path, "x", libver=libver), path) as file:
+        yield file
+
+
+@contextmanager
+def changed(path: Path) -> Iterator[h5py.File]:
+    """The same of a file that is there."""
+    with _closed(h5py.File(path, "r+"), path) as file:
+        yield file
+
+
+@contextmanager
+def _closed(file: h5py.File, path: Path) -> Iterator[h5py.File]:
     try:
         yield file
         file.close()

@@ -8,6 +8,8 @@ added by half is taken out again when the file is opened.
 from __future__ import annotations
 
 import json
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import refuse_existing, whole_file
 from beamline.storage import hdf5
 from beamline.storage.scratch import reserve
 from beamline.storage.writer_lock import WriterLock, held
-from beamline.storage.writers.recon_file import ReconRecord, Value, value_of, write_record
+from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, Value, rewrite_facts, value_of, write_record
 from recon.base.slabs import Slab
 
 _SLABS = "entry/reconstruction/slabs"
@@ -112,15 +114,14 @@ def create_partial(
             with h5py.File(partial, "r+") as file:
                 file.create_dataset(_PLACES["done_text"], (), "S40", data=f"0 of {nz} slices".encode())
                 file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
-                deepest = max(1, *(len(_shared(slab)) for slab in slabs))
-                file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)[-1, -1, -1] = (
-                    0  # allocates it
-                )
                 group = file[_SLABS]
                 group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
                 group["kept"] = json.dumps(kept, default=_plain)
                 for name, value in made_from.items():
                     group[f"made_from/{name}"] = value
+                deepest = max(1, *(len(_shared(slab)) for slab in slabs))
+                shared = file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)
+                shared[-1, -1, -1] = 0  # which allocates it, at the end: HDF5 cuts it off when it goes
             with partial.open("r+b") as whole:
                 reserve(whole.fileno(), partial.stat().st_size, path.parent)
         except OSError as error:
@@ -150,6 +151,60 @@ def open_partial(path: Path) -> PartialVolume:
     return found
 
 
+def completes(target: Path) -> bool:
+    """Whether a partial volume can become `target` where it lies: of that format; Windows renames no file in use."""
+    return target.suffix.lower() in SUFFIXES and sys.platform != "win32"
+
+
+def complete(path: Path, record: ReconRecord, target: Path, *, replace: bool = False) -> None:
+    """A partial volume with all its slabs becomes the reconstruction file `target` of `record`; no voxel is copied.
+
+    Raises:
+        DataError: `target` exists and `replace` is not set, or the disk refuses; the partial volume stays.
+    """
+    if not replace:
+        refuse_existing(target)
+    _save_structure(path)
+    try:
+        rewrite_facts(path, record)
+        _structure_of(path).unlink()
+        path.replace(target)
+    except OSError as error:
+        _put_back(path)
+        raise DataError(
+            f"{target} could not be written ({hdf5.reason(error)}). Check the disk; {path} keeps the slabs."
+        ) from error
+
+
+def _structure_of(path: Path) -> Path:
+    """Where all of a partial volume but its voxels is kept while that is rewritten."""
+    return path.with_name(f".{path.name}.structure")
+
+
+def _save_structure(path: Path) -> None:
+    with hdf5.readable(path), h5py.File(path, "r") as file:
+        volume = file[_PLACES["volume"]]
+        first, end = volume.id.get_offset(), volume.id.get_offset() + volume.id.get_storage_size()
+    with whole_file(_structure_of(path), replace=True) as saved, path.open("rb") as source, saved.open("wb") as out:
+        out.write(first.to_bytes(8, "little") + end.to_bytes(8, "little") + source.read(first))
+        source.seek(end)
+        shutil.copyfileobj(source, out)
+
+
+def _put_back(path: Path) -> None:
+    """Undo a completion that was cut short, if there was one."""
+    saved = _structure_of(path)
+    if not saved.is_file():
+        return
+    with saved.open("rb") as source, path.open("r+b") as out:
+        first, end = (int.from_bytes(source.read(8), "little") for _ in range(2))
+        out.write(source.read(first))
+        out.seek(end)
+        shutil.copyfileobj(source, out)
+        out.truncate()
+    saved.unlink()
+
+
 def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
     """All slabs, and those that are not finished, of a file that stays as it is.
 
@@ -163,6 +218,8 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 
 
 def _refuse_unusable(path: Path) -> None:
+    if path.is_file() and not held(path):
+        _put_back(path)
     if not is_partial(path):
         raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
     if held(path):
@@ -176,7 +233,9 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 
 def is_partial(path: Path) -> bool:
-    """Whether a file is a partial volume, by its content."""
+    """Whether a file is a partial volume, by its content; also one whose completion was cut short."""
+    if _structure_of(path).is_file():
+        return True
     if not path.is_file() or not hdf5.is_hdf5(path):
         return False
     try:

@@ -21,6 +21,7 @@ from beamline.storage import hdf5
 from recon.base.volume import Grid, Volume
 
 DEFINITION = "NXtomoproc"
+SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
 Value = str | int | float | bool | NDArray[Any]
 
@@ -77,8 +78,36 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
         file.attrs["default"] = "entry"
 
 
+def rewrite_facts(path: Path, record: ReconRecord) -> None:
+    """All of a file by `write_record` but its voxels and their places becomes the record's. OSError as there."""
+    with hdf5.changed(path) as file:
+        entry = file["entry"]
+        for name in set(entry) - {"data"}:
+            del entry[name]
+        _write_facts(entry, record)
+
+
 def _write_entry(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
     entry.attrs["default"] = "data"
+    _write_facts(entry, record)
+    data = _group(entry, "data", "NXdata")
+    data.attrs["signal"] = "data"
+    data.attrs["axes"] = ["z", "y", "x"]
+    # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
+    shape = record.volume.grid.shape
+    stored = data.create_dataset("data", shape, np.float32, chunks=None if empty else (1, *shape[1:]))
+    if empty:
+        stored[-1, -1, -1] = 0  # which allocates it
+    for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
+        stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
+    data["data"].attrs["units"] = f"1/{record.length_unit}"
+    data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
+    for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
+        data[name] = centres
+        data[name].attrs["units"] = record.length_unit
+
+
+def _write_facts(entry: h5py.Group, record: ReconRecord) -> None:
     entry["definition"] = DEFINITION
     entry["title"] = record.title
     source = _group(_group(entry, "instrument", "NXinstrument"), "source", "NXsource")
@@ -97,22 +126,6 @@ def _write_entry(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
         node = _group(process, group, "NXcollection")
         for name, value in values.items():
             node[name] = value
-
-    data = _group(entry, "data", "NXdata")
-    data.attrs["signal"] = "data"
-    data.attrs["axes"] = ["z", "y", "x"]
-    # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
-    shape = record.volume.grid.shape
-    stored = data.create_dataset("data", shape, np.float32, chunks=None if empty else (1, *shape[1:]))
-    if empty:
-        stored[-1, -1, -1] = 0  # which allocates it
-    for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
-        stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
-    data["data"].attrs["units"] = f"1/{record.length_unit}"
-    data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
-    for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
-        data[name] = centres
-        data[name].attrs["units"] = record.length_unit
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:

@@ -12,18 +12,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakSet
 
+import h5py
 import numpy as np
 import pytest
 
 from beamline.projections.selection import Selection
-from beamline.reconstruct import estimate
+from beamline.reconstruct import estimate, result
 from beamline.reconstruct import slabs as module
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
 from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers import partial_volume
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
-from beamline.storage.writers.recon_file import read_reconstruction
+from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from recon.run_time import Extent
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -82,6 +84,39 @@ def test_resumed_is_uninterrupted_to_the_bit(folder: Path, monkeypatch: pytest.M
     assert parts.parameters["resumed_from"] == "parts.partial.h5"
     assert "--resume" not in str(parts.parameters["command"])  # the file is gone
     assert left(folder) == {"scan.h5", "whole.h5", "parts.h5"}
+
+
+def test_the_partial_volume_becomes_the_output_where_it_lies(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(result, "write_volume", None)
+    assert beamline(*FISTA, "-o", "out.h5").exit_code == 0
+    assert left(folder) == {"scan.h5", "out.h5"} and beamline("validate", "out.h5").exit_code == 0
+    found = read_reconstruction(Path("out.h5"))
+    assert found.metrics["residual"] > 0 and found.parameters["slabs"] == 3 and "partial" not in found.parameters
+    assert Path("out.h5").stat().st_size < found.volume.data.nbytes * 1.2  # not with slices that slabs shared
+
+
+@pytest.mark.parametrize("error", [OSError("the disk is full"), KeyboardInterrupt()])
+def test_a_volume_that_could_not_be_completed_is_resumed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    """After KeyboardInterrupt the file is as after a kill."""
+
+    def fail(path: Path, record: ReconRecord) -> None:
+        with h5py.File(path, "r+") as file:
+            del file["entry/reconstruction"]
+            file["entry/filled"] = np.ones(1000)
+        raise error
+
+    assert beamline(*FISTA, "-o", "whole.h5").exit_code == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(partial_volume, "rewrite_facts", fail)
+        failed = beamline(*FISTA, "-o", "parts.h5")
+    assert failed.exit_code == (5 if isinstance(error, OSError) else 4) and not Path("parts.h5").exists()
+    resumed = beamline(*FISTA, "-o", "parts.h5", "--resume", "parts.partial.h5")
+    assert resumed.exit_code == 0 and "96 of 96 slices are there." in resumed.stderr, resumed.output
+    assert left(folder) == {"scan.h5", "whole.h5", "parts.h5"}
+    whole, parts = (read_reconstruction(Path(name)) for name in ("whole.h5", "parts.h5"))
+    np.testing.assert_array_equal(parts.volume.data, whole.volume.data)
 
 
 def test_other_data_or_options_are_refused_and_nothing_is_touched(
