@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -97,6 +98,27 @@ def test_the_transpose_is_exact_at_a_working_size(cone: bool, rng: np.random.Gen
     assert left == pytest.approx(np.vdot(volume.astype(np.float64), projector.adjoint(views)), rel=1e-7)
     np.testing.assert_array_equal(projector.forward(volume), forward)  # no race: the same bits again
     np.testing.assert_array_equal(projector.subset([30, 2]).forward(volume), forward[[30, 2]])
+
+
+def test_tiles_make_no_difference(rng: np.random.Generator) -> None:
+    """Rays through many tiles, along their edges too, more slices than a job takes: the explicit matrix, whatever the
+    number of threads, to the bit."""
+    geometry = Geometry.parallel([0.0, np.pi / 2, np.pi / 4, 0.3, 1.2, 2.0, 2.9], (75, 84), 1.0, 42.5)
+    projector, matrix = Projector(geometry, Grid((75, 97, 66))), system_matrix(geometry.rows(0, 1), Grid((1, 97, 66)))
+    volume = rng.random(projector.grid.shape, dtype=np.float32)
+    views = rng.random(projector.projection_shape, dtype=np.float32)
+    forward, adjoint = projector.forward(volume), projector.adjoint(views)
+    expected = matrix @ volume.reshape(75, -1).T
+    np.testing.assert_allclose(forward.swapaxes(1, 2).reshape(-1, 75), expected, rtol=2e-6, atol=2e-6 * expected.max())
+    expected = matrix.T @ views.swapaxes(1, 2).reshape(-1, 75)
+    np.testing.assert_allclose(adjoint.reshape(75, -1).T, expected, rtol=2e-6, atol=2e-6 * expected.max())
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        np.testing.assert_array_equal(projector.forward(volume), forward)
+        np.testing.assert_array_equal(projector.adjoint(views), adjoint)
+    finally:
+        numba.set_num_threads(threads)
 
 
 @given(
