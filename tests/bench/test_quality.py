@@ -27,6 +27,7 @@ from tests.bench.quality_cases import OBJECTS, SLABS, Case, cone, dense_battery,
 
 F32 = NDArray[np.float32]
 FACTOR = 2.0
+EFFORTS = ((25, 2), (50, 4), (100, 4), (100, 8), (200, 8), (400, 8))  # steps of a fit, sweeps of its finish
 
 
 class Table:
@@ -61,26 +62,32 @@ def best_weight(quality: Callable[[float], float], start: float) -> None:
         found[further] = quality(further)
 
 
-def _compare(case: Case) -> Table:
-    """FBP, total variation by default and at its best, and R²-Gaussian by default."""
-    data, geometry, grid = case.projections, case.geometry, case.grid
+def _made(case: Case, method: recon.Method) -> Callable[[], F32]:
+    return lambda: recon.reconstruct(case.projections, case.geometry, method, grid=case.grid).volume.data
+
+
+def _peers(case: Case) -> Table:
+    """Total variation by default and at its best."""
     peers = ("FISTA-TV", FistaTv(), 3e-4), ("OS-SIRT-TV", OsSirtTv(), 0.004)
     for method in (recon.R2(), *(how for _, how, _ in peers)):
-        warm_up(method, geometry)
+        warm_up(method, case.geometry)
     table = Table(case)
-
-    def made(method: recon.Method) -> Callable[[], F32]:
-        return lambda: recon.reconstruct(data, geometry, method, grid=grid).volume.data
-
-    table.add("FBP, hann", made(recon.Fbp(filter="hann")))
     for name, how, start in peers:
-        table.add(f"{name}, default", made(how))
-        best_weight(
-            lambda w, name=name, how=how: table.add(f"{name}, weight {w:.2g}", made(replace(how, tv_weight=w))),  # type: ignore[misc]
-            start,
-        )
-    table.add("R²-Gaussian, default", made(recon.R2()))
-    name, peer = table.best(*(name for name, _, _ in peers))
+        table.add(f"{name}, default", _made(case, how))
+
+        def quality(weight: float, name: str = name, how: FistaTv | OsSirtTv = how) -> float:
+            return table.add(f"{name}, weight {weight:.2g}", _made(case, replace(how, tv_weight=weight)))
+
+        best_weight(quality, start)
+    return table
+
+
+def _compare(case: Case) -> Table:
+    """FBP, total variation by default and at its best, and R²-Gaussian by default."""
+    table = _peers(case)
+    table.add("FBP, hann", _made(case, recon.Fbp(filter="hann")))
+    table.add("R²-Gaussian, default", _made(case, recon.R2()))
+    name, peer = table.best("FISTA", "OS")
     _, ours = table.best("R²")
     print(f"  R²-Gaussian - {name}: {ours[0] - peer[0]:+.2f} dB in {ours[3] / peer[3]:.2f} of its CPU time", flush=True)
     return table
@@ -140,3 +147,22 @@ def test_the_teapot_at_full_size_against_the_published_figures(shared_data: Path
             lambda fit=fit: recon.reconstruct(case.projections, case.geometry, fit, grid=case.grid).volume.data,
         )
     assert table.best("R²")[1][0] > published - 1
+
+
+@pytest.mark.bench
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [*((slab, name) for name in SLABS), *((cone, name) for name in OBJECTS), (dense_battery, "")],
+)
+def test_time_to_the_quality_of_total_variation(shared_data: Path, make: Callable[..., Case], name: str) -> None:
+    """The first of EFFORTS that is as good as the best of total variation, and its share of that one's CPU time."""
+    cases = {slab: (shared_data, name, 50), cone: (shared_data, name, 25, 128), dense_battery: (45,)}
+    table = _peers(make(*cases[make]))
+    peer, (quality, _, _, seconds) = table.best("FISTA", "OS")
+    for steps, sweeps in EFFORTS:
+        ours = f"R²-Gaussian, {steps} steps, {sweeps} sweeps"
+        if table.add(ours, _made(table.case, recon.R2(steps=steps, finish=sweeps))) >= quality:
+            print(f"  as good as {peer} in {table.rows[ours][3] / seconds:.2f} of its CPU time", flush=True)
+            return
+    print(f"  not as good as {peer}", flush=True)
