@@ -143,16 +143,39 @@ def _entropy(histogram: NDArray[Any]) -> float:
 
 
 @numba.njit(nogil=True, cache=True)
-def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: ignore[no-untyped-def]  # numba infers the types
+def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers the types
+    """Sums and largest values of `side` neighbours each, from those of `side` rows: pairs of pairs while `side` is even
+    (and their sums fit into 32 bits), which the compiler makes vector instructions of."""
+    width = 1
+    while side % (2 * width) == 0 and 2 * width * side <= 65536:
+        n = sums.size // 2
+        pairs, highest = np.empty(n, np.uint32), np.empty(n, np.uint16)
+        for i in range(n):
+            pairs[i] = sums[2 * i] + sums[2 * i + 1]
+        for i in range(n):
+            highest[i] = max(tops[2 * i], tops[2 * i + 1])
+        sums, tops, width = pairs, highest, 2 * width
+    each = side // width
+    parts, most = np.zeros(sums.size // each, np.uint64), np.zeros(sums.size // each, np.uint16)
+    for block in range(parts.size):
+        for i in range(block * each, (block + 1) * each):
+            parts[block] += np.uint64(sums[i])
+            most[block] = max(most[block], tops[i])
+    return parts, most
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: ignore[no-untyped-def]
     """(minimum, maximum, sum, sum of squares, pixels from `full` on, histogram of every k-th row).
 
     Fills preview and peaks. Short loops over one line each: the compiler makes vector instructions of all but the
-    histogram's.
+    histogram's; a check for a division by zero would forbid them.
     """
     rows, cols = image.shape
     # Two histograms by turns: neighbours are often equal, and an increment must not wait for the one before it.
     histogram = np.zeros((2, 65536), np.uint32)
-    sums, tops = np.empty(cols, np.uint32), np.empty(cols, np.uint16)
+    across = preview.shape[1]
+    sums, tops = np.zeros(across * preview_bin, np.uint32), np.zeros(across * preview_bin, np.uint16)  # whole blocks
     least = np.full(cols, 65535, np.uint16)
     high = np.uint16(0)
     total, squares, saturated = np.uint64(0), np.uint64(0), np.int64(0)
@@ -174,19 +197,20 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: igno
                     histogram[1, line[col + 1]] += np.uint32(1)
                 if cols & 1:
                     histogram[0, line[cols - 1]] += np.uint32(1)
-        for block_col in range(preview.shape[1]):
-            left, right = block_col * preview_bin, min((block_col + 1) * preview_bin, cols)
-            part, most = np.uint64(0), np.uint16(0)
-            for col in range(left, right):
-                part += np.uint64(sums[col])
-                most = max(most, tops[col])
-            high, peaks[block, block_col] = max(high, most), most
-            if most >= full:
-                for row in range(first, last):
-                    for col in range(left, right):
-                        saturated += image[row, col] >= full
-            preview[block, block_col] = part / ((right - left) * (last - first))
+        parts, most = _folded(sums, tops, preview_bin)
+        for part in parts:
             total += part
+        pixels, at_edge = preview_bin * (last - first), (cols - (across - 1) * preview_bin) * (last - first)
+        for at in range(across):
+            preview[block, at] = np.float64(parts[at]) / np.float64(pixels)
+        preview[block, across - 1] = np.float64(parts[across - 1]) / np.float64(at_edge)
+        peaks[block] = most
+        top = most.max()
+        high = max(high, top)
+        if top >= full:
+            for row in range(first, last):
+                for col in range(cols):
+                    saturated += image[row, col] >= full
     return int(least.min()), int(high), total, squares, saturated, histogram.sum(0).astype(np.int64)
 
 
