@@ -127,6 +127,7 @@ def region_of(text: str) -> Region:
     "_METHOD.h5, in this folder.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
+@click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
 @click.option(
     "--enough-loss",
@@ -192,6 +193,7 @@ def recon(
     truth: str | None,
     output: Path | None,
     report: bool,
+    pdf: bool,
     follow: bool,
     enough_loss: float | None,
     enough_gain: float | None,
@@ -245,9 +247,9 @@ def recon(
         raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
-    refuse_shared(
-        {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint, "--resume": resume, "--log": log}
-    )
+    sheet = output.with_suffix(".pdf") if pdf else None
+    files = {"FILE": file, "--output": output, "report": page, "--pdf": sheet, "--checkpoint": checkpoint}
+    refuse_shared({**files, "--resume": resume, "--log": log})
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
     if cluster is not None and (follow or budget is not None):
         raise click.UsageError("--cluster does not go with --follow or --budget, which hold everything in memory.")
@@ -260,7 +262,7 @@ def recon(
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=source,
-        target=OutputPaths(output, page),
+        target=OutputPaths(output, page, pdf=sheet),
         selection=selection,
         method=method_with(method, {**settings, "filter": ramp}),
         budget=budget,

@@ -20,6 +20,7 @@ from beamline.reconstruct.measure import measure, regions
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.reconstruct.remarks import hiding_warning, odd_views_warning
 from beamline.report.html import write_report
+from beamline.report.logbook import write_logbook
 from beamline.report.record import history_arrays
 from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
@@ -35,11 +36,13 @@ from recon.voxels.unexplained import unexplained
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results."""
+    """Where results go. `report` and `pdf` (a logbook page) are None where none is wanted; `replace` takes the place of
+    older results."""
 
     output: Path
     report: Path | None
     replace: bool = False
+    pdf: Path | None = None
 
     @property
     def partial(self) -> Path:
@@ -57,9 +60,9 @@ class OutputPaths:
     def refuse_existing(self) -> None:
         """Raise DataError before any work where a result is in the way, or its folder cannot be written to."""
         if not self.replace:
-            refuse_existing(self.output)
-            if self.report is not None:
-                refuse_existing(self.report)
+            for path in (self.output, self.report, self.pdf):
+                if path is not None:
+                    refuse_existing(path)
         try:
             with tempfile.TemporaryFile(dir=self.output.parent):
                 pass
@@ -145,21 +148,28 @@ def write_result(
         metrics=own,
         history=history_arrays(made.history),
     )
-    if target.report is not None:
-        page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
-        write_report(target.report, page, replace=target.replace)
+    pages: list[Path] = []
     try:
+        if target.report is not None or target.pdf is not None:
+            page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
+        if target.report is not None:
+            write_report(target.report, page, replace=target.replace)
+            pages.append(target.report)
+        if target.pdf is not None:
+            write_logbook(target.pdf, page, record.volume, prepared.length_unit, clock.now(), replace=target.replace)
+            pages.append(target.pdf)
         if lies_in is None:
             write_volume(target.output, record, replace=target.replace)
         else:
             complete(lies_in, record, target.output, replace=target.replace)
     except BaseException:
-        if target.report is not None:
-            remove(target.report)
+        for written in pages:
+            remove(written)
         raise
     summary: dict[str, Any] = {
         "output": target.output,
         "report": target.report,
+        **({} if target.pdf is None else {"pdf": target.pdf}),
         "method": made.method,
         "axis_col": prepared.axis_col,
         "n_views": prepared.geometry.n_views,

@@ -82,6 +82,12 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     return png(figure)
 
 
+def planes(grid: Grid) -> list[tuple[str, str, Window, Window]]:
+    """Of slices at one z, y and x: the axes to the right and up (z: down), and their edges."""
+    z, y, x = (_edges(grid.centre[i], grid.shape[i], grid.voxel_size) for i in range(3))
+    return [("x", "y", x, y), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
+
+
 def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Window = (1.0, 99.5)) -> bytes:
     """Three orthogonal slices through each volume, side by side in one grey window; z downwards, as the camera sees it.
 
@@ -102,10 +108,8 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
     size = (1.2 + column * len(volumes), 0.9 + (column - 0.35) * sum(heights) + 0.33 * len(heights))
     figure = Figure(figsize=size, dpi=dpi_for(nx, column - 0.35), layout="constrained")
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
-    z, y, x = (_edges(first.centre[i], first.shape[i], first.voxel_size) for i in range(3))
-    planes = (("x", "y", x, y), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1]))
     for j, (name, images) in enumerate(slices.items()):
-        for i, (image, (across, up, h_edges, v_edges)) in enumerate(zip(images, planes, strict=True)):
+        for i, (image, (across, up, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
             axes = panels[i][j]
             thin = image.shape[0] < _THIN * image.shape[1]
             shown = axes.imshow(
