@@ -40,7 +40,7 @@ def window_of(text: str) -> tuple[float, float]:
     metavar="PATH",
     callback=parsed(volume_path),
     required=True,
-    help="Its suffix names the format: .tif, .npy, .nrrd, .h5, or none: a folder of TIFFs.",
+    help="Its suffix names the format: .tif, .npy, .nrrd, .zarr, .h5, or none: a folder of TIFFs.",
 )
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values.")
 @click.option(
@@ -54,7 +54,7 @@ def window_of(text: str) -> tuple[float, float]:
 def export(
     volume: Path, output: Path, bits: str, window: tuple[float, float] | None, dataset: str | None, as_json: bool
 ) -> None:
-    """Copy VOLUME to another format: TIFF (BigTIFF from 2 GiB on), a folder of TIFFs, NRRD, npy or NXtomoproc.
+    """Copy VOLUME to another format: TIFF (BigTIFF from 2 GiB on), folder of TIFFs, NRRD, npy, OME-Zarr or NXtomoproc.
 
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
     Nothing is overwritten, and a failure leaves nothing.

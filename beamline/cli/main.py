@@ -51,7 +51,9 @@ _COMMANDS = {
     "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor."),
     "ingest": _Entry("files", "Convert a multi-page TIFF into an HDF5 scan, page by page."),
-    "export": _Entry("export", "Copy a volume to another format: TIFF, npy, NRRD, with grey values if wanted."),
+    "export": _Entry(
+        "export", "Copy a volume to another format: TIFF, npy, NRRD, OME-Zarr, with grey values if wanted."
+    ),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema."),
 }
 

@@ -123,8 +123,8 @@ def region_of(text: str) -> Region:
     "--output",
     metavar="PATH",
     callback=parsed(volume_path),
-    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, or no suffix: a folder of TIFFs. Default: FILE's stem + "
-    "_METHOD.h5, in this folder.",
+    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, .zarr, or no suffix: a folder of TIFFs. Default: FILE's "
+    "stem + _METHOD.h5, in this folder.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
 @click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")

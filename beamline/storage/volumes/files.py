@@ -14,14 +14,13 @@ from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import SUFFIXES, read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record
 from beamline.storage.volumes.nxtomoproc import NXtomoproc
+from beamline.storage.volumes.ome_zarr import OmeZarr
 from beamline.storage.volumes.plain import Npy, Nrrd
 from beamline.storage.volumes.tiff import TiffFile, TiffFolder
 from beamline.storage.writers.recon_file import ReconRecord
 
-FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffFile(), TiffFolder(), Npy(), Nrrd())
+FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffFile(), TiffFolder(), Npy(), Nrrd(), OmeZarr())
 """Every format that volumes are written in."""
-
-_ZARR = (".zarr", ".ome")
 
 
 def format_of(path: Path) -> VolumeFormat:
@@ -36,10 +35,7 @@ def format_of(path: Path) -> VolumeFormat:
     found = next((kind for kind in FORMATS if suffix in kind.suffixes), None)
     if found is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in FORMATS)
-        why = " OME-Zarr is not written, as no library of this program does it." if suffix in _ZARR else ""
-        raise ValueError(
-            f"{str(path)!r}: the suffix names the format of a volume, and {suffix!r} is none of {known}.{why}"
-        )
+        raise ValueError(f"{str(path)!r}: the suffix names the format of a volume, and {suffix!r} is none of {known}.")
     return found
 
 

@@ -58,7 +58,6 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "code", "said"),
     [
-        (["-o", "v.zarr"], 2, "OME-Zarr is not written"),
         (["-o", "v.png"], 2, "'.png' is none of"),
         (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
         (["-o", "no/v.tif"], 5, "does not exist"),

@@ -94,7 +94,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "no file": ({}, ["-o", "."], 2, "names no file"),
     "nameless": ({}, ["-o", ""], 2, "names no file"),
     "a page": ({}, ["-o", "out.html"], 2, "'.html' is none of .h5"),
-    "a format that is not written": ({}, ["-o", "out.zarr"], 2, "OME-Zarr is not written"),
+    "a format that is not written": ({}, ["-o", "out.vtk"], 2, "'.vtk' is none of .h5"),
     "a version for a suffix": ({}, ["-o", "out_v1.2"], 2, "'.2' is none of"),
     "a file for a folder": ({}, ["-o", "scan.npy"], 5, "never overwritten"),
     "method misspelt": ({}, ["--method", "r3"], 2, "r3"),
