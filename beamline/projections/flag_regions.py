@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.flag_legend import FlagBit, FrameFlags
 from recon.base.binning import bin_views
+from recon.prep.resample import Resampling
 
 WARNED_SHARE = 0.5
 """Weight of a ray in the region of a warning."""
@@ -28,12 +29,14 @@ class Regions:
         boxes: int64 [region, 4], first row, row after the last, first column, column after the last.
         shares: float32 [region], what the rays in it weigh.
         local: bool [frame of the file], every flag of the frame is of a part of it.
+        resampling: of the views, whose pixels were seen elsewhere; None: of none.
     """
 
     frames: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     boxes: I64 = field(default_factory=lambda: np.zeros((0, 4), np.int64))
     shares: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     local: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    resampling: Resampling | None = None
 
     def mark(self, view_ids: I64) -> bool:
         """Whether a ray of these views weighs less."""
@@ -52,10 +55,16 @@ class Regions:
             return None
         height, width = shape
         weights = np.ones((view_ids.size, height, width), np.float32)
+        seen = None if self.resampling is None else self.resampling.places(shape, rows.start)
         at = {int(frame): view for view, frame in enumerate(view_ids)}
         for frame, (top, bottom, left, right), share in zip(
             self.frames[chosen].tolist(), self.boxes[chosen].tolist(), self.shares[chosen].tolist(), strict=True
         ):
+            if seen is not None:
+                row, col = seen
+                inside = (row > top - 1) & (row < bottom) & (col > left - 1) & (col < right)
+                weights[at[frame]][inside] *= share
+                continue
             fine = np.ones((1, height * binning, width * binning), np.float32)
             fine[0, max(top - rows.start, 0) : max(bottom - rows.start, 0), left:right] = share
             weights[at[frame]] *= bin_views(fine, binning)[0]

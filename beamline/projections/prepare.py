@@ -225,7 +225,7 @@ def prepare_projections(
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
     taken, rings = take_rings_out(projections.data, source.angles[projections.view_ids], selection.rings)
-    regions = usable.regions
+    regions = replace(usable.regions, resampling=resampling_of(source, selection))
     shares_of = None
     if spill is not None:
         rows, ids = rows_of(source, selection), projections.view_ids
@@ -358,6 +358,7 @@ def assemble(
     if resampling is not None:
         unknown = unknown | resampling.unseen((shape[0], shape[1]), rows.start)
     unknown = areas(unknown)
+    regions = replace(usable.regions, resampling=resampling)
     return PreparedProjections(
         projections=projections,
         geometry=geometry_of(source, selection, axis_col, source.angles[projections.view_ids]),
@@ -370,7 +371,7 @@ def assemble(
         view_weights=usable.weights_of(projections.view_ids),
         left_out=usable.left_out,
         flags=usable.flags,
-        shares=usable.regions.weights(projections.view_ids, rows, selection.binning, (shape[0], shape[1])),
+        shares=regions.weights(projections.view_ids, rows, selection.binning, (shape[0], shape[1])),
         measured=~unknown if unknown.any() else None,
         tilt_deg=selection.tilt_deg or 0.0,
     )

@@ -111,18 +111,22 @@ class Resampling:
 
     def unseen(self, shape: tuple[int, int], first: int) -> NDArray[np.bool_]:
         """Pixels [row, col] of views that begin at row `first`, which the detector did not see."""
-        rows, cols = self._places(shape, first)
-        rows += first / self.binning
-        high, wide = (n // self.binning for n in self.shape)
+        rows, cols = self.places(shape, first)
+        high, wide = self.shape
         return (rows < -0.5) | (rows > high - 0.5) | (cols < -0.5) | (cols > wide - 0.5)
+
+    def places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
+        """(row, col) on the detector, each [row, col], at which the pixels of views that begin at row `first` were
+        seen."""
+        rows, cols = (np.arange(length) * self.binning + (self.binning - 1) / 2 for length in shape[-2:])
+        col, row = self._seen_at(*np.meshgrid(cols, rows + first))
+        return row, col
 
     def _places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
         """(row, col) in the views given, of each of their new pixels."""
-        n = self.binning
-        middle = (n - 1) / 2
-        rows, cols = (np.arange(length) * n + middle for length in shape)
-        col, row = self._seen_at(*np.meshgrid(cols, rows + first))
-        return (row - middle) / n - first / n, (col - middle) / n
+        row, col = self.places(shape, first)
+        middle = (self.binning - 1) / 2
+        return (row - middle) / self.binning - first / self.binning, (col - middle) / self.binning
 
     def _seen_at(self, col: F64, row: F64) -> tuple[F64, F64]:
         middle_row, middle_col = ((n - 1) / 2 for n in self.shape)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
@@ -16,6 +18,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import SourceOptions
 from recon.prep.correct import CorrectionSettings
+from recon.prep.resample import Resampling
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 NAME, OTHER = CHECKS[0].name, CHECKS[1].name
@@ -48,6 +51,23 @@ def test_rows_that_are_chosen_and_binned_pixels_take_their_part() -> None:
     np.testing.assert_allclose(weights[0, :2, 4], 0.5)
     np.testing.assert_allclose(weights[0, 2:], 1)
     assert regions.weights(np.array([1, 2]), slice(5, 13), 2, (4, 20)) is None
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_a_region_of_views_that_are_turned_lies_where_its_pixels_went(binning: int) -> None:
+    resampling = Resampling(SHAPE, 0.2, binning=binning)
+    plain = regions_of(found(flag(3, (4, 12, 22, 32), Level.ALARM)), SHAPE)
+    shape = SHAPE[0] // binning, SHAPE[1] // binning
+    straight = plain.weights(np.array([3]), slice(0, 20), binning, shape)
+    turned = replace(plain, resampling=resampling).weights(np.array([3]), slice(0, 20), binning, shape)
+    assert straight is not None and turned is not None
+    there = straight.copy()
+    resampling.apply(there, 0)
+    assert not turned[there < 0.5].any()  # none of the region is missed, and nothing away from it is taken
+    assert (turned[0][ndimage.minimum_filter(there[0], 3) > 0.5] == 1).all()
+    some = replace(plain, resampling=resampling).weights(np.array([3]), slice(4, 12), binning, (8 // binning, shape[1]))
+    assert some is not None
+    np.testing.assert_array_equal(some, turned[:, 4 // binning : 12 // binning])
 
 
 def test_views_marked_later_take_the_line_of_those_after_them() -> None:
