@@ -24,6 +24,7 @@ import serial
 
 from beamline.config.load import Config, config_folder, load
 from beamline.core.events import Event
+from beamline.core.stop import StopRequest
 from beamline.instrument.connect import Instrument, connect
 from beamline.scan import run as run_module
 from beamline.scan.recorder import Recorder
@@ -159,6 +160,8 @@ class Cable:
     Attributes:
         spoilt: a reply was spoilt, or the cable came out.
         last_request: what the host sent last.
+        at_request: number of a request, from 0 -> what happens just before it.
+        dead: the cable is out.
     """
 
     def __init__(self, kind: Kind, controller: Any) -> None:
@@ -169,6 +172,8 @@ class Cable:
 
     def repair(self) -> None:
         self.phase, self.spoilt = Phase.OPENING, False
+        self.at_request: dict[int, Callable[[], object]] = {}
+        self._requests = 0
         self._at: Phase | None = None
         self._spoil: Spoil | None = None
         self._due = self._out_of_socket = False
@@ -185,8 +190,18 @@ class Cable:
         """It comes out now."""
         self._out_of_socket = True
 
+    @property
+    def dead(self) -> bool:
+        return self._out_of_socket
+
+    def plug(self) -> None:
+        """It is put in again."""
+        self._out_of_socket = False
+
     def receive(self, data: bytes) -> None:
         self._watch(data)
+        self.at_request.get(self._requests, lambda: None)()
+        self._requests += 1
         if self._at is self.phase:
             self._at = None
             self._due = self._spoil is not None
@@ -345,13 +360,14 @@ class Rig:
         devices = f"devices.stage={{{stage}}}", f"devices.shutter={{kind: {shutter}}}", f"devices.camera={{{camera}}}"
         return _instrument(*devices, *SMALL, *overrides)
 
-    def scan(self, runs: Path, *overrides: str) -> Scanned:
+    def scan(self, runs: Path, *overrides: str, stop: StopRequest | None = None) -> Scanned:
         """A whole scan: devices opened, run, closed."""
         runs.mkdir(exist_ok=True)
         before = set(runs.iterdir())
         scanned = Scanned(None, self._sensor)
         try:
-            scanned.result = run_scan(self.config(*overrides), runs, [scanned.events.append], ask=self.asked.append)
+            sinks = [scanned.events.append]
+            scanned.result = run_scan(self.config(*overrides), runs, sinks, stop, ask=self.asked.append)
         except Exception as error:
             scanned.error = error
         scanned.folder = next(iter(set(runs.iterdir()) - before), None)
