@@ -18,9 +18,9 @@ import h5py
 from beamline.config.load import Config, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.scan.preflight import ReadyScan
-from beamline.scan.run_folder import CONFIG, EVENTS, JOINED, SCAN, create_part, parts_of
+from beamline.scan.run_folder import CONFIG, EVENTS, SCAN, create_part, parts_of
 from beamline.storage import hdf5
-from beamline.storage.parts import join, views_in, views_planned
+from beamline.storage.parts import JOINED, join, views_in, views_planned
 from beamline.storage.recover import Recovered, recover
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout

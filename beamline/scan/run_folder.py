@@ -12,7 +12,7 @@ from typing import TextIO
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
-JOINED, PART = "joined.h5", "part-{}"  # of a run that was resumed: the file of all its parts, and the folder of one
+PART = "part-{}"  # of a run that was resumed: the folder of a later part
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:

@@ -24,6 +24,9 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from drivers.frame import FrameKind
 
+JOINED = "joined.h5"
+"""The file of all parts, in the folder of the run, where its first part is."""
+
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = ("/exchange", "/implements", f"{layout.DETECTOR}/image_key_control")
@@ -63,6 +66,22 @@ def join(parts: Sequence[Path], joined: Path) -> int:
                 return _join(files, [os.path.relpath(part, joined.parent) for part in parts], file)
         except hdf5.ALTERED as error:
             raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
+
+
+def joined_from(part: Path) -> tuple[Path, int] | None:
+    """The file that joins this one with other parts of its scan, and how many it joins; None where there is none."""
+    for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
+        joined = folder / JOINED
+        if not joined.is_file():
+            continue
+        try:
+            with hdf5.open_hdf5(joined) as file:
+                names = [source.file_name for source in file[layout.DATA].virtual_sources()]
+        except (DataError, *hdf5.ALTERED):
+            continue
+        if part.resolve() in [(folder / name).resolve() for name in names]:
+            return joined, len(names)
+    return None
 
 
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
+from beamline.storage.parts import joined_from
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
@@ -264,6 +265,13 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "pixel-size", f"A pixel size of {source.pixel_size_mm:g} mm cannot be.")
 
 
+def parts_joined(source: ScanSource) -> Iterator[Finding]:
+    """A part of a scan that was resumed is not all of it."""
+    if (found := joined_from(source.path)) is not None:
+        joined, n = found
+        yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
+
+
 SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     enough_views,
     angles_known,
@@ -274,6 +282,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     pixels_measured,
     series_complete,
     scale_known,
+    parts_joined,
 )
 
 

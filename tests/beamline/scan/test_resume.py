@@ -15,7 +15,7 @@ import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.stop import StopRequest
-from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepare import checked_views, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.scan import control
 from beamline.scan.control import Verb, running, tell
@@ -25,6 +25,7 @@ from beamline.scan.run_folder import parts_of
 from beamline.scan.states import State
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
+from beamline.storage.parts import JOINED, joined_from
 from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.overlay import Overlay
 from beamline.storage.recover import QUIET
@@ -132,7 +133,15 @@ def test_only_the_missing_views_are_taken(tmp_path: Path, monkeypatch: pytest.Mo
         references = (first[layout.KIND][()] != FrameKind.PROJECTION).sum() + 7
     _assert_whole(run / "joined.h5", references)
     assert [finding.severity for finding in validate(run / "joined.h5", lambda done, of: None)] in ([], ["warning"])
+    for part in (run / "scan.h5", run / "part-2/scan.h5"):
+        line = f"This file is one of 2 parts of a scan: {run / 'joined.h5'} has the frames of all."
+        assert describe(part)["findings"].count(line) == 1
+        warned: list[str] = []
+        with open_scan(part) as source:
+            checked_views(source, Selection(accept_references=True), warned.append)
+        assert warned.count(line) == 1
     said = describe(run / "joined.h5")
+    assert not any("parts of a scan" in finding for finding in said["findings"])
     assert said["kinds"]["projection"] == VIEWS
     assert said["attributes"]["status"] == "complete"
     assert (said["missing_triggers"], said["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
@@ -303,3 +312,20 @@ def test_a_file_without_its_plan_is_not_taken_for_a_whole_one(tmp_path: Path, mo
         file["/entry/record/plan"][()] = "{}"
     with pytest.raises(BeamlineError, match="does not hold its plan"):
         _go_on(run)
+
+
+def test_only_a_file_that_is_drawn_from_is_a_part(tmp_path: Path) -> None:
+    first, other = tmp_path / "scan.h5", tmp_path / "other.h5"
+    for path in (first, other):
+        with h5py.File(path, "x") as file:
+            file[layout.DATA] = np.zeros((2, 4, 4), np.uint16)
+    assert joined_from(first) is None
+    (tmp_path / JOINED).write_bytes(b"no HDF5")
+    assert joined_from(first) is None
+    (tmp_path / JOINED).unlink()
+    with h5py.File(tmp_path / JOINED, "x") as file:
+        virtual = h5py.VirtualLayout((2, 4, 4), "u2")
+        virtual[:] = h5py.VirtualSource("scan.h5", layout.DATA, (2, 4, 4))
+        file.create_virtual_dataset(layout.DATA, virtual)
+    assert joined_from(first) == (tmp_path / JOINED, 1)
+    assert joined_from(other) is None and joined_from(tmp_path / JOINED) is None
