@@ -73,7 +73,7 @@ def memory_size(text: str) -> int:
 
 
 def cluster_of(text: str) -> str:
-    """Workers, `local:N` or an address. ValueError for anything else."""
+    """Workers, `local:N`, an address or `slurm:CONFIG`. ValueError for anything else."""
     from beamline.reconstruct.cluster import check_cluster  # here: help needs none of it
 
     check_cluster(text)
@@ -153,10 +153,10 @@ def region_of(text: str) -> Region:
 )
 @click.option(
     "--cluster",
-    metavar="local:N|tcp://HOST:PORT",
+    metavar="local:N|tcp://HOST:PORT|slurm[:CONFIG]",
     callback=parsed(cluster_of),
-    help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, or "
-    "those of a scheduler.",
+    help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
+    "those of a scheduler, or jobs of Slurm by a YAML file.",
 )
 @click.option(
     "--roi",

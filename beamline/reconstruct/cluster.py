@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import BeamlineError, ConfigError
+from beamline.reconstruct.slurm import is_slurm, slurm_jobs, submitted
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, RunControl
@@ -118,11 +119,13 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
 
 
 def check_cluster(spec: str) -> None:
-    """Raises ValueError for what is neither local:N nor an address, and where dask.distributed is not installed."""
+    """Raises ValueError for what names no cluster, and where dask.distributed is not installed."""
     if find_spec("distributed") is None:
         raise ValueError("it needs dask.distributed: pip install splatline[cluster]")
-    if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+", spec):
-        raise ValueError(f"{spec!r} is neither local:N with N workers on this machine, nor tcp://HOST:PORT")
+    if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+|slurm(:.+)?", spec):
+        raise ValueError(
+            f"{spec!r} is neither local:N with N workers on this machine, nor tcp://HOST:PORT, nor slurm[:CONFIG.yaml]"
+        )
 
 
 def local_workers(spec: str | None) -> int:
@@ -130,12 +133,24 @@ def local_workers(spec: str | None) -> int:
     return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0
 
 
+def refuse_unusable(spec: str) -> None:
+    """Raises ConfigError where a cluster cannot be asked for work, before there is any; no jobs are submitted."""
+    if is_slurm(spec):
+        slurm_jobs(spec)
+    elif not local_workers(spec):
+        with connected(spec):
+            pass
+
+
 @contextmanager
 def connected(spec: str, patience: float = _CONNECT_TIMEOUT) -> Iterator[Cluster]:
-    """The cluster that `spec` names; workers on this machine end with the block.
+    """The cluster that `spec` names; workers on this machine and jobs of Slurm end with the block.
+
+    Args:
+        patience: s to wait for the first worker; a configuration of Slurm has its own.
 
     Raises:
-        ConfigError: the scheduler does not answer, or has no workers within 30 s.
+        ConfigError: no scheduler answers, jobs are refused, or no worker comes in time.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -143,25 +158,31 @@ def connected(spec: str, patience: float = _CONNECT_TIMEOUT) -> Iterator[Cluster
     with ExitStack() as closing:
         closing.enter_context(dask.config.set({"distributed.admin.large-graph-warning-threshold": _TASK_SIZE_WARNING}))
         address: Any = spec
+        jobs = slurm_jobs(spec) if is_slurm(spec) else None
         try:
             if n := local_workers(spec):
                 # Without a page on a port, and without a limit of its own: --memory is that of a slab.
                 address = LocalCluster(
-                    n_workers=n,
-                    threads_per_worker=1,
-                    dashboard_address=None,
-                    memory_limit=0,
+                    n_workers=n, threads_per_worker=1, dashboard_address=None, memory_limit=0,
                     silence_logs=logging.ERROR,
-                )
+                )  # fmt: skip
                 closing.enter_context(address)
+            elif jobs is not None:
+                address, patience = closing.enter_context(submitted(jobs)), jobs.wait_s
             client = closing.enter_context(Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False))
         except (OSError, RuntimeError, ValueError) as error:
-            raise ConfigError(f"--cluster {spec}: no scheduler answers ({error}).") from error
+            what = "no scheduler answers" if jobs is None else "the jobs were not submitted"
+            raise ConfigError(f"--cluster {spec}: {what} ({' '.join(str(error).split())}).") from error
         try:
             client.wait_for_workers(1, patience)
         except TimeoutError:
+            advice = (
+                f"Start some: dask worker {spec}." if jobs is None else "See squeue, and wait_s of the configuration."
+            )
             raise ConfigError(
-                f"--cluster {spec}: the scheduler has no workers, and none came in {patience:g} s. Start some: dask "
-                f"worker {spec}."
+                f"--cluster {spec}: the scheduler has no workers, and none came in {patience:g} s. {advice}"
             ) from None
-        yield Cluster(max(1, _count(client)), client)
+        if jobs is not None:
+            yield Cluster(jobs.jobs, client, jobs.wait_s)
+        else:
+            yield Cluster(max(1, _count(client)), client)

@@ -17,7 +17,7 @@ from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
-from beamline.reconstruct.cluster import connected, local_workers
+from beamline.reconstruct.cluster import connected, refuse_unusable
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import corrections_done, progress_events
@@ -57,9 +57,8 @@ def reconstruct_file(
     options.checkpoints.refuse_existing()
     check_device(options.device)
     _refuse_foreign(options)
-    if options.cluster is not None and not local_workers(options.cluster):
-        with connected(options.cluster):  # refused now, not when the scan has been corrected
-            pass
+    if options.cluster is not None:
+        refuse_unusable(options.cluster)  # now, not when the scan has been corrected
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:

@@ -132,7 +132,7 @@ def test_without_any_worker_it_ends_after_the_time_stated() -> None:
             Cluster(1, client, patience=0.2).reconstruct(np.zeros((2, 1, 4), np.float32), views, Sirt(), **rest)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("spec", ["local", "local:0", "slurm", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])
+@pytest.mark.parametrize("spec", ["local", "local:0", "slurm:", "pbs", "tcp://", "tcp://x", "tls://x:1", "http://x:1"])
 def test_what_names_no_workers_is_refused(spec: str) -> None:
     with pytest.raises(ValueError, match="neither local:N"):
         check_cluster(spec)

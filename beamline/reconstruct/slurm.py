@@ -1,0 +1,98 @@
+"""Slurm: jobs whose workers reconstruct slabs, by dask-jobqueue."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
+
+from beamline.config.section import Section
+from beamline.core.errors import ConfigError
+
+_NAME = "slurm"
+
+
+class SlurmJobs(Section):
+    """Jobs of one worker each; what is not stated is the cluster's default."""
+
+    jobs: PositiveInt = 4
+    cores: PositiveInt = 8
+    """Of a job; it computes with as many threads as the process that submits it, see NUMBA_NUM_THREADS."""
+    memory: str = Field("32GB", pattern=r"^\d+ ?[KMGT]i?B$")
+    """Of a job; --memory is less."""
+    walltime: str = Field("04:00:00", pattern=r"^(\d+-)?\d+(:\d\d){0,2}$")
+    queue: str | None = None
+    account: str | None = None
+    interface: str | None = None
+    """Of the network between the jobs and this process, as ib0."""
+    directives: tuple[str, ...] = ()
+    """Further options of sbatch, as --exclusive."""
+    prologue: tuple[str, ...] = ()
+    """Shell lines that a job begins with, as module load."""
+    wait_s: PositiveFloat = 3600.0
+    """For the first job to begin, and for another one where none is left."""
+
+
+def is_slurm(spec: str) -> bool:
+    """Whether a cluster is named as `slurm` or `slurm:CONFIG.yaml`."""
+    return spec == _NAME or spec.startswith(f"{_NAME}:")
+
+
+def slurm_jobs(spec: str) -> SlurmJobs:
+    """What `slurm` or `slurm:CONFIG.yaml` asks for.
+
+    Raises:
+        ConfigError: dask-jobqueue or sbatch is missing, or the file cannot be read, or is wrong, with the key.
+    """
+    if find_spec("dask_jobqueue") is None:
+        raise ConfigError(f"--cluster {spec} needs dask-jobqueue: pip install splatline[cluster].")
+    if shutil.which("sbatch") is None:
+        raise ConfigError(f"--cluster {spec}: there is no sbatch here. Call from a machine that submits Slurm jobs.")
+    name = spec.removeprefix(_NAME).removeprefix(":")
+    try:
+        tree = yaml.safe_load(Path(name).read_text(encoding="utf-8")) if name else {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"--cluster {spec}: {name} cannot be read: {' '.join(str(error).split())}.") from error
+    try:
+        return SlurmJobs.model_validate(tree)
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, one['loc'])) or name}: {one['msg']}" for one in error.errors())
+        raise ConfigError(f"--cluster {spec}: {wrong}. Keys: {', '.join(SlurmJobs.model_fields)}.") from error
+
+
+@contextmanager
+def submitted(jobs: SlurmJobs) -> Iterator[Any]:
+    """The cluster of these jobs, which are submitted, and cancelled when the block ends.
+
+    Raises:
+        RuntimeError: Slurm refuses them.
+    """
+    from dask_jobqueue import SLURMCluster
+
+    with SLURMCluster(
+        cores=1,  # slabs that a worker makes at a time
+        processes=1,
+        job_cpu=jobs.cores,
+        memory=jobs.memory,
+        walltime=jobs.walltime,
+        queue=jobs.queue,
+        account=jobs.account,
+        interface=jobs.interface,
+        job_extra_directives=list(jobs.directives),
+        job_script_prologue=list(jobs.prologue),
+        worker_extra_args=["--memory-limit", "0", "--no-dashboard"],
+        scheduler_options={"dashboard": False},
+    ) as cluster:
+        # What Slurm refuses when the library submits it, nobody would hear of.
+        looked = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
+        if looked.returncode:
+            raise RuntimeError(looked.stderr.strip() or f"sbatch ended with {looked.returncode}")
+        cluster.scale(jobs=jobs.jobs)
+        yield cluster
