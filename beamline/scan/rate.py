@@ -33,6 +33,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.to_disk import ToDisk
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
+from drivers.frame_memory import FrameMemory
 from drivers.protocols import TriggerTrain
 
 REFERENCES = 2  # darks, and as many flats
@@ -192,11 +193,13 @@ def _pipeline(load: Load, folder: Path, n: int, clock: Clock) -> int:
     writer = _writer(load, folder, clock)
     monitor = start(load.context, load.checks)
     recorder = Recorder(writer, monitor, load.timeline(n), preview_bin=load.preview_bin, emit=lambda event, data: None)
-    status = "failed"
+    status, memory = "failed", FrameMemory()
     try:
         for row in range(n):
             frame = load.frame(row, n)
-            recorder.put(replace(frame, counts=frame.counts.copy()))  # as a driver copies it out of its ring
+            pixels = memory.take(load.shape)
+            np.copyto(pixels, frame.counts)  # as a driver copies it out of its ring
+            recorder.put(replace(frame, counts=pixels))
         recorder.finish()
         status = "complete"
     finally:

@@ -13,6 +13,7 @@ from drivers.dcam.codes import CaptureMode, CaptureState
 from drivers.dcam.session import run_all
 from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceTimeout
+from drivers.frame_memory import FrameMemory
 
 START_TIMEOUT = 5.0
 """s that a camera may take to start a capture."""
@@ -37,6 +38,7 @@ class Ring:
         self._count = 0  # frames that had arrived at the last look
         self._overrun_reported = False  # and no frame was taken since
         self.overwritten = 0
+        self._memory = FrameMemory()
         dcam.buf_alloc(camera, slots)
 
     def start(self, mode: CaptureMode, clock: Clock) -> None:
@@ -141,7 +143,9 @@ class Ring:
                 state=f"{self._next} frames of this run were taken before",
             )
         memory = (ctypes.c_char * (stride * (rows - 1) + 2 * cols)).from_address(frame.buffer)
-        return np.ndarray((rows, cols), dtype="<u2", buffer=memoryview(memory), strides=(stride, 2)).copy()
+        pixels = self._memory.take((rows, cols))
+        pixels[:] = np.ndarray((rows, cols), dtype="<u2", buffer=memoryview(memory), strides=(stride, 2))
+        return pixels
 
 
 def seconds_of(frame: BufFrame) -> float:
