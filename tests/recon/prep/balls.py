@@ -53,10 +53,16 @@ class Balls:
 
     def truth(self, grid: Grid) -> NDArray[np.float32]:
         """1/pixel, on a grid in pixels."""
-        out, sub = np.zeros(grid.shape), np.array([-0.25, 0.25])
-        for dz, dy, dx in np.stack(np.meshgrid(sub, sub, sub), axis=-1).reshape(-1, 3):
-            z, y, x = (np.asarray(along) + d for along, d in zip(grid.coordinates(), (dz, dy, dx), strict=True))
-            for bx, by, bz, radius in self.places:
-                far = (z[:, None, None] - bz) ** 2 + (y[:, None] - by) ** 2 + (x - bx) ** 2
-                out += 0.02 / 8 * (far <= radius**2)
+        out, at = np.zeros(grid.shape), grid.coordinates()
+        for bx, by, bz, radius in self.places:
+            near = [np.flatnonzero(np.abs(along - c) < radius + 1) for along, c in zip(at, (bz, by, bx), strict=True)]
+            if not all(part.size for part in near):
+                continue
+            fine = [
+                (along[part][:, None] + [-0.25, 0.25]).ravel() - c
+                for along, part, c in zip(at, near, (bz, by, bx), strict=True)
+            ]
+            z, y, x = np.ix_(*fine)
+            inside = (z**2 + y**2 + x**2 <= radius**2).reshape(near[0].size, 2, near[1].size, 2, near[2].size, 2)
+            out[np.ix_(*near)] += 0.02 * inside.mean(axis=(1, 3, 5))
         return out.astype(np.float32)
