@@ -9,6 +9,7 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,17 +86,16 @@ class Cluster:
 
     def _wait_for(self, future: Future) -> None:
         """Return when it is done; raises WorkersLostError where no worker has been there for `patience`."""
-        look, alone = min(_LOOK, self.patience), 0.0
-        while not future.done():
-            try:
-                future.result(look)
-            except TimeoutError:
-                alone = 0.0 if _count(self._client) else alone + look
-                if alone >= self.patience:
-                    raise WorkersLostError(
-                        f"All workers have left, and none came for {self.patience:g} s. Start some again; slabs that "
-                        "are finished stay: see --resume."
-                    ) from None
+        look, alone, done = min(_LOOK, self.patience), 0.0, Event()
+        # Not result(look): each TimeoutError of it is in a cycle with its frames, and these hold the partial volume.
+        future.add_done_callback(lambda _: done.set())
+        while not (done.wait(look) or future.done()):
+            alone = 0.0 if _count(self._client) else alone + look
+            if alone >= self.patience:
+                raise WorkersLostError(
+                    f"All workers have left, and none came for {self.patience:g} s. Start some again; slabs that "
+                    "are finished stay: see --resume."
+                )
 
 
 def _count(client: Client) -> int:

@@ -147,7 +147,8 @@ def _as_they_come(make: Callable[[int], T], left: Sequence[int], at_a_time: int)
             for task in wait(under_way, _LOOK, FIRST_COMPLETED).done:
                 yield under_way.pop(task), task.result()
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+        # A thread that has returned its slab holds the partial volume, and its lock, until it ends.
+        pool.shutdown(wait=not under_way, cancel_futures=True)
 
 
 def _add(partial: PartialVolume, n: int, found: Reconstruction | None, remark: str, warn: Warn) -> None:

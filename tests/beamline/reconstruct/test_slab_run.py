@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -212,6 +213,14 @@ def test_no_more_slabs_wait_to_be_written_than_are_made_at_a_time() -> None:
     assert sorted(taken) == list(range(20)) and most <= 3 + 1  # and the one that was just taken
     with pytest.raises(ZeroDivisionError):
         list(_as_they_come(lambda n: 1 / n, [1, 0], 1))
+
+
+def test_no_thread_outlives_the_slabs() -> None:
+    """It would hold the partial volume and its lock, which the next step needs."""
+    before = threading.active_count()
+    for _ in range(20):
+        list(_as_they_come(lambda n: n, range(8), 8))
+        assert threading.active_count() == before
 
 
 @dataclass(eq=False)
