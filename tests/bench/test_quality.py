@@ -27,7 +27,9 @@ from tests.bench.quality_cases import OBJECTS, SLABS, Case, cone, dense_battery,
 
 F32 = NDArray[np.float32]
 FACTOR = 2.0
-EFFORTS = ((25, 2), (50, 4), (100, 4), (100, 8), (200, 8), (400, 8))  # steps of a fit, sweeps of its finish
+EFFORTS = (
+    (25, 2), (50, 4), (100, 4), (100, 8), (200, 8), (100, 24), (400, 8), (200, 24), (400, 24),
+)  # fmt: skip  # steps of a fit, sweeps of its finish
 
 
 class Table:
