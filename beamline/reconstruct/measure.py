@@ -128,7 +128,8 @@ def _residual(
     """Of these views, rays that were not measured left out: what the volume does not explain of them."""
     left = total = 0.0
     some = geometry.select(views)
-    for rows in residual_bands(volume.grid, some):
+    matter = np.maximum(sum(data[view].sum(axis=1, dtype=np.float64) for view in views), 0)
+    for rows in residual_bands(volume.grid, some, matter):
         part = some if rows == slice(0, some.detector_shape[0]) else some.rows(rows.start, rows.stop)
         lines = volume
         if part is not some:
@@ -143,8 +144,12 @@ def _residual(
     return float(np.sqrt(left / total))
 
 
-def residual_bands(grid: Grid, geometry: Geometry) -> list[slice]:
-    """Bands of rows that stand for all: all rows, unless the detector is large; one band where rows are no slices."""
+def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) -> list[slice]:
+    """Bands of rows that stand for all: all rows, unless the detector is large; one band where rows are no slices.
+
+    Args:
+        matter: that the rows show [row]; bands lie at equal shares of it.
+    """
     rows, cols = geometry.detector_shape
     bands = max(1, _RESIDUAL_RAYS // (_RESIDUAL_ROWS * cols))
     on_rows = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
@@ -152,5 +157,7 @@ def residual_bands(grid: Grid, geometry: Geometry) -> list[slice]:
         return [slice(0, rows)]
     if rows <= bands * _RESIDUAL_ROWS:
         return [slice(first, min(first + _RESIDUAL_ROWS, rows)) for first in range(0, rows, _RESIDUAL_ROWS)]
-    starts = (np.arange(bands) + 0.5) * rows / bands - _RESIDUAL_ROWS / 2
-    return [slice(first, first + _RESIDUAL_ROWS) for first in starts.astype(int).tolist()]
+    reached = np.cumsum(matter if matter.any() else np.ones(rows))
+    middles = np.searchsorted(reached, (np.arange(bands) + 0.5) / bands * reached[-1])
+    starts = np.unique(np.clip(middles - _RESIDUAL_ROWS // 2, 0, rows - _RESIDUAL_ROWS))
+    return [slice(first, first + _RESIDUAL_ROWS) for first in starts.tolist()]

@@ -117,9 +117,18 @@ def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatc
     wrong = Volume(flat.data * np.linspace(0.8, 1.0, 24, dtype=np.float32), ball.grid)
     whole = measure(wrong, prepared, None, None)["residual"]
     monkeypatch.setattr(module, "_RESIDUAL_RAYS", 4 * 16 * 24)
-    bands = module.residual_bands(ball.grid, prepared.geometry)
+    bands = module.residual_bands(ball.grid, prepared.geometry, np.ones(200))
     assert [band.stop - band.start for band in bands] == [16] * 4 and bands[0].start > 0 and bands[-1].stop < 200
     assert measure(wrong, prepared, None, None)["residual"] == pytest.approx(whole, rel=1e-5)
+
+
+def test_bands_lie_where_the_matter_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few rows of a large detector show a sample: a residual is of these, at its ends as well."""
+    monkeypatch.setattr(module, "_RESIDUAL_RAYS", 4 * 16 * 24)
+    ball = _ball_in((200, 24, 24))
+    thin = Volume(np.where(np.isin(np.arange(200), (0, 1, 63, 199))[:, None, None], ball.data[100], 0), ball.grid)
+    wrong = Volume(0.8 * thin.data, ball.grid)
+    assert measure(wrong, _prepared(thin), None, None)["residual"] == pytest.approx(0.2, rel=1e-5)
 
 
 def test_a_volume_without_two_regions_has_no_snr() -> None:
