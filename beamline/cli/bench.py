@@ -15,6 +15,7 @@ from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.terminal import Terminal
 from beamline.config.load import load
+from beamline.config.models import Storage
 from beamline.config.monitor import configured_checks
 from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
@@ -53,7 +54,7 @@ def _frame_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     "--config",
     "file",
     type=click.Path(path_type=Path),
-    help="Frame, preview, flushes and checks of this configuration; else the full sensor, and the defaults.",
+    help="Frame, preview, flushes and checks of this configuration; default: the full sensor, and the defaults.",
 )
 @click.option(
     "--size",
@@ -62,7 +63,7 @@ def _frame_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     callback=_frame_size,
     help="Rows and columns of a frame, instead of the camera's.",
 )
-@click.option("--seconds", type=POSITIVE, default=60.0, show_default=True, help="For all rounds together, about.")
+@click.option("--seconds", type=POSITIVE, default=60.0, show_default=True, help="For all rounds; not the warm-up.")
 @click.option(
     "--rounds", type=click.IntRange(1, 100), default=5, show_default=True, help="In each, every stage is measured once."
 )
@@ -107,7 +108,7 @@ def acquire(
 
 def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
     if file is None:
-        return Load(shape or orca_quest.SENSOR_SHAPE)
+        return Load(shape or orca_quest.SENSOR_SHAPE, Storage().preview_bin, Storage().flush_every)
     config = load(file)
     camera, storage = config.devices.camera, config.storage
     settings = CameraSettings(

@@ -45,7 +45,7 @@ _COMMANDS = {
     "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
     "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
     "segment": _Entry("segment", "Segment the particles of a volume: labels, sizes, places."),
-    "bench": _Entry("bench", "Measure this machine: kernels, fits, and quality against time."),
+    "bench": _Entry("bench", "Measure this machine: kernels, fits, quality against time, and acquisition."),
     "info": _Entry("files", "Describe a scan file or a volume."),
     "validate": _Entry("files", "Check a scan file or a volume against the rules of its format."),
     "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),

@@ -52,7 +52,11 @@ def name_of(option: click.Option) -> str:
 
 def recipe_text(ctx: click.Context, method: str) -> str:
     """The recipe of this call, as YAML: the method, and the options given that hold for any scan."""
-    values = {name_of(option): value for option, value in given(ctx).items() if option.name not in _OF_ONE_CALL}
+    values = {
+        name_of(option): _from_anywhere(str(value), option.type) if isinstance(option.type, click.Path) else value
+        for option, value in given(ctx).items()
+        if option.name not in _OF_ONE_CALL
+    }
     return "".join(f"{name}: {_scalar(value)}\n" for name, value in ({"method": method} | values).items())
 
 

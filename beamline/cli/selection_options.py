@@ -68,7 +68,7 @@ def distances(ctx: click.Context, param: click.Parameter, value: str | None) -> 
     return sod, sdd
 
 
-def degrees(ctx: click.Context, param: click.Parameter, value: str | None) -> float | str | None:
+def tilt_of(ctx: click.Context, param: click.Parameter, value: str | None) -> float | str | None:
     """An angle within 45 degrees, or "auto"."""
     if value is None or value == "auto":
         return value
@@ -76,8 +76,8 @@ def degrees(ctx: click.Context, param: click.Parameter, value: str | None) -> fl
         number = float(value)
     except ValueError:
         number = math.nan
-    if not abs(number) <= _STEEPEST:
-        raise click.BadParameter(f"{value!r} is neither auto nor degrees from -{_STEEPEST:g} to {_STEEPEST:g}")
+    if not abs(number) <= _MOST_TILT_DEG:
+        raise click.BadParameter(f"{value!r} is neither auto nor degrees within {_MOST_TILT_DEG:g} of 0")
     return number
 
 
@@ -215,7 +215,7 @@ def _hardening(value: str | None) -> Hardening | None:
         raise click.UsageError(f"--hardening {value}: {error}.") from error
 
 
-_STEEPEST = 45.0
+_MOST_TILT_DEG = 45.0
 
 _BEFORE = (
     click.option(
@@ -252,7 +252,7 @@ _BEFORE = (
 _AFTER = (
     click.option(
         "--tilt",
-        callback=degrees,
+        callback=tilt_of,
         metavar="DEGREES|auto",
         help="By how much the rotation axis leans in the detector's plane (its column grows with the rows): views are "
         "turned. auto finds it by all rows. Default: views are used as they are, with a warning if they show a tilt.",

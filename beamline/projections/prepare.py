@@ -42,7 +42,7 @@ from recon.base.masks import RayWeights, areas, masked
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate, find_axis
 from recon.prep.correct import Projections
-from recon.prep.rings import take_rings_out
+from recon.prep.rings import remove_rings_in_place
 from recon.voxels.projector import seen_rays
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
@@ -224,7 +224,7 @@ def prepare_projections(
         projections = correction.at_once(scan_frames[chosen])
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
-    taken, rings = take_rings_out(projections.data, source.angles[projections.view_ids], selection.rings)
+    taken, rings = remove_rings_in_place(projections.data, source.angles[projections.view_ids], selection.rings)
     regions = replace(usable.regions, resampling=resampling_of(source, selection))
     shares_of = None
     if spill is not None:

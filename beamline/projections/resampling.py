@@ -35,7 +35,7 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
     """
     resampling_of(source, selection)  # refuses a cone
     if not selection.find_tilt:
-        return selection, "" if not selection.tilt_deg else f"Views are turned by {selection.tilt_deg:g} degrees."
+        return selection, turned_text(selection.tilt_deg) if selection.tilt_deg else ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
     try:
         tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, _BANDS, 0.0, _ROUNDS)
@@ -54,6 +54,11 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
     if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
         return replace(selection, find_tilt=False, tilt_deg=0.0), f"{said}: not corrected."
     return replace(selection, find_tilt=False, tilt_deg=math.degrees(tilt)), f"{said}; views are turned."
+
+
+def turned_text(degrees: float) -> str:
+    """What was done about a tilt that was given."""
+    return f"Views are turned by {degrees:g} degrees."
 
 
 def warn_of_tilt(
@@ -138,7 +143,7 @@ def _look(source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int
             means.append(band.data.mean(axis=1))
             heights.append(first + (thick - 1) / 2)
     if len(means) < FEWEST_BANDS:
-        raise ValueError(f"{len(means)} bands of rows, 4 are needed")
+        raise ValueError(f"{len(means)} bands of rows, {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])
 
 

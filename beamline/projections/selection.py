@@ -75,7 +75,7 @@ class Selection:
         flat_fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components
             of their changes that the view shows, see `recon.prep.dynamic_flats`.
         use_current: views and flats are divided by the ring current that the file has for each frame.
-        rings: how stripes are removed from line integrals, see `recon.prep.rings.take_rings_out`.
+        rings: how stripes are removed from line integrals, see `recon.prep.rings.remove_rings_in_place`.
         gain: counts a photon, of single pixels; None finds it by the flats.
         phase: None: it is not retrieved.
         hardening: None: it is not corrected.

@@ -143,11 +143,11 @@ def refuse_unusable(spec: str) -> None:
 
 
 @contextmanager
-def connected(spec: str, patience: float = _CONNECT_TIMEOUT) -> Iterator[Cluster]:
+def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[Cluster]:
     """The cluster that `spec` names; workers on this machine and jobs of Slurm end with the block.
 
     Args:
-        patience: s to wait for the first worker; a configuration of Slurm has its own.
+        first_worker_s: s to wait for the first worker; a configuration of Slurm has its own.
 
     Raises:
         ConfigError: no scheduler answers, jobs are refused, or no worker comes in time.
@@ -168,19 +168,19 @@ def connected(spec: str, patience: float = _CONNECT_TIMEOUT) -> Iterator[Cluster
                 )  # fmt: skip
                 closing.enter_context(address)
             elif jobs is not None:
-                address, patience = closing.enter_context(submitted(jobs)), jobs.wait_s
+                address, first_worker_s = closing.enter_context(submitted(jobs)), jobs.wait_s
             client = closing.enter_context(Client(address, timeout=_CONNECT_TIMEOUT, set_as_default=False))
         except (OSError, RuntimeError, ValueError) as error:
             what = "no scheduler answers" if jobs is None else "the jobs were not submitted"
             raise ConfigError(f"--cluster {spec}: {what} ({' '.join(str(error).split())}).") from error
         try:
-            client.wait_for_workers(1, patience)
+            client.wait_for_workers(1, first_worker_s)
         except TimeoutError:
             advice = (
                 f"Start some: dask worker {spec}." if jobs is None else "See squeue, and wait_s of the configuration."
             )
             raise ConfigError(
-                f"--cluster {spec}: the scheduler has no workers, and none came in {patience:g} s. {advice}"
+                f"--cluster {spec}: the scheduler has no workers, and none came in {first_worker_s:g} s. {advice}"
             ) from None
         if jobs is not None:
             yield Cluster(jobs.jobs, client, jobs.wait_s)

@@ -9,7 +9,7 @@ from beamline.core.errors import DataError
 from beamline.core.text import count, size
 from beamline.projections.selection import cone_of
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole
+from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.clock import Clock
 from recon.assess.time_model import duration_text
@@ -81,7 +81,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
         fits = needs.at_once <= allowed and options.partial is None
         if not fits:
             refuse_whole(source, options, needs, allowed)
-            needs = replace(needs, weighted=False)  # as it is unless a part of the detector is dead, or a view flagged
+            needs = replace(needs, weighted=surely_weighted(source, options))
             refuse_smallest(source, needs, allowed, options.selection.binning)
             slabs = left = slabs_of(rows, needs.height(allowed), needs.method.traits.halo)
         if options.partial is not None:
@@ -89,7 +89,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             if slabs[-1].own.stop != rows:
                 raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {rows}.")
             refuse_slabs(options.partial, slabs, needs, allowed)
-    output, meanwhile = (needs.volume, 0) if fits else options.disk(needs.volume)
+    output, meanwhile = (needs.volume, 0) if fits else options.disk_needs(needs.volume)
     scratch = 0 if fits else needs.line_integrals + meanwhile
     free = shutil.disk_usage(options.target.output.parent).free
     if scratch + output > free:

@@ -81,7 +81,7 @@ def reconstruct_file(
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
-    options.target.require_room(*(options.disk(volume) if slabs else (volume, 0)))
+    options.target.require_room(*(options.disk_needs(volume) if slabs else (volume, 0)))
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
@@ -110,8 +110,8 @@ def reconstruct_file(
             recipe=options.recipe,
             region=region,
         )
-        lies_in = options.partial_path if slabs and options.completes else None
-        metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, lies_in)
+        partial_volume = options.partial_path if slabs and options.becomes_output else None
+        metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)
         del outcome  # Windows removes no file that is mapped
     return metrics
 

@@ -22,6 +22,7 @@ from beamline.projections.prepare import (
     correction_blockers,
     refuse,
 )
+from beamline.projections.resampling import turned_text
 from beamline.projections.selection import check_axis, geometry_of
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
@@ -322,4 +323,6 @@ class ScanFollower:
         found = assemble(
             self.source, self._options.selection, projections, (axis_col, self._axis.estimate), usable, self._warn
         )
-        return replace(found, noise=self._correction.noise, phase=self._correction.phase)
+        done, degrees = self._correction, self._options.selection.tilt_deg
+        tilt = turned_text(degrees) if degrees else ""
+        return replace(found, noise=done.noise, phase=done.phase, flats=done.flats, tilt=tilt)

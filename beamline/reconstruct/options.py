@@ -12,7 +12,7 @@ from beamline.reconstruct.region import Region, selection_around
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.partial_volume import completes
+from beamline.storage.writers.partial_volume import can_become
 from recon.assess.plans import Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Method
@@ -72,15 +72,15 @@ class ReconOptions:
     recipe: str = ""
 
     @property
-    def completes(self) -> bool:
+    def becomes_output(self) -> bool:
         """Whether a volume that is made in slabs becomes the output where it lies."""
-        return self.region is None and completes(self.target.output)
+        return self.region is None and can_become(self.target.output)
 
-    def disk(self, volume: int) -> tuple[int, int]:
+    def disk_needs(self, volume: int) -> tuple[int, int]:
         """Bytes on the disk for the result of a volume of so many, in slabs, and for what lies there meanwhile."""
         compared = self.target.report is not None and not self.method.traits.direct
         slabs = self.partial is None  # else they are there
-        if self.completes:
+        if self.becomes_output:
             return slabs * volume, compared * volume
         return volume, (slabs + compared) * volume
 

@@ -92,15 +92,15 @@ def write_result(
     context: ReportContext,
     sink: Sink,
     clock: Clock,
-    lies_in: Path | None = None,
+    partial_volume: Path | None = None,
 ) -> dict[str, float]:
     """Measure the volume, write its file and the report, and send the event `done`. Returns the metrics.
 
     Args:
-        lies_in: the partial volume that becomes the output as it is; None: the volume is written.
+        partial_volume: the partial volume that becomes the output as it is; None: the volume is written.
 
     Raises:
-        DataError: a result could not be written; neither is left where one fails.
+        DataError: a result could not be written; none is left where one fails.
     """
     region = context.region
     region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
@@ -158,10 +158,10 @@ def write_result(
         if target.pdf is not None:
             write_logbook(target.pdf, page, record.volume, prepared.length_unit, clock.now(), replace=target.replace)
             pages.append(target.pdf)
-        if lies_in is None:
+        if partial_volume is None:
             write_volume(target.output, record, replace=target.replace)
         else:
-            complete(lies_in, record, target.output, replace=target.replace)
+            complete(partial_volume, record, target.output, replace=target.replace)
     except BaseException:
         for written in pages:
             remove(written)

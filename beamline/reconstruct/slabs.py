@@ -14,12 +14,13 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
 from beamline.core.text import size
-from beamline.projections.correction import Warn
+from beamline.projections.correction import Warn, resampling_of
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import choose_views, cone_of, rows_of
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
+from beamline.reconstruct.slurm import is_slurm, slurm_jobs
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
@@ -175,7 +176,9 @@ def spill_of(
     if options.partial is None:
         options.target.refuse_partial()
     refuse_whole(source, options, needs, memory)
-    refuse_smallest(source, replace(needs, weighted=False), memory, options.selection.binning)
+    refuse_smallest(
+        source, replace(needs, weighted=surely_weighted(source, options)), memory, options.selection.binning
+    )
     batch = max(1, int(_BATCH * memory / needs.view))
     warn(
         f"All at once would take {size(needs.at_once)}, {size(memory)} of memory may be used: views and volume lie on "
@@ -185,10 +188,17 @@ def spill_of(
     return Spill(scratch_array(options.target.output.parent, shape), batch, told)
 
 
+def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
+    """Whether rays have weights before the views are known, which may give them some: of views that are turned."""
+    return not options.method.traits.direct and resampling_of(source, options.selection) is not None
+
+
 def memory_of(options: ReconOptions) -> int:
-    """Bytes that this process may use, and each worker on this machine."""
+    """Bytes that this process may use, and each worker on this machine or job of Slurm."""
     if options.memory is not None:
         return options.memory
+    if options.cluster is not None and is_slurm(options.cluster):
+        return round(SHARE * min(free_memory(), slurm_jobs(options.cluster).bytes))
     return round(SHARE * free_memory() / (1 + local_workers(options.cluster)))
 
 

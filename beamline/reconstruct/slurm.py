@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import yaml
-from pydantic import Field, PositiveFloat, PositiveInt, ValidationError
+from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt, ValidationError
 
 from beamline.config.section import Section
 from beamline.core.errors import ConfigError
 
 _NAME = "slurm"
+
+
+def _text(value: Any) -> Any:
+    """A name that YAML takes for a whole number."""
+    return str(value) if isinstance(value, int) else value
 
 
 class SlurmJobs(Section):
@@ -28,8 +34,9 @@ class SlurmJobs(Section):
     memory: str = Field("32GB", pattern=r"^\d+ ?[KMGT]i?B$")
     """Of a job; --memory is less."""
     walltime: str = Field("04:00:00", pattern=r"^(\d+-)?\d+(:\d\d){0,2}$")
-    queue: str | None = None
-    account: str | None = None
+    """In quotes in YAML, which takes 12:00:00 for a number."""
+    queue: Annotated[str, BeforeValidator(_text)] | None = None
+    account: Annotated[str, BeforeValidator(_text)] | None = None
     interface: str | None = None
     """Of the network between the jobs and this process, as ib0."""
     directives: tuple[str, ...] = ()
@@ -38,6 +45,12 @@ class SlurmJobs(Section):
     """Shell lines that a job begins with, as module load."""
     wait_s: PositiveFloat = 3600.0
     """For the first job to begin, and for another one where none is left."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory of a job."""
+        number, letter, binary = re.fullmatch(r"(\d+) ?([KMGT])(i?)B", self.memory).groups()  # type: ignore[union-attr]
+        return int(number) * (1024 if binary else 1000) ** (" KMGT".index(letter))
 
 
 def is_slurm(spec: str) -> bool:
@@ -57,7 +70,7 @@ def slurm_jobs(spec: str) -> SlurmJobs:
         raise ConfigError(f"--cluster {spec}: there is no sbatch here. Call from a machine that submits Slurm jobs.")
     name = spec.removeprefix(_NAME).removeprefix(":")
     try:
-        tree = yaml.safe_load(Path(name).read_text(encoding="utf-8")) if name else {}
+        tree = (yaml.safe_load(Path(name).read_text(encoding="utf-8")) if name else None) or {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(f"--cluster {spec}: {name} cannot be read: {' '.join(str(error).split())}.") from error
     try:

@@ -38,7 +38,7 @@ from drivers.protocols import TriggerTrain
 
 REFERENCES = 2  # darks, and as many flats
 RING = 8  # views that differ; they come by turns
-WARM_UP = 32  # frames of each stage that are not counted: they compile the kernels and tell how many the time allows
+FEWEST = 32  # frames of a warm-up, which compiles the kernels and tells how many the time allows, and of a stage
 DARK, FLAT, ABSORPTION, RADIUS = 200, 12_000, 1.5, 0.8  # counts; line integral at the axis; share of half the width
 SATURATION = 65_535
 PERIOD = 1 / 120  # s that the frames say lie between them; they come as fast as they are taken
@@ -54,8 +54,8 @@ class Load:
     """
 
     shape: tuple[int, int]
-    preview_bin: int = 8
-    flush_every: int = 16
+    preview_bin: int
+    flush_every: int
     checks: tuple[Check, ...] = tuple(CHECKS)
 
     @property
@@ -238,15 +238,15 @@ def rates(
         raise DataError(f"{folder} is no folder. Name one on the disk that scans are to be written to.")
     free = shutil.disk_usage(folder).free
     most = free // 2 // (load.frame_bytes + 2 * 4 * load.frame_bytes // load.preview_bin**2)
-    if most < WARM_UP:
+    if most < FEWEST:
         raise DataError(
-            f"{size(free)} are free on the disk of {folder}; {WARM_UP} frames of {size(load.frame_bytes)} must fit "
+            f"{size(free)} are free on the disk of {folder}; {FEWEST} frames of {size(load.frame_bytes)} must fit "
             "into half of it. Free some, or measure smaller frames with --size. Nothing was written."
         )
     total, done, slowest = len(STAGES) * (rounds + 1), 0, 0.0
     for at in range(rounds + 1):
         share = seconds / (len(STAGES) * rounds)
-        n = WARM_UP if at == 0 else int(min(max(share / slowest, WARM_UP), most))
+        n = FEWEST if at == 0 else int(min(max(share / slowest, FEWEST), most))
         names = list(STAGES)
         for name in names[at % len(names) :] + names[: at % len(names)]:
             said(done, total, name if at else f"{name}, to warm up")
@@ -254,7 +254,7 @@ def rates(
             done += 1
             if at:
                 yield taken
-            elif slowest == 0 or name != names[0]:
+            else:
                 again = _measure(name, load, folder, n, clock)  # the kernels are compiled now
                 slowest = max(slowest, again.seconds / n)
     said(total, total, "")
@@ -304,7 +304,7 @@ def _writer(load: Load, folder: Path, clock: Clock) -> NXtomoWriter:
 
 
 def _lost(load: Load, path: Path, n: int) -> int:
-    """Frames that are not in their row, by the CRC-32 of their pixels, which the writer got from the digest."""
+    """Rows without the checksum of their frame, which the writer got from the digest; pixels are not read back."""
     expected = np.array([load.digests[load.slot(row)].checksum for row in range(n)], np.uint32)
     with h5py.File(path, "r") as file:
         stored = file["/entry/digest/checksum"][()]

@@ -138,8 +138,8 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator
 
 @contextmanager
 def changed(path: Path) -> Iterator[h5py.File]:
-    """The same of a file that is there."""
-    with _closed(h5py.File(path, "r+"), path) as file:
+    """An existing file, open to be changed; closed as by `created`."""
+    with _closed(h5py.File(path, "r+", locking=False), path) as file:  # a reader of the old content does not matter
         yield file
 
 

@@ -68,7 +68,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
             raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
 
 
-def joined_from(part: Path) -> tuple[Path, int] | None:
+def joined_file_of(part: Path) -> tuple[Path, int] | None:
     """The file that joins this one with other parts of its scan, and how many it joins; None where there is none."""
     for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
         joined = folder / JOINED

@@ -164,7 +164,7 @@ def remove_rings(projections: NDArray[np.floating], angles: NDArray[np.float64],
             ones, "wavelet" by wavelets (Münch et al. 2009), "none"; "auto" looks and chooses sort, vo or none.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or another way.
+        ValueError: shapes that do not fit, values that are not finite, or a `rings` that is none of these.
     """
     views, theta = np.array(projections, np.float32), np.asarray(angles, np.float64)
     if views.ndim != 3 or theta.shape != views.shape[:1]:
@@ -173,10 +173,10 @@ def remove_rings(projections: NDArray[np.floating], angles: NDArray[np.float64],
         raise ValueError(f"rings is one of {', '.join(get_args(Rings))}, got {rings!r}")
     if not (np.isfinite(views).all() and np.isfinite(theta).all()):
         raise ValueError("projections or angles hold NaN or infinite values; correct them first")
-    return WithoutRings(views, *take_rings_out(views, theta, rings))
+    return WithoutRings(views, *remove_rings_in_place(views, theta, rings))
 
 
-def take_rings_out(views: F32, angles: NDArray[np.float64], rings: Rings) -> tuple[F32, str]:
+def remove_rings_in_place(views: F32, angles: NDArray[np.float64], rings: Rings) -> tuple[F32, str]:
     """Stripes out of all rows of line integrals [view, row, col], in place.
 
     Args:

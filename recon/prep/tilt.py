@@ -60,6 +60,8 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
     data, heights = np.asarray(bands, np.float64), np.asarray(heights, np.float64)
     if data.ndim != 3 or heights.shape != data.shape[1:2] or len(angles) != len(data):
         raise ValueError(f"bands {data.shape} must be [view, band, col] for {heights.shape} heights")
+    if not np.isfinite(data).all():
+        raise ValueError("bands hold NaN or infinite values; correct them first")
     if len(heights) < FEWEST_BANDS or not np.ptp(heights) > 0:
         raise ValueError(f"{len(heights)} bands of rows; {FEWEST_BANDS} at different heights are needed")
     for curves_of in (wedge_curves, opposite_curves):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
-from beamline.storage.parts import joined_from
+from beamline.storage.parts import joined_file_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
@@ -267,7 +267,7 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
 
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """A part of a scan that was resumed is not all of it."""
-    if (found := joined_from(source.path)) is not None:
+    if (found := joined_file_of(source.path)) is not None:
         joined, n = found
         yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
 

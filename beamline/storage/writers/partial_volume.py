@@ -8,7 +8,7 @@ added by half is taken out again when the file is opened.
 from __future__ import annotations
 
 import json
-import shutil
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -135,6 +135,7 @@ def open_partial(path: Path) -> PartialVolume:
     Raises:
         DataError: it is no such file, is damaged, or another process adds to it.
     """
+    _put_back(path)
     _refuse_unusable(path)
     lock = WriterLock(path)
     with hdf5.readable(path), h5py.File(path, "r") as file:
@@ -151,7 +152,7 @@ def open_partial(path: Path) -> PartialVolume:
     return found
 
 
-def completes(target: Path) -> bool:
+def can_become(target: Path) -> bool:
     """Whether a partial volume can become `target` where it lies: of that format; Windows renames no file in use."""
     return target.suffix.lower() in SUFFIXES and sys.platform != "win32"
 
@@ -164,15 +165,17 @@ def complete(path: Path, record: ReconRecord, target: Path, *, replace: bool = F
     """
     if not replace:
         refuse_existing(target)
-    _save_structure(path)
     try:
+        _save_structure(path)
         rewrite_facts(path, record)
-        _structure_of(path).unlink()
+        _to_disk(path)
         path.replace(target)
+        _structure_of(path).unlink()
     except OSError as error:
         _put_back(path)
         raise DataError(
-            f"{target} could not be written ({hdf5.reason(error)}). Check the disk; {path} keeps the slabs."
+            f"{target} could not be written ({hdf5.reason(error)}). Check the disk. {path} keeps all slabs: give "
+            f"--resume {path}."
         ) from error
 
 
@@ -182,35 +185,49 @@ def _structure_of(path: Path) -> Path:
 
 
 def _save_structure(path: Path) -> None:
-    with hdf5.readable(path), h5py.File(path, "r") as file:
-        volume = file[_PLACES["volume"]]
-        first, end = volume.id.get_offset(), volume.id.get_offset() + volume.id.get_storage_size()
-    with whole_file(_structure_of(path), replace=True) as saved, path.open("rb") as source, saved.open("wb") as out:
-        out.write(first.to_bytes(8, "little") + end.to_bytes(8, "little") + source.read(first))
-        source.seek(end)
-        shutil.copyfileobj(source, out)
+    """First four numbers of eight bytes: where the volume and the shared slices begin and end."""
+    with hdf5.readable(path), h5py.File(path, "r", locking=False) as file:
+        voxels = [file[_PLACES[name]].id for name in ("volume", "shared_before")]
+        ends = [at for item in voxels for at in (item.get_offset(), item.get_offset() + item.get_storage_size())]
+    with whole_file(_structure_of(path), replace=True) as saved:
+        with path.open("rb") as source, saved.open("wb") as out:
+            out.write(b"".join(end.to_bytes(8, "little") for end in ends))
+            for first, end in zip((0, *ends[1::2]), (*ends[::2], path.stat().st_size), strict=True):
+                source.seek(first)
+                out.write(source.read(end - first))
+        _to_disk(saved)
 
 
 def _put_back(path: Path) -> None:
-    """Undo a completion that was cut short, if there was one."""
+    """Undo a completion that was cut short, if there was one. Shared slices are lost, which no slab needs any more."""
     saved = _structure_of(path)
-    if not saved.is_file():
+    if not (saved.is_file() and path.is_file()) or held(path):
         return
     with saved.open("rb") as source, path.open("r+b") as out:
-        first, end = (int.from_bytes(source.read(8), "little") for _ in range(2))
-        out.write(source.read(first))
-        out.seek(end)
-        shutil.copyfileobj(source, out)
+        ends = [int.from_bytes(source.read(8), "little") for _ in range(4)]
+        for first, end in zip((0, *ends[1::2]), ends[::2], strict=False):
+            out.seek(first)
+            out.write(source.read(end - first))
+        out.seek(ends[-1])
+        out.write(source.read())
         out.truncate()
+    _to_disk(path)
     saved.unlink()
 
 
+def _to_disk(path: Path) -> None:
+    """Return when the file would survive a loss of power."""
+    with path.open("r+b") as file:
+        os.fsync(file.fileno())
+
+
 def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
-    """All slabs, and those that are not finished, of a file that stays as it is.
+    """All slabs, and those that are not finished; undoes a completion that was cut short.
 
     Raises:
         DataError: as `open_partial`.
     """
+    _put_back(path)
     _refuse_unusable(path)
     with hdf5.readable(path), h5py.File(path, "r") as file:
         slabs, state = _slabs_in(file[_SLABS]), file[_PLACES["state"]][()]
@@ -218,8 +235,6 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 
 
 def _refuse_unusable(path: Path) -> None:
-    if path.is_file() and not held(path):
-        _put_back(path)
     if not is_partial(path):
         raise DataError(f"{path} is no partial volume; recon leaves one where it is stopped after the first slab.")
     if held(path):
@@ -234,9 +249,11 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 def is_partial(path: Path) -> bool:
     """Whether a file is a partial volume, by its content; also one whose completion was cut short."""
+    if not path.is_file():
+        return False
     if _structure_of(path).is_file():
         return True
-    if not path.is_file() or not hdf5.is_hdf5(path):
+    if not hdf5.is_hdf5(path):
         return False
     try:
         with hdf5.open_hdf5(path) as file:

@@ -79,7 +79,7 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
 
 
 def rewrite_facts(path: Path, record: ReconRecord) -> None:
-    """All of a file by `write_record` but its voxels and their places becomes the record's. OSError as there."""
+    """Replace all but voxels and axes by what `record` says. OSError where the disk refuses."""
     with hdf5.changed(path) as file:
         entry = file["entry"]
         for name in set(entry) - {"data"}:

@@ -263,7 +263,7 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
     assert "Views are turned by -0.5 degrees." in result.stderr
     assert "Views are turned by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
     for options, error, code in (
-        (("--tilt", "90"), "neither auto nor degrees from -45 to 45", 2),
+        (("--tilt", "90"), "neither auto nor degrees within 45 of 0", 2),
         (("--tilt", "auto", "--follow"), "--tilt auto is for a finished scan", 2),
         (("--tilt", "auto"), "the tilt of the axis was not found: 2 bands of rows", 5),
         (("--tilt", "1", "--cone", "5:7"), "--tilt is for a parallel beam; scan.h5 is a cone", 2),

@@ -127,7 +127,7 @@ def test_without_any_worker_it_ends_after_the_time_stated() -> None:
     with alone, distributed.Client(alone, set_as_default=False) as client:
         with (
             pytest.raises(ConfigError, match=r"none came in 0\.2 s\. Start some: dask worker tcp://"),
-            connected(alone.scheduler_address, patience=0.2),
+            connected(alone.scheduler_address, first_worker_s=0.2),
         ):
             pytest.fail("there is nobody to do anything")
         with pytest.raises(WorkersLostError, match=r"left, and none came for 0\.2 s"):

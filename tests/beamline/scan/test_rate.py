@@ -11,12 +11,12 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.scan import rate
-from beamline.scan.rate import REFERENCES, RING, STAGES, WARM_UP, Load, rates, summary
+from beamline.scan.rate import FEWEST, REFERENCES, RING, STAGES, Load, rates, summary
 from beamline.scan.recorder import Recorder
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
 
-LOAD = Load((24, 40), preview_bin=4)
+LOAD = Load((24, 40), preview_bin=4, flush_every=16)
 
 
 def measured(folder: Path, rounds: int = 2) -> list[rate.Taken]:
@@ -36,7 +36,7 @@ def test_each_stage_is_measured_once_a_round_and_its_file_removed(tmp_path: Path
 
 
 def test_a_frame_that_is_not_in_its_row_counts_as_lost(tmp_path: Path) -> None:
-    frames = [LOAD.frame(row, WARM_UP) for row in range(9)]
+    frames = [LOAD.frame(row, FEWEST) for row in range(9)]
     frames[6] = replace(frames[6], counts=frames[7].counts)
     with rate._writer(LOAD, tmp_path, SystemClock()) as writer:
         for frame in frames:
@@ -59,7 +59,7 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_frames_beside_each_other_differ_and_views_follow_darks_and_flats() -> None:
-    frames = [LOAD.frame(row, WARM_UP) for row in range(2 * REFERENCES + RING + 1)]
+    frames = [LOAD.frame(row, FEWEST) for row in range(2 * REFERENCES + RING + 1)]
     assert all((a.counts != b.counts).any() for a, b in pairwise(frames))
     kinds = [FrameKind.DARK] * REFERENCES + [FrameKind.FLAT] * REFERENCES + [FrameKind.PROJECTION] * (RING + 1)
     assert [frame.kind for frame in frames] == kinds
@@ -70,7 +70,7 @@ def test_a_folder_that_is_not_there_and_a_full_disk_are_refused(
 ) -> None:
     with pytest.raises(DataError, match="is no folder"):
         measured(tmp_path / "none")
-    full = shutil.disk_usage(tmp_path)._replace(free=WARM_UP * LOAD.frame_bytes)
+    full = shutil.disk_usage(tmp_path)._replace(free=FEWEST * LOAD.frame_bytes)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: full)
     with pytest.raises(DataError, match="Nothing was written"):
         measured(tmp_path)

@@ -25,7 +25,7 @@ from beamline.scan.run_folder import parts_of
 from beamline.scan.states import State
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
-from beamline.storage.parts import JOINED, joined_from
+from beamline.storage.parts import JOINED, joined_file_of
 from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.overlay import Overlay
 from beamline.storage.recover import QUIET
@@ -319,13 +319,13 @@ def test_only_a_file_that_is_drawn_from_is_a_part(tmp_path: Path) -> None:
     for path in (first, other):
         with h5py.File(path, "x") as file:
             file[layout.DATA] = np.zeros((2, 4, 4), np.uint16)
-    assert joined_from(first) is None
+    assert joined_file_of(first) is None
     (tmp_path / JOINED).write_bytes(b"no HDF5")
-    assert joined_from(first) is None
+    assert joined_file_of(first) is None
     (tmp_path / JOINED).unlink()
     with h5py.File(tmp_path / JOINED, "x") as file:
         virtual = h5py.VirtualLayout((2, 4, 4), "u2")
         virtual[:] = h5py.VirtualSource("scan.h5", layout.DATA, (2, 4, 4))
         file.create_virtual_dataset(layout.DATA, virtual)
-    assert joined_from(first) == (tmp_path / JOINED, 1)
-    assert joined_from(other) is None and joined_from(tmp_path / JOINED) is None
+    assert joined_file_of(first) == (tmp_path / JOINED, 1)
+    assert joined_file_of(other) is None and joined_file_of(tmp_path / JOINED) is None

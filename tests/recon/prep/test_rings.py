@@ -14,9 +14,9 @@ from recon.prep.rings import (
     _analysed,
     _synthesised,
     by_vo,
+    remove_rings_in_place,
     ring_score,
     stripe_score,
-    take_rings_out,
     without_dead_columns,
     without_large_stripes,
 )
@@ -100,14 +100,14 @@ def test_auto_removes_what_it_sees_and_says_so(clean: F32, gains: F32) -> None:
     for views, said in ((clean, "none seen"), (clean + gains, "removed by")):
         stack = np.repeat(views[shuffled, None], 2, axis=1)
         before = stack.copy()
-        taken, text = take_rings_out(stack, ANGLES[shuffled], "auto")
+        taken, text = remove_rings_in_place(stack, ANGLES[shuffled], "auto")
         assert said in text
         assert (stack == before).all() == (said == "none seen")
         np.testing.assert_allclose(taken, (before - stack).mean(axis=0), atol=1e-6)
     few = clean[:7, None].copy()
-    assert "7 views of 240 columns are too few" in take_rings_out(few, ANGLES[:7], "vo")[1]
+    assert "7 views of 240 columns are too few" in remove_rings_in_place(few, ANGLES[:7], "vo")[1]
     np.testing.assert_array_equal(few, clean[:7, None])
-    assert take_rings_out(clean[:, None].copy(), ANGLES, "none")[1] == ""
+    assert remove_rings_in_place(clean[:, None].copy(), ANGLES, "none")[1] == ""
 
 
 def test_tooth_loses_its_rings_and_keeps_its_crack(shared_data: Path) -> None:
@@ -115,7 +115,7 @@ def test_tooth_loses_its_rings_and_keeps_its_crack(shared_data: Path) -> None:
     scores, cracks = {}, {}
     for way in ("none", "sort", "vo", "wavelet"):
         clean = views.copy()
-        take_rings_out(clean, geometry.angles, way)
+        remove_rings_in_place(clean, geometry.angles, way)
         image = recon.reconstruct(clean, geometry, recon.Fbp("shepp-logan")).volume.data[0]
         middle = (image.shape[0] - 1) / 2
         scores[way] = ring_score(image, (middle, middle))
