@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 class FrameMemory:
     """Gives memory for frames, and takes it back when nobody holds the frame, or a part of it, any longer.
 
-    It keeps as much as there were frames at a time. May be used from any thread.
+    Keeps as many buffers as there were frames at one time. May be used from any thread.
     """
 
     def __init__(self) -> None:

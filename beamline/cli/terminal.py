@@ -28,7 +28,12 @@ SAY_EVERY = 0.2
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
 _OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
-_OF_TRIALS = {"tradeoff": "trials", "study": "trials", "batch": "scans", "bench": "runs"}  # what that of others counts
+_OF_TRIALS = {
+    "tradeoff": "trials",
+    "study": "trials",
+    "batch": "scans",
+    "bench": "runs",
+}  # stage: what its progress counts
 
 
 class Terminal:

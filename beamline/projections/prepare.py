@@ -18,7 +18,6 @@ from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.hardening import curve_of
 from beamline.projections.jumps import find_jumps, longest_part
 from beamline.projections.replay import judged_flags
-from beamline.projections.resampling import spread, spread_views, warn_of_tilt, with_tilt
 from beamline.projections.selection import (
     Hardening,
     Selection,
@@ -30,6 +29,7 @@ from beamline.projections.selection import (
     rows_of,
     unbinned,
 )
+from beamline.projections.tilt import spread, spread_views, warn_of_tilt, with_tilt
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding

@@ -22,8 +22,8 @@ from beamline.projections.prepare import (
     correction_blockers,
     refuse,
 )
-from beamline.projections.resampling import turned_text
 from beamline.projections.selection import check_axis, geometry_of
+from beamline.projections.tilt import turned_text
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions

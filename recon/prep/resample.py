@@ -19,6 +19,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 _TAPS = 6  # pixels along each side that a new pixel is made of
+_BEFORE = _TAPS // 2 - 1  # taps before a place
 _PHASES = 4096  # steps of a pixel by which weights are tabled
 _LOOKED_AT = 65  # positions along each side at which the reach is measured
 
@@ -71,7 +72,8 @@ class Resampling:
 
     Attributes:
         shape: (rows, cols) of the whole detector.
-        tilt: radians by which the rotation axis leans in the detector's plane: its column grows by tan(tilt) a row.
+        tilt: radians by which the rotation axis leans in the detector's plane: its column grows by tan(tilt) a row. A
+            `Geometry` calls such a lean roll; its own tilt is the one along the beam.
         distortion: of the lens; None: none.
         binning: pixels of the views are the means of so many a side.
     """
@@ -145,7 +147,7 @@ def _split(at: F64) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
 
 def _weights() -> F32:
     """[phase, tap] of the cubic convolution over six points (Keys 1981, IEEE Trans. ASSP 29, 1153, section VI)."""
-    s = np.abs(np.arange(_TAPS) - (_TAPS // 2 - 1) - np.arange(_PHASES)[:, None] / _PHASES)
+    s = np.abs(np.arange(_TAPS) - _BEFORE - np.arange(_PHASES)[:, None] / _PHASES)
     near = (4 / 3 * s - 7 / 3) * s**2 + 1
     middle = ((-7 / 12 * s + 3) * s - 59 / 12) * s + 5 / 2
     far = ((s / 12 - 2 / 3) * s + 7 / 4) * s - 3 / 2
@@ -158,13 +160,13 @@ def _resample(view, row, row_phase, col, col_phase, table, out):  # type: ignore
     rows, cols = view.shape
     for i in prange(rows):
         for j in range(cols):
-            r0, c0 = row[i, j] - 2, col[i, j] - 2
+            r0, c0 = row[i, j] - _BEFORE, col[i, j] - _BEFORE
             down, along = table[row_phase[i, j]], table[col_phase[i, j]]
             total = np.float32(0)
-            for k in range(6):
+            for k in range(_TAPS):
                 line = view[min(max(r0 + k, 0), rows - 1)]
                 part = np.float32(0)
-                for m in range(6):
+                for m in range(_TAPS):
                     part += along[m] * line[min(max(c0 + m, 0), cols - 1)]
                 total += down[k] * part
             out[i, j] = total

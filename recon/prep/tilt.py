@@ -27,7 +27,7 @@ class TiltEstimate:
     """Estimate of the tilt.
 
     Attributes:
-        tilt: radians; the axis' column grows by tan(tilt) a row.
+        tilt: radians; the axis' column grows by tan(tilt) a row (`Geometry` calls it roll).
         uncertainty: radians, one standard deviation.
         axis_col: column of the axis at height 0.
     """

@@ -12,8 +12,8 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.projections import prepare as pipeline
 from beamline.projections.prepare import PreparedProjections, prepare_projections
-from beamline.projections.resampling import spread_views
 from beamline.projections.selection import Selection
+from beamline.projections.tilt import spread_views
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from recon.prep.align import AxisError, AxisEstimate

@@ -1,4 +1,4 @@
-"""How views of a scan are resampled: the distortion of the lens, and the tilt of the axis, given or found."""
+"""The tilt of the axis: found where that is asked for, warned of where nobody said what it is."""
 
 from __future__ import annotations
 
