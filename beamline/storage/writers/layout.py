@@ -315,12 +315,24 @@ class Rows:
 def settle(file: h5py.File) -> None:
     """Once SWMR writing is over: what strict validators want otherwise than a growing file can have it."""
     if END_TIME in file:
-        end = file[END_TIME].asstr()[()]
+        end = _end_time(file)
         del file[END_TIME]
         file[END_TIME] = end
     kinds = file[KIND][()]
     if (kinds == FrameKind.ALIGNMENT).any():
         file[f"{DETECTOR}/image_key_control"] = kinds
+
+
+def _end_time(file: h5py.File) -> str:
+    """As it was written; the time of the last frame where a writer died while `settle` wrote it anew."""
+    try:
+        end = str(file[END_TIME].asstr()[()])
+        if end:
+            datetime.fromisoformat(end)
+    except (ValueError, OSError, RuntimeError):
+        times = file[TIME][()]
+        return iso_time(float(times.max())) if times.size else ""
+    return end
 
 
 def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import h5py
@@ -60,7 +61,19 @@ def _died_at_the_end(folder: Path, frames: list[Frame], clock: StandingClock) ->
     return _aged(folder / "died.h5")
 
 
-@pytest.mark.parametrize(("died", "status"), [(_died_in_the_scan, "failed"), (_died_at_the_end, "complete")])
+def _died_in_its_end_time(folder: Path, frames: list[Frame], clock: StandingClock) -> Path:
+    """While the time of the end was written anew: its text is not there yet."""
+    path = _died_at_the_end(folder, frames, clock)
+    whole = path.read_bytes()
+    end = whole.rindex(layout.iso_time(clock.now()).encode())
+    path.write_bytes(whole[:end] + b"\xb6" * 5 + whole[end + 5 :])
+    return _aged(path)
+
+
+@pytest.mark.parametrize(
+    ("died", "status"),
+    [(_died_in_the_scan, "failed"), (_died_at_the_end, "complete"), (_died_in_its_end_time, "complete")],
+)
 def test_every_committed_frame_is_kept(
     tmp_path: Path,
     clock: StandingClock,
@@ -75,6 +88,7 @@ def test_every_committed_frame_is_kept(
     assert (done.changed, done.frames) == (True, 10)
     with h5py.File(path) as file:  # as any program opens it
         assert {file[name].shape[0] for name in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {10}
+        assert status == "failed" or datetime.fromisoformat(file[layout.END_TIME].asstr()[()])
         assert len(file["exchange/data"]) == sum(frame.kind is FrameKind.PROJECTION for frame in frames[:10])
     with open_scan(path) as source:
         assert (source.finished, source.attributes["status"]) == (True, status)
