@@ -40,6 +40,13 @@ def _scan(runs: Path, step: bool) -> None:
     run_scan(small(*WORDS, f"scan.mode={'step' if step else 'fly'}"), runs, instrument=instrument.connected())
 
 
+def _seconds(runs: Path, step: bool) -> float:
+    """That a scan takes here, so that kills fall into it on any machine."""
+    begin = time.monotonic()
+    _scan(runs, step)
+    return time.monotonic() - begin
+
+
 def _assert_frames(path: Path, one_part: bool = True) -> int:
     """What the fake camera wrote into the pixels is what the file says of each frame."""
     with open_scan(path) as source:
@@ -70,9 +77,10 @@ def _killed(runs: Path, seconds: float, step: bool) -> Path | None:
 def kills(folder: Path, n: int, seed: int) -> dict[str, int]:
     rng, found = np.random.default_rng(seed), dict.fromkeys(("recovered", "whole", "frames", "none", "resumed"), 0)
     _scan(folder / "warm", step=False)
+    whole = [_seconds(folder / f"whole{step:d}", step) for step in (False, True)]
     for k in range(n):
         step, runs = bool(k % 2), folder / str(k)
-        run = _killed(runs, float(rng.uniform(0.02, 1.2)), step)
+        run = _killed(runs, float(rng.uniform(0.02, whole[step])), step)
         try:
             done = recover_run(run)[0] if run is not None else []
         except DataError:
