@@ -68,6 +68,9 @@ def distances(ctx: click.Context, param: click.Parameter, value: str | None) -> 
     return sod, sdd
 
 
+_MOST_TILT_DEG = 45.0
+
+
 def tilt_of(ctx: click.Context, param: click.Parameter, value: str | None) -> float | str | None:
     """An angle within 45 degrees, or "auto"."""
     if value is None or value == "auto":
@@ -214,8 +217,6 @@ def _hardening(value: str | None) -> Hardening | None:
     except ValueError as error:
         raise click.UsageError(f"--hardening {value}: {error}.") from error
 
-
-_MOST_TILT_DEG = 45.0
 
 _BEFORE = (
     click.option(

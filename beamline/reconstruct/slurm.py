@@ -49,7 +49,7 @@ class SlurmJobs(Section):
     @property
     def bytes(self) -> int:
         """Memory of a job."""
-        number, letter, binary = re.fullmatch(r"(\d+) ?([KMGT])(i?)B", self.memory).groups()  # type: ignore[union-attr]
+        (number, letter, binary), *_ = re.findall(r"(\d+) ?([KMGT])(i?)B", self.memory)
         return int(number) * (1024 if binary else 1000) ** (" KMGT".index(letter))
 
 

@@ -192,7 +192,7 @@ def axis_from_sinogram(
         )
     if not (np.isfinite(data).all() and np.isfinite(theta).all()):
         raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")
-    if not _over_half_a_turn(theta):
+    if not _covers_half_a_turn(theta):
         return _axis_from_mass(data, theta, search)
     wedge = _axis_from_wedge(data, theta, search)
     if wedge.confident:
@@ -238,9 +238,9 @@ def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     """Candidates [n] for the axis, and the mismatch [row, n] of each row of [view, row, col] by the double wedge.
 
     Raises:
-        ValueError: the views have a wider gap than it bears.
+        ValueError: the views leave a gap in the half turn.
     """
-    if not _over_half_a_turn(theta):
+    if not _covers_half_a_turn(theta):
         raise ValueError("the views do not go round half a turn evenly")
     part, theta, bin_ = _for_wedge(data, theta)
     omega, fits = _wedge_residuals(part, theta)
@@ -263,7 +263,7 @@ def opposite_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     return candidates, np.stack([_mirror_mismatch(a[:, row], b[:, row], candidates - 0.5) for row in rows])
 
 
-def _over_half_a_turn(theta: Floats) -> bool:
+def _covers_half_a_turn(theta: Floats) -> bool:
     half_turn = np.sort(np.mod(theta, np.pi))
     gap = np.diff(half_turn, append=half_turn[0] + np.pi).max()
     return bool(gap <= max(_WIDEST_GAP, 4 * np.pi / len(theta)))
@@ -279,7 +279,7 @@ def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
 
 
 def _power(part: Floats) -> int:
-    """By which frequencies weigh: low ones suffer from bad air and truncation, high ones from noise."""
+    """Exponent of the frequency by which residuals weigh: 2 where the rim is not air, which spoils low ones, else 1."""
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
     return 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
 

@@ -107,12 +107,12 @@ def _samples(first, step, low0, low1, j0, j1, across, along, at, share):  # type
 @njit(cache=True, boundscheck=False, error_model="numpy")
 def _columns(rays, v, low0, low1, j0, j1):  # type: ignore[no-untyped-def]
     """Columns first..end (excluded) beyond which no ray of a parallel view has samples there (see `_samples`)."""
-    cols, step = rays.shape[1], rays[v, 0, 1]
-    per_col = (rays[v, cols - 1, 0] - rays[v, 0, 0]) / max(cols - 1, 1)
+    cols, step = rays.shape[1], rays[v, 0, STEP]
+    per_col = (rays[v, cols - 1, AT] - rays[v, 0, AT]) / max(cols - 1, 1)
     if per_col == 0.0:
         return 0, cols
-    end0 = (low0 - max(step * j0, step * (j1 - 1)) - rays[v, 0, 0]) / per_col
-    end1 = (low1 - min(step * j0, step * (j1 - 1)) - rays[v, 0, 0]) / per_col
+    end0 = (low0 - max(step * j0, step * (j1 - 1)) - rays[v, 0, AT]) / per_col
+    end1 = (low1 - min(step * j0, step * (j1 - 1)) - rays[v, 0, AT]) / per_col
     if end1 < end0:
         end0, end1 = end1, end0
     return int(min(max(end0 - 1.0, 0.0), cols)), int(min(max(end1 + 2.0, 0.0), cols))

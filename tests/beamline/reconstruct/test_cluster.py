@@ -1,4 +1,4 @@
-"""Slabs by workers of dask.distributed: the same bits, whoever makes them and whoever is lost."""
+"""Slabs made by workers of dask.distributed are equal to the bit, also after a worker is lost."""
 
 from __future__ import annotations
 

@@ -109,3 +109,8 @@ def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         slurm_jobs("slurm")
     monkeypatch.setattr(slurm.shutil, "which", lambda name: name)
     assert slurm_jobs("slurm") == SlurmJobs() and is_slurm("slurm:x.yaml") and not is_slurm("local:3")
+
+
+def test_slabs_fit_a_job() -> None:
+    assert SlurmJobs(memory="32GB").bytes == 32 * 10**9
+    assert SlurmJobs(memory="4 GiB").bytes == 4 * 2**30
