@@ -1,9 +1,10 @@
 """Whole commands by width: CPU and wall seconds a slice, and the peak of memory beside the plan's.
 
-    python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS]
+    python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS LIMIT]
 
 The scan is one TIFF of line integrals with the noise of 10 000 photons, of grains in a cylinder. One warm-up of 64
-columns compiles. A command that takes longer than ten minutes is ended.
+columns compiles. A command that takes longer
+than LIMIT seconds (600) is ended.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 
 _PHOTONS = 1e4
-_LIMIT = 600  # s
 _MEMORY = "16G"
 
 
@@ -53,7 +53,7 @@ def command(path: Path, method: str, cols: int, *more: str) -> list[str]:
     return [sys.executable, "-m", "beamline.cli.main", "recon", str(path), "-m", method, *options, *output, *more]
 
 
-def measure(folder: Path, method: str, cols: int, rows: int = 64, views: int = 90) -> None:
+def measure(folder: Path, method: str, cols: int, rows: int = 64, views: int = 90, limit: int = 600) -> None:
     small, path = folder / "warm.tif", folder / f"{cols}x{rows}x{views}.tif"
     for scan, size in ((small, (64, 16, 24)), (path, (cols, rows, views))):
         if not scan.exists():
@@ -66,9 +66,9 @@ def measure(folder: Path, method: str, cols: int, rows: int = 64, views: int = 9
     plan = json.loads(said.stdout.splitlines()[-1])
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     try:
-        subprocess.run(command(path, method, cols), check=True, capture_output=True, timeout=_LIMIT)
+        subprocess.run(command(path, method, cols), check=True, capture_output=True, timeout=limit)
     except subprocess.TimeoutExpired:
-        print(f"{method}, {cols} columns: more than {_LIMIT} s", flush=True)
+        print(f"{method}, {cols} columns: more than {limit} s", flush=True)
         return
     wall, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
     busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
