@@ -80,16 +80,11 @@ def slurm_jobs(spec: str) -> SlurmJobs:
         raise ConfigError(f"--cluster {spec}: {wrong}. Keys: {', '.join(SlurmJobs.model_fields)}.") from error
 
 
-@contextmanager
-def submitted(jobs: SlurmJobs) -> Iterator[Any]:
-    """The cluster of these jobs, which are submitted, and cancelled when the block ends.
-
-    Raises:
-        RuntimeError: Slurm refuses them.
-    """
+def _cluster(jobs: SlurmJobs) -> Any:
+    """The cluster of these jobs, of which none is submitted."""
     from dask_jobqueue import SLURMCluster
 
-    with SLURMCluster(
+    return SLURMCluster(
         cores=1,  # slabs that a worker makes at a time
         processes=1,
         job_cpu=jobs.cores,
@@ -102,10 +97,43 @@ def submitted(jobs: SlurmJobs) -> Iterator[Any]:
         job_script_prologue=list(jobs.prologue),
         worker_extra_args=["--memory-limit", "0", "--no-dashboard"],
         scheduler_options={"dashboard": False},
-    ) as cluster:
-        # What Slurm refuses when the library submits it, nobody would hear of.
-        looked = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
-        if looked.returncode:
-            raise RuntimeError(looked.stderr.strip() or f"sbatch ended with {looked.returncode}")
+    )
+
+
+def _refuse_refused(cluster: Any) -> None:
+    """Raises RuntimeError where Slurm would refuse the cluster's jobs.
+
+    What it refuses when the library submits it, nobody would hear of.
+    """
+    looked = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
+    if looked.returncode:
+        raise RuntimeError(looked.stderr.strip() or f"sbatch ended with {looked.returncode}")
+
+
+def refuse_slurm(spec: str) -> None:
+    """Ask Slurm whether it would take the jobs of `slurm` or `slurm:CONFIG.yaml`; none is submitted.
+
+    Raises:
+        ConfigError: it would not, or as `slurm_jobs`.
+    """
+    try:
+        with _cluster(slurm_jobs(spec)) as cluster:
+            _refuse_refused(cluster)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise ConfigError(
+            f"--cluster {spec}: Slurm refuses the jobs ({' '.join(str(error).split())}). Mend the configuration of "
+            "the jobs, and ask Slurm with sinfo what there is. Nothing was read."
+        ) from error
+
+
+@contextmanager
+def submitted(jobs: SlurmJobs) -> Iterator[Any]:
+    """The cluster of these jobs, which are submitted, and cancelled when the block ends.
+
+    Raises:
+        RuntimeError: Slurm refuses them.
+    """
+    with _cluster(jobs) as cluster:
+        _refuse_refused(cluster)
         cluster.scale(jobs=jobs.jobs)
         yield cluster

@@ -11,7 +11,7 @@ import pytest
 
 import recon
 from beamline.core.errors import ConfigError
-from beamline.reconstruct import slurm
+from beamline.reconstruct import finished, slurm
 from beamline.reconstruct.cluster import connected
 from beamline.reconstruct.slurm import SlurmJobs, is_slurm, slurm_jobs
 from recon.base.decisions import Decisions
@@ -19,6 +19,8 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, RunControl
 from recon.base.volume import Grid
 from recon.voxels.methods.sirt import Sirt
+from tests.beamline.cli.small_scan import beamline
+from tests.beamline.scans import TwoCylinders, write_exchange
 
 # Keeps the script, and runs it as Slurm would, in a group of its own.
 SBATCH = """#!/bin/sh
@@ -74,6 +76,19 @@ def test_what_slurm_refuses_is_an_error_at_once(fake: Path) -> None:
     (fake / "sbatch").write_text("#!/bin/sh\ncat > /dev/null\necho 'invalid partition specified: day' >&2\nexit 1\n")
     with pytest.raises(ConfigError, match=r"not submitted .*invalid partition"), connected("slurm"):
         pytest.fail("nothing was submitted")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no shell")
+@pytest.mark.filterwarnings("ignore")
+def test_slurm_is_asked_before_the_scan_is_read(fake: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
+    (fake / "sbatch").write_text("#!/bin/sh\ncat > asked.sh\necho 'invalid partition specified: day' >&2\nexit 1\n")
+    write_exchange(Path("scan.h5"), TwoCylinders(angles=np.radians(np.arange(0, 180, 20.0)), shape=(4, 16), axis_col=8))
+    monkeypatch.setattr(finished, "prepare_within", lambda *_: pytest.fail("too late"))
+    result = beamline("recon", "scan.h5", "-m", "sirt", "--cluster", "slurm", "-o", "out.h5")
+    assert result.exit_code == 2 and "invalid partition specified: day" in result.stderr, result.output
+    assert "--cpus-per-task=8" in Path("asked.sh").read_text()
+    assert not list(fake.glob("out*"))
 
 
 @pytest.mark.parametrize(
