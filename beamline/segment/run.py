@@ -130,21 +130,12 @@ def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
     box: Box = slice(0, nz), slice(0, ny), slice(0, nx)
     if options.margin is not None:
         box = inscribed_box(volume.grid.shape, sample_circle(volume.data), options.margin)
-        volume = _cut(volume, box)
+        volume = Volume(np.ascontiguousarray(volume.data[box]), volume.grid.part(*box))
     grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
     found = clusters(grey, options.n_clusters, options.seed)
     labels = parted(cleaned(grey > found.threshold, options.radius, options.smallest), options.neck)
-    first = tuple(float(axis[0]) for axis in volume.grid.coordinates())
-    particles = measured(labels, volume.grid.spacing, first)  # type: ignore[arg-type]
+    particles = measured(labels, volume.grid.spacing, volume.grid.first)
     return Segmented(box, volume, unit, labels, found, particles)
-
-
-def _cut(volume: Volume, box: Box) -> Volume:
-    axes = [axis[part] for axis, part in zip(volume.grid.coordinates(), box, strict=True)]
-    z, y, x = ((float(axis[0]) + float(axis[-1])) / 2 for axis in axes)
-    shape = len(axes[0]), len(axes[1]), len(axes[2])
-    grid = Grid(shape, volume.grid.voxel_size, (z, y, x), volume.grid.slice_pitch)
-    return Volume(np.ascontiguousarray(volume.data[box]), grid)
 
 
 def _read(options: SegmentOptions) -> tuple[Volume, str]:

@@ -177,11 +177,16 @@ class Geometry:
     def axes(self, view: int) -> F64:
         """Unit vectors [3, 3] of one view in the object's frame: along the columns, along the rows, along the beam."""
         c, s = math.cos(self.angles[view]), math.sin(self.angles[view])
-        u, v, d = np.array([c, s, 0.0]), np.array([0.0, 0.0, 1.0]), np.array([-s, c, 0.0])
         ct, st = math.cos(self.tilt[view]), math.sin(self.tilt[view])
-        v, d = ct * v + st * d, ct * d - st * v
         cr, sr = math.cos(self.roll[view]), math.sin(self.roll[view])
-        return np.stack((cr * u + sr * v, cr * v - sr * u, d))
+        (u0, u1, u2), (v0, v1, v2) = (c, s, 0.0), (-s * st, c * st, ct)
+        return np.array(
+            (
+                (cr * u0 + sr * v0, cr * u1 + sr * v1, cr * u2 + sr * v2),
+                (cr * v0 - sr * u0, cr * v1 - sr * u1, cr * v2 - sr * u2),
+                (-s * ct, c * ct, -st),
+            )
+        )
 
     def origin(self, view: int) -> tuple[float, float]:
         """Pixel (col, row) of the origin of the object's frame in one view."""

@@ -107,12 +107,19 @@ class Grid:
         middle = np.asarray(self.centre[::-1])
         return np.stack((middle - half, middle + half))
 
+    @property
+    def first(self) -> tuple[float, float, float]:
+        """Centre (z, y, x) of voxel [0, 0, 0] in mm."""
+        return tuple(  # type: ignore[return-value]
+            c - (n - 1) / 2 * edge for n, c, edge in zip(self.shape, self.centre, self.spacing, strict=True)
+        )
+
     def part(self, z: slice, y: slice, x: slice) -> Grid:
         """The box of these voxels, slices with first and end."""
-        slices, lowest = (z, y, x), [axis[0] for axis in self.coordinates()]
+        slices = (z, y, x)
         centre = tuple(
-            low + (part.start + part.stop - 1) / 2 * edge
-            for low, part, edge in zip(lowest, slices, self.spacing, strict=True)
+            first + (part.start + part.stop - 1) / 2 * edge
+            for first, part, edge in zip(self.first, slices, self.spacing, strict=True)
         )
         nz, ny, nx = (part.stop - part.start for part in slices)
         return replace(self, shape=(nz, ny, nx), centre=centre)

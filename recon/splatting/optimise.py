@@ -215,11 +215,7 @@ def _smooth(state: FitState, problem: FitProblem, settings: FitSettings, weight:
     side = tv_size(settings, grid)
     size = tuple(min(side, n) for n in grid.shape)
     corner = [int(state.rng.integers(0, n - s + 1)) for n, s in zip(grid.shape, size, strict=True)]
-    centre = tuple(
-        float(axis[c] + (s - 1) / 2 * edge)
-        for axis, c, s, edge in zip(grid.coordinates(), corner, size, grid.spacing, strict=True)
-    )
-    box = Grid(size, grid.voxel_size, centre, grid.slice_pitch)  # type: ignore[arg-type]
+    box = grid.part(*(slice(c, c + s) for c, s in zip(corner, size, strict=True)))
     cut = settings.truncation
     found = run.box(box, cut.faint / problem.half_field, cut.sigmas)
     half = np.float32(problem.half_field)

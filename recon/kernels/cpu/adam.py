@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numba import njit, prange
@@ -49,6 +50,12 @@ def _adam(
             lanes.store_first(p, 0, j, lanes.clamp(value, low, high), count)
 
 
+@lru_cache(maxsize=16)
+def _tasks(sizes: tuple[int, ...]) -> NDArray[np.int64]:
+    found = [(k, begin) for k, size in enumerate(sizes) for begin in range(0, size, _TASK)]
+    return np.array(found, np.int64).reshape(-1, 2)
+
+
 def adam_all(
     parameters: Sequence[F32],
     gradients: Sequence[F32],
@@ -76,12 +83,11 @@ def adam_all(
                 f"a parameter, its gradient and its moments must be C-contiguous and of one shape: {shapes}"
             )
     limits = [(-_WIDEST, _WIDEST) if b is None else b for b in bounds or [None] * len(parameters)]
-    tasks = [(k, begin) for k, p in enumerate(parameters) for begin in range(0, p.size, _TASK)]
     scale1, scale2 = 1 / (1 - BETA1**step), 1 / (1 - BETA2**step)
     _adam(
         *(tuple(a.reshape(1, -1) for a in arrays) for arrays in lists),
         np.array([rate * scale1 for rate in rates], np.float32), np.array(limits, np.float32), scale2, eps,
-        np.array(tasks, np.int64).reshape(-1, 2),
+        _tasks(tuple(p.size for p in parameters)),
     )  # fmt: skip
 
 

@@ -181,6 +181,6 @@ def render_view(
 
 def grid_layout(active: Active, grid: Grid, faint: float, sigmas: float) -> Layout:
     """Layout of Gaussians on a grid, for filling it and its backward pass; `faint` is a density."""
-    z, y, x = (float(axis[0]) for axis in grid.coordinates())
+    z, y, x = grid.first
     parameters = (active.means, active.scales, active.rotations, active.densities)
     return Layout(*parameters, (x, y, z), grid.spacing, grid.shape, faint, sigmas, active.kernel)

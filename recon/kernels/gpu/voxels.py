@@ -112,7 +112,7 @@ def place(
 ) -> Placed:  # fmt: skip
     """Place Gaussians on a grid, cut off below `faint` (a density) and at `cut` σ, compact ones at their end."""
     n = densities.shape[0]
-    z, y, x = (float(axis[0]) for axis in grid.coordinates())
+    z, y, x = grid.first
     nz, ny, nx = grid.shape
     edge_z, _, edge_x = grid.spacing
     placed = Placed(
