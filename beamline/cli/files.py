@@ -1,4 +1,4 @@
-"""`beamline info`, `validate`, `recover`, `ingest`: describes, checks and mends a scan file, converts a TIFF to one."""
+"""`beamline info`, `validate`, `recover`, `ingest`, `archive`: describe, check, mend, convert, compress scans."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
-from beamline.core.text import printable
+from beamline.core.text import count, printable, size, spans
 from beamline.scan.resume import recover_run
+from beamline.storage.archive import CODECS
+from beamline.storage.archive import archive as archive_scan
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
@@ -85,11 +87,11 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
             for finding in findings:
                 sink(Event("flag", now, vars(finding)))
             sink(Event("done", now, {"file": file, **counts}))
-    errors = _count(counts["error"], "error")
+    errors = count(counts["error"], "error")
     if not as_json:
         for finding in findings:
             click.echo(f"{finding.severity:<9}{finding.rule:<16}{finding.message}")
-        click.echo(f"{file}: {errors}, {_count(counts['warning'], 'warning')}")
+        click.echo(f"{file}: {errors}, {count(counts['warning'], 'warning')}")
     if counts["error"]:
         raise DataError(f"{file}: {errors} against the rules that readers rely on; stdout lists them.")
 
@@ -112,10 +114,6 @@ def recover(file: Path, as_json: bool) -> None:
                 sink(Event("done", SystemClock().now(), vars(done)))
     if not as_json:
         click.echo("\n".join(done.said() for done in found))
-
-
-def _count(n: int, word: str) -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 @click.command()
@@ -162,3 +160,40 @@ def ingest(
     click.echo(f"output   {done.path} ({done.definition})")
     click.echo(f"frames   {done.frames}, {done.invalid_frames} without a valid pixel")
     click.echo(f"speed    {done.pixel_bytes / max(seconds, 1e-9) / 1e6:.0f} MB/s")
+
+
+@click.command()
+@click.argument("scan", type=_PATH)
+@click.option("-o", "--output", metavar="FILE", type=_PATH, required=True, help="The archive to write.")
+@click.option(
+    "--codec",
+    type=click.Choice([*CODECS]),
+    default=next(iter(CODECS)),
+    show_default=True,
+    help="Compressor, all lossless. blosc2: zstd of bits in planes. bitshuffle-lz4: fast, and most widely read.",
+)
+@click.option("--keep-damaged", is_flag=True, help="Archive frames that differ from their checksum, as they are.")
+@json_option
+def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: bool) -> None:
+    """Write a compressed copy of the HDF5 scan SCAN, and compare every frame of it with SCAN.
+
+    The copy is lossless and opens like SCAN. Each frame is read back from the finished file and compared by its CRC-32.
+    SCAN is never deleted: the command says when that may be done. Nothing is overwritten, and a failure leaves nothing.
+    """
+    clock = SystemClock()
+    began = clock.now()
+    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+        refuse_existing(output)
+        progress = counting("archive", fan_out(*(json_sinks or [terminal])), clock)
+        done = archive_scan(scan, output, codec, keep_damaged=keep_damaged, progress=progress)
+        facts = {**vars(done), "codec": codec, "ratio": done.raw_bytes / done.bytes, "seconds": clock.now() - began}
+        for sink in json_sinks:
+            sink(Event("done", clock.now(), facts))
+    if as_json:
+        return
+    click.echo(f"output   {output} ({codec})")
+    click.echo(f"size     {size(done.raw_bytes)} -> {size(done.bytes)}, ratio {facts['ratio']:.2f}")
+    click.echo(f"speed    {done.raw_bytes / max(facts['seconds'], 1e-9) / 1e6:.0f} MB/s, written and compared")
+    if done.damaged:
+        click.echo(f"damaged  {count(len(done.damaged), 'frame')} of {scan}, kept as they are: {spans(done.damaged)}")
+    click.echo(f"verified {count(done.frames, 'frame')}, each as in {scan}: the raw may be deleted")

@@ -49,6 +49,7 @@ _COMMANDS = {
     "info": _Entry("files", "Describe a scan file or a volume."),
     "validate": _Entry("files", "Check a scan file or a volume against the rules of its format."),
     "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
+    "archive": _Entry("files", "Write a compressed copy of a scan file, compared with it frame by frame."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor."),
     "ingest": _Entry("files", "Convert a multi-page TIFF into an HDF5 scan, page by page."),
     "export": _Entry(

@@ -87,6 +87,8 @@ class Terminal:
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
             self._show("frames", event.data["n"], event.data["of"], rate_text(event.data))
+        elif event.event == "progress" and event.data.get("stage") == "archive":
+            self._show("written and compared", event.data["n"], event.data["of"], rate_text(event.data, "MB"))
         elif event.event == "progress" and event.data.get("stage") == "axes":
             self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
         elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:

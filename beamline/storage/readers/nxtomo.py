@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
-from beamline.monitor.digest import checksum_of
+from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.hdf5 import require_real
@@ -204,9 +204,7 @@ class NXtomoSource(ScanReader):
         return whole[0]
 
     def _compared(self, row: int, image: NDArray[Any]) -> NDArray[Any]:
-        """The image. Its checksum may be that of swapped bytes: `ingest` wrote such of big-endian frames."""
-        said = self._checksums[row]
-        if said != checksum_of(image) and said != checksum_of(image.byteswap()):
+        if not has_checksum(image, int(self._checksums[row])):
             self._damaged.add(int(row))
         return image
 
