@@ -29,7 +29,7 @@ JOINED = "joined.h5"
 
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
-_MADE_ANEW = ("/exchange", "/implements", f"{layout.DETECTOR}/image_key_control")
+_MADE_ANEW = ("/exchange", "/implements", layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_in(file: h5py.File) -> frozenset[int]:

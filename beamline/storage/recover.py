@@ -115,7 +115,7 @@ def _finished(path: Path, file: h5py.File) -> Recovered:
         if hdf5.text(file[layout.STATUS][()]) == "running":
             file[layout.STATUS][()] = b"failed"
         file[layout.FINISHED][()] = 1
-    for name in ("exchange", "implements", f"{layout.DETECTOR}/image_key_control"):  # where the writer died in these
+    for name in ("exchange", "implements"):  # where the writer died in these
         with suppress(KeyError):
             del file[name]
     layout.settle(file)

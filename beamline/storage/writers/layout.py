@@ -1,8 +1,8 @@
 """The layout of our HDF5 scans: every path, type and unit, made once before the first frame and only grown after.
 
     /entry                      NXentry, definition NXtomo (NeXus definitions 2026.01): title, start_time, end_time
-      instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, count_time (s),
-                                x_pixel_size, y_pixel_size, distance (mm)
+      instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
+                                count_time (s), x_pixel_size, y_pixel_size, distance (mm), field_of_view
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
@@ -15,8 +15,9 @@
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
 
-image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind and in image_key_control, ESRF's
-extension, which is added at the end of a scan that has such frames (validators refuse it in others).
+image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind. image_key_control (a link to it),
+field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo, without which its
+programs (nabu) take a file for one of another kind, or leave out its darks and flats.
 Float frames are no NXtomo (its data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
 """
 
@@ -36,17 +37,23 @@ from numpy.typing import NDArray
 from beamline.core.version import version
 from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
+from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
+from recon.base.geometry import Geometry
 
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
+ESRF_VERSION = 1.5
+"""Of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest that has all of ours."""
 
 ENTRY = "/entry"
 DETECTOR = "/entry/instrument/detector"
 DATA = f"{DETECTOR}/data"
 IMAGE_KEY = f"{DETECTOR}/image_key"
+IMAGE_KEY_CONTROL = f"{DETECTOR}/image_key_control"
+FIELD_OF_VIEW = f"{DETECTOR}/field_of_view"
 ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
 PREVIEW = "/entry/digest/preview"
@@ -60,11 +67,13 @@ MISSING = "/entry/progress/missing_triggers"
 PART_STARTS = "/entry/record/part_starts"
 END_TIME = "/entry/end_time"
 BEAM = "/entry/record/beam"
+AXIS_COL = "/entry/record/axis_col"
 SOURCE_DISTANCE = "/entry/record/source_distance"
 """Of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes for cones."""
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
+_TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
 
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {  # path: (type, unit)
@@ -194,7 +203,7 @@ def create(
         ("/entry/instrument/beam/incident_energy", info.energy_kev, "keV"),
         ("/entry/record/exposure", info.exposure, "s"),
         ("/entry/record/period", info.period, "s"),
-        ("/entry/record/axis_col", info.axis_col, "pixel"),
+        (AXIS_COL, info.axis_col, "pixel"),
     ):
         if value is not None:
             file[path] = np.float64(value)
@@ -231,6 +240,7 @@ def create(
             file[f"{BEAM}/{name}"].attrs["units"] = unit
         file[f"{BEAM}/time"].attrs["description"] = "since 1970-01-01T00:00:00Z"
     _nxdata(file, rows, cols, info.pixel_size_mm)
+    _declare(file)
 
     file[COMMITTED] = np.int64(0)
     file[FINISHED] = np.int8(0)
@@ -318,9 +328,35 @@ def settle(file: h5py.File) -> None:
         end = _end_time(file)
         del file[END_TIME]
         file[END_TIME] = end
-    kinds = file[KIND][()]
-    if (kinds == FrameKind.ALIGNMENT).any():
-        file[f"{DETECTOR}/image_key_control"] = kinds
+    _declare(file)
+    field = _field_of_view(file)
+    if FIELD_OF_VIEW in file:
+        del file[FIELD_OF_VIEW]
+    if field:
+        file[FIELD_OF_VIEW] = field
+
+
+def _declare(file: h5py.File) -> None:
+    """What ESRF's programs know an NXtomo by, also in a file of an earlier version."""
+    entry = file[ENTRY]
+    entry.attrs["definition"] = hdf5.text(file["/entry/definition"][()])
+    entry.attrs["version"] = ESRF_VERSION
+    if IMAGE_KEY_CONTROL in file:
+        del file[IMAGE_KEY_CONTROL]
+    file[IMAGE_KEY_CONTROL] = file[KIND]
+
+
+def _field_of_view(file: h5py.File) -> str:
+    """`Half` where a full turn sees half of the sample at a time; "" where angles or the axis are not known."""
+    angles = np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
+    if not np.isfinite(angles).all():
+        return ""
+    if angles.size < 2 or np.ptp(angles) * angles.size / (angles.size - 1) < 2 * np.pi - _TURN_TOLERANCE:
+        return "Full"
+    if AXIS_COL not in file:
+        return ""
+    geometry = Geometry.parallel(angles, file[DATA].shape[1:], axis_col=float(file[AXIS_COL][()]))
+    return "Half" if geometry.is_off_middle else "Full"
 
 
 def _end_time(file: h5py.File) -> str:

@@ -170,10 +170,32 @@ def test_an_alignment_frame_is_a_projection_to_those_who_do_not_know_it(write: W
         assert file["entry/instrument/detector/image_key"][14] == 0
         assert file["entry/instrument/detector/image_key_control"][14] == -1
         assert file["exchange/data"].shape[0] == 9
-    with h5py.File(write(frames, "plain.h5")) as file:  # type: ignore[call-arg]
-        assert "image_key_control" not in file["entry/instrument/detector"]
+        assert file["entry/instrument/detector/image_key_control"] == file["entry/frame_log/kind"]
     with open_scan(path) as source:
         assert source.image_key[14] == FrameKind.ALIGNMENT
+
+
+@pytest.mark.parametrize(
+    ("turn", "axis", "field"),
+    [(180.0, None, b"Full"), (360.0, 7.5, b"Full"), (360.0, 11.0, b"Half"), (360.0, None, None), (np.nan, 7.5, None)],
+)
+def test_what_the_programs_of_esrf_know_an_nxtomo_by(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], turn: float, axis: float | None, field: bytes | None
+) -> None:
+    path, views = tmp_path / "s.h5", frames[5:]
+    with NXtomoWriter(path, replace(INFO, axis_col=axis), SHAPE, clock=clock) as writer:
+        for i, frame in enumerate(views):
+            turned = replace(frame, index=i, angle=np.radians(turn) * i / len(views))
+            writer.append(turned, digest(frame.counts))
+        writer.flush()
+        assert h5py.File(path, "r", swmr=True)["entry"].attrs["definition"] == "NXtomo"  # while it grows, too
+    for _ in range(2):  # settled again, as `recover` does it, a file has the same
+        with h5py.File(path, "r+", libver=layout.LIBVER) as file:
+            detector, entry = file["entry/instrument/detector"], file["entry"]
+            assert (entry.attrs["definition"], entry.attrs["version"]) == ("NXtomo", 1.5)
+            assert detector["image_key_control"] == file["entry/frame_log/kind"]
+            assert (detector["field_of_view"][()] if "field_of_view" in detector else None) == field
+            layout.settle(file)
 
 
 def test_an_exception_inside_leaves_a_failed_but_readable_file(
