@@ -17,7 +17,7 @@ def underscored(ctx: click.Context, param: click.Parameter, value: str | None) -
 
 
 def scan_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --quantity, --angles, --angle-rows, --darks and --flats: the fields of SourceOptions."""
+    """Adds --quantity, --angles, --angle-rows, --darks, --flats, --data-path ...: the fields of SourceOptions."""
     for option in reversed(_OPTIONS):
         command = option(command)
     return command
@@ -34,4 +34,19 @@ _OPTIONS = (
     click.option("--angle-rows", metavar="A:B", help="Lines of --angles that belong to the projections."),
     click.option("--darks", type=_PATH, help="Image file or folder with darks, instead of those in the file."),
     click.option("--flats", type=_PATH, help="Image file or folder with flats, instead of those in the file."),
+    click.option(
+        "--data-path",
+        metavar="DATASET",
+        help="For an HDF5 file of any layout: its projections [frame, row, col], e.g. /raw/images.",
+    ),
+    click.option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
+    click.option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),
+    click.option(
+        "--angles-path",
+        metavar="DATASET",
+        help="For any HDF5 file: its angles, one for each projection or frame, in the unit that the dataset states.",
+    ),
+    click.option(
+        "--angles-unit", type=click.Choice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."
+    ),
 )

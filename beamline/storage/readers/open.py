@@ -15,6 +15,7 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
 from beamline.storage.readers.overlay import Overlay
+from beamline.storage.readers.stacks import contents, named_angles, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeries
 
@@ -43,6 +44,10 @@ class SourceOptions:
             projection, or one for each frame.
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
         darks, flats: replace the file's; they come before its frames.
+        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are.
+        darks_path, flats_path: for `data_path`: where its darks and flats are.
+        angles_path: of any HDF5 file: where the angles are, instead of `angles`.
+        angles_unit: "deg" or "rad", of these, instead of what the file says.
     """
 
     path: Path | str
@@ -51,6 +56,11 @@ class SourceOptions:
     angle_rows: str | None = None
     darks: Images | None = None
     flats: Images | None = None
+    data_path: str | None = None
+    darks_path: str | None = None
+    flats_path: str | None = None
+    angles_path: str | None = None
+    angles_unit: str | None = None
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The scan with these replacements; see `open_scan`."""
@@ -70,12 +80,18 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
     path, angles, darks, flats = Path(options.path), options.angles, options.darks, options.flats
-    if follow and (angles is not None or darks is not None or flats is not None):
-        raise DataError(f"{path} cannot be followed with --angles, --darks or --flats: its counts still change.")
-    base = _open(path, Opening(follow, own_angles=angles is None))
+    _refuse(options, follow)
+    if options.data_path is not None:
+        with hdf5.readable(path):
+            base: ScanReader = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
+    else:
+        base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
         table = None if angles is None else load_angles(angles)
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
+        if options.angles_path is not None:
+            angles_from = f"{options.angles_path} in {path}"
+            table = named_angles(path, options.angles_path, options.angles_unit)
         if table is None and isinstance(base, TiffSeries) and base.angle_text is not None:
             angles_from = f"{base.angle_text[0]} in {path}"
             table = parse_angles(base.angle_text[1], angles_from)
@@ -106,4 +122,24 @@ def _open(path: Path, opening: Opening) -> ScanReader:
     if not hdf5.is_hdf5(path):
         raise DataError(f"{path} is neither HDF5 nor TIFF; a scan is one of these, or a folder or .zip of TIFFs.")
     known = ", ".join(kind.name for kind in FORMATS)
-    raise DataError(f"{path} holds no scan of a format that is read: {known}.")
+    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+        held = contents(file)
+    raise DataError(
+        f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
+        "--angles-path, --darks-path, --flats-path."
+    )
+
+
+def _refuse(options: SourceOptions, follow: bool) -> None:
+    """DataError for what does not go together."""
+    own = ("angles", "darks", "flats", "data_path", "angles_path")
+    replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
+    if follow and replaced:
+        raise DataError(f"{options.path} cannot be followed with {', '.join(replaced)}: its counts still change.")
+    for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
+        if getattr(options, one) is not None and getattr(options, other) is not None:
+            raise DataError(f"--{one} and --{other.replace('_', '-')} name the same thing twice: give one of them.")
+    for name, needed in (("darks_path", "data_path"), ("flats_path", "data_path"), ("angles_unit", "angles_path")):
+        if getattr(options, name) is not None and getattr(options, needed) is None:
+            dashed = (f"--{each.replace('_', '-')}" for each in (name, needed))
+            raise DataError("{} is for a file whose layout is not known: give {}, too.".format(*dashed))

@@ -1,0 +1,145 @@
+"""StacksSource: an HDF5 file with a dataset of projections and others of darks and flats, under any names.
+
+Such a layout does not say when the references were taken: the frames are numbered darks first, then flats, then
+projections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.readers.base import WHOLE, Attributes, ScanReader, frame_indices
+from drivers.frame import FrameKind
+
+_LISTED = 10  # datasets of a file that an error names
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Frames of one kind. `frames`: [frame, row, col], an h5py.Dataset, or an array; `name`: for messages."""
+
+    kind: FrameKind
+    name: str
+    frames: Any
+
+
+class StacksSource(ScanReader):
+    """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
+
+    Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
+    """
+
+    def __init__(self, file: h5py.File, stacks: Sequence[Stack], *, name: str, facts: Attributes) -> None:
+        """Take over an open file. Angles are NaN; `stacks` are in the order of the frames, the projections last."""
+        self.path, self.format, self.facts = Path(file.filename), name, facts
+        self._file, self._stacks = file, stacks
+        self._check()
+        sizes = [len(stack.frames) for stack in stacks]
+        self._starts = np.cumsum([0, *sizes])
+        views = stacks[-1].frames
+        self.shape = tuple(views.shape[1:])
+        self.dtype = np.result_type(*(stack.frames.dtype for stack in stacks))
+        self.image_key = np.repeat([stack.kind for stack in stacks], sizes).astype(np.int32)
+        self.angles = np.full(self.image_key.size, np.nan)
+        self.exposures = np.full(self.image_key.size, np.nan)
+        kinds = {stack.kind for stack in stacks}
+        self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
+
+    def _check(self) -> None:
+        views = self._stacks[-1]
+        for stack in self._stacks:
+            hdf5.require_real(stack.frames.dtype, f"{stack.name} in {self.path}")
+            if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
+                shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
+                raise DataError(f"{self.path}: expected frames [frame, row, col] of one shape, found {shapes}.")
+            if isinstance(stack.frames, h5py.Dataset):
+                hdf5.require_possible(stack.frames)
+                lost = hdf5.missing_links(stack.frames)
+                if lost:
+                    raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
+        if not len(views.frames):
+            raise DataError(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        """Pixels [frame, row, col] of the frames asked for, in that order; darks and flats are cast to dtype."""
+        indices = frame_indices(frames, self.image_key.size)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        for stack, first, last in zip(self._stacks, self._starts[:-1], self._starts[1:], strict=True):
+            wanted = np.flatnonzero((indices >= first) & (indices < last))
+            if wanted.size:
+                part = np.empty((wanted.size, *out.shape[1:]), stack.frames.dtype)
+                hdf5.read_frames(stack.frames, indices[wanted] - first, rows, part)
+                out[wanted] = part
+        return out
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> StacksSource:
+    """The scan whose datasets have these paths in an HDF5 file. A dark or flat may be a single image [row, col].
+
+    DataError where one is not there, or is no stack of frames; the message names the datasets that the file has.
+    """
+    file = hdf5.open_hdf5(path)
+    try:
+        given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats), (FrameKind.PROJECTION, data))
+        stacks = []
+        for kind, where in given:
+            if where is not None:
+                item = named(file, where)
+                image = item.ndim == 2 and kind != FrameKind.PROJECTION
+                stacks.append(Stack(kind, where, item[()][None] if image else item))
+        return StacksSource(file, stacks, name="hdf5_stacks", facts={"data": data})
+    except BaseException:
+        file.close()
+        raise
+
+
+def named_angles(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
+    """Radians of the dataset `where` of an HDF5 file, a list or a column, by `unit` or its attribute `units`.
+
+    Args:
+        unit: "deg" or "rad", whatever the attribute says; None: as that says.
+
+    Raises:
+        DataError: it is not there, is no list, or nothing says its unit.
+    """
+    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+        item = named(file, where)
+        if item.ndim == 0 or item.size != max(item.shape):
+            raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
+        hdf5.require_real(item.dtype, f"{where} in {path}")
+        said = unit or hdf5.attribute(item, "units")
+        factor = hdf5.ANGLE_UNITS.get(said.lower())
+        if factor is None:
+            found = f"the units {said!r}" if said else "no attribute `units`"
+            raise DataError(f"{where} in {path} has {found}: say --angles-unit deg or --angles-unit rad.")
+        return np.ravel(np.asarray(item[()], np.float64)) * factor
+
+
+def named(file: h5py.File, where: str) -> h5py.Dataset:
+    """The dataset at a path; DataError where there is none, with those that the file has."""
+    item = hdf5.dataset(file, where)
+    if item is None:
+        raise DataError(f"{file.filename} has no dataset {where}. {contents(file)}")
+    return item
+
+
+def contents(file: h5py.File) -> str:
+    """A sentence on the datasets of a file and their shapes, the largest first."""
+    found: list[h5py.Dataset] = []
+    file.visititems(lambda _, item: found.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
+    found.sort(key=lambda item: (-item.ndim, -item.size))
+    shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in found[:_LISTED]]
+    more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."

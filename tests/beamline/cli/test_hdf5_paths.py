@@ -1,0 +1,83 @@
+"""A scan in a layout of its own gives, by the names of its datasets, what the same scan gives in ours."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.storage.readers.open import open_scan
+from beamline.storage.writers.recon_file import read_reconstruction
+from tests.beamline.cli.small_scan import SCAN, beamline
+from tests.beamline.scans import BEAM, DARK, frames_of, write_flagged
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+NAMES = ("--data-path", "/p/a", "--darks-path", "/p/d", "--flats-path", "/p/f", "--angles-path", "/m/o")
+LAYOUT = (*NAMES, "--angles-unit", "rad")
+FBP = ("-m", "fbp", "--axis", "20.7", "--pixel-size-um", "500", "--no-report")
+
+
+@pytest.fixture
+def foreign(folder: Path) -> Path:
+    """SCAN as another beamline may write it; the same frames in our own file are ours.h5."""
+    frames = frames_of(SCAN)
+    images = np.array([frame.counts for frame in frames])
+    write_flagged(folder / "ours.h5", frames, {}, pixel_size_mm=SCAN.pixel_size_mm)
+    with h5py.File(folder / "f.h5", "w") as file:
+        file["p/d"], file["p/f"], file["p/a"], file["m/o"] = images[:2], images[2:4], images[4:], SCAN.angles
+    return folder / "f.h5"
+
+
+def _volume(*arguments: str) -> np.ndarray:
+    result = beamline("recon", *arguments, "-o", "v.h5")
+    assert result.exit_code == 0, result.output
+    record = read_reconstruction(Path("v.h5"))
+    Path("v.h5").unlink()
+    return record.volume.data
+
+
+def test_recon_by_paths_recipe_and_line_to_repeat(foreign: Path) -> None:
+    expected = _volume("ours.h5", *FBP)
+    assert np.abs(expected).max() > 0.03
+    np.testing.assert_array_equal(_volume("f.h5", *LAYOUT, *FBP), expected)
+
+    assert beamline("recon", "f.h5", *LAYOUT, *FBP, "--write-config", "layout.yaml").exit_code == 0
+    assert 'data-path: "/p/a"' in Path("layout.yaml").read_text()
+    np.testing.assert_array_equal(_volume("f.h5", "--config", "layout.yaml", "--no-report"), expected)
+
+    assert beamline("recon", "f.h5", *LAYOUT, *FBP, "-o", "w.h5").exit_code == 0
+    _, *line = shlex.split(str(read_reconstruction(Path("w.h5")).parameters["command"]))
+    assert beamline(*line).exit_code == 0
+    np.testing.assert_array_equal(read_reconstruction(Path("w_again.h5")).volume.data, expected)
+
+
+def test_info_validate_monitor_and_ingest(foreign: Path) -> None:
+    info = beamline("info", "f.h5", *LAYOUT)
+    assert info.exit_code == 0, info.output
+    assert "hdf5_stacks" in info.stdout
+    validated = beamline("validate", "f.h5", *LAYOUT)
+    assert validated.exit_code == 0, validated.output
+    looked = beamline("monitor", "f.h5", *LAYOUT)
+    assert f"{4 + SCAN.angles.size} frames" in looked.stdout
+    taken = beamline("ingest", "f.h5", "in.h5", *LAYOUT, "--pixel-size-um", "500")
+    assert taken.exit_code == 0, taken.output
+    with open_scan(Path("in.h5")) as ours:
+        assert ours.quantity == "counts"
+        np.testing.assert_array_equal(ours.angles[4:], np.radians(np.degrees(SCAN.angles)))
+        assert ours.read([0, 2]).mean(axis=(1, 2)).tolist() == [DARK, DARK + BEAM]
+
+
+@pytest.mark.parametrize("command", ["info", "validate", "monitor", "recon"])
+def test_what_is_wrong_is_said_in_a_line(foreign: Path, command: str) -> None:
+    for arguments, said in (
+        ((), "/p/a (30 x 2 x 40)"),
+        (NAMES, "say --angles-unit"),
+        ((*LAYOUT, "--data-path", "/p/b"), "has no dataset /p/b. It has /p/a (30 x 2 x 40)"),
+    ):
+        result = beamline(command, "f.h5", *arguments)
+        assert result.exit_code == 5, result.output
+        assert said in result.output  # validate lists what it finds on stdout
+        assert result.stderr.count("\n") == 1, result.stderr
