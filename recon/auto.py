@@ -11,6 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.assess.edges import edge_steepness
 from recon.base.binning import bin_views
 from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
@@ -53,6 +54,7 @@ class Score:
         method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
         residual_seen: the same of views that it was made from, their mean.
+        volume: of the trial, [z, y, x].
         hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
     """
 
@@ -60,6 +62,7 @@ class Score:
     method: Method
     residuals: F64
     residual_seen: float = math.inf
+    volume: F32 | None = None
     hides: Callable[[], bool] = lambda: False
 
     @property
@@ -206,7 +209,8 @@ def predicts_best(
         if stopped():
             return
         own = float(_residuals(volume, some).mean())
-        scores.append(Score(at, method, _residuals(volume, judge), own, partial(_hides, volume, trial)))
+        hides = partial(_hides, volume, trial)
+        scores.append(Score(at, method, _residuals(volume, judge), own, volume.data, hides))
         if control.on_progress is not None:
             last, done = scores[-1].residual, len(scores) + len(refused)
             seconds = control.now() - begin
@@ -222,11 +226,11 @@ def predicts_best(
     if not scores:
         raise ValueError("; ".join(refused))
     best, hiding = best_of(scores)
-    told = {s.at: " (hides structure)" if s.at in hiding else "" for s in scores}
+    steep = edge_steepness([s.volume for s in scores if s.volume is not None])
     listed = [
-        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views)"
-        f"{told[s.at]}"
-        for s in sorted(scores, key=lambda s: s.residual)
+        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views, "
+        f"edges {edges:.2f}{', hides structure' * (s.at in hiding)})"
+        for s, edges in sorted(zip(scores, steep, strict=True), key=lambda pair: pair[0].residual)
     ]
     late = [methods[at].name for at in regular[len(scores) + len(refused) :]] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
