@@ -121,7 +121,7 @@ def _faults(result: RunResult) -> list[str]:
 
 
 def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sinks: Sequence[Sink]) -> None:
-    worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.views)
+    worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.left)
     if not json_sinks:
         click.echo("\n".join(worked.lines()))
     refuse_violations(worked.timeline)

@@ -147,6 +147,8 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[Pass]:
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float) -> float:
     """How long a block takes, with its moves; the views' block begins with the stage at its zero."""
+    if not block.left:
+        return 0.0
     tail = block.exposure + camera.readout
     if block.mode is Mode.STATIC or (block.mode is Mode.FLY and not block.trains):
         return (block.n - 1) * block.period + tail
@@ -171,21 +173,24 @@ def _blocks(
     before = [(FrameKind.DARK, plan.darks), (FrameKind.FLAT, plan.flats)]
     for kind, field in before:
         if field.count and field.at in (Place.START, Place.BOTH):
-            yield _static(kind, field, row, plan, camera)
+            yield _static(kind, field, row, plan, camera, stored=plan.ends is not None)
             row += field.count
     views = _views(plan, flight, row, scale, stage)
     yield views
     row += views.n
     for kind, field in reversed(before):
         if field.count and field.at in (Place.END, Place.BOTH):
-            yield _static(kind, field, row, plan, camera)
+            yield _static(kind, field, row, plan, camera, stored=plan.ends is not None and kind not in plan.ends)
             row += field.count
 
 
-def _static(kind: FrameKind, field: FieldPlan, row: int, plan: ScanPlan, camera: CameraTiming) -> Block:
+def _static(
+    kind: FrameKind, field: FieldPlan, row: int, plan: ScanPlan, camera: CameraTiming, *, stored: bool
+) -> Block:
     """References follow one another as fast as the camera can: its overhead per frame, on their own exposure."""
-    overhead = max(camera.min_period - plan.exposure, camera.readout)
-    return Block(kind, Mode.STATIC, row, np.full(field.count, np.nan), field.exposure, field.exposure + overhead)
+    period = field.exposure + max(camera.min_period - plan.exposure, camera.readout)
+    kept = frozenset(range(field.count)) if stored else frozenset[int]()
+    return Block(kind, Mode.STATIC, row, np.full(field.count, np.nan), field.exposure, period, stored=kept)
 
 
 def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage: StageLimits) -> Block:
@@ -211,6 +216,7 @@ def _half_width(camera: CameraTiming, axis_col: float | None) -> float:
 def _reach(views: Block) -> tuple[float, float]:
     """The smallest and the largest angle that the stage would be sent to."""
     ends = np.array([(flown.start, flown.end) for flown in passes(views)]) if views.trains else views.angles
+    ends = ends if ends.size else views.angles  # all are stored
     return float(ends.min()), float(ends.max())
 
 
@@ -224,6 +230,8 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
 
 
 def _return(views: Block, stage: StageLimits) -> float:
+    if not views.left:
+        return 0.0
     last = passes(views)[-1].end if views.trains else float(views.angles[-1])
     return move_seconds(last, stage.max_speed, stage.acceleration)
 
@@ -241,6 +249,8 @@ def describe(
         f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
     ]
     for block, row in zip(timeline.blocks, timeline.first_rows, strict=True):
+        if not block.left:
+            continue
         seconds = block_seconds(block, stage, camera, plan.settle)
         lines.append(
             f"{row:>6}-{row + block.left - 1:<6}  {block.kind.name.lower():<10}  {block.left:>6}  {block.mode:<6}  "

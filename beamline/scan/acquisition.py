@@ -120,6 +120,9 @@ class Acquisition:
         for block in self._timeline.blocks:
             if self._stop.aborting:
                 raise ScanAborted(f"Aborted: {self._stop.reason}.")
+            if not block.left:
+                self._done.append(TakenBlock(block, Taken()))
+                continue
             if self._stop.stopping and not self._still_needed(block):
                 continue
             if block.kind is FrameKind.PROJECTION and (refused := self._supervision.refusal()):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,14 @@ from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 from recon.base.choices import AUTO
 from recon.methods import streams
+
+Left = Callable[[ScanPlan], ScanPlan]
+"""A plan without what earlier files of the same scan have."""
+
+
+def whole(plan: ScanPlan) -> ScanPlan:
+    """All of it."""
+    return plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +79,18 @@ class DryRun:
         }
 
 
-def dry_run(settings: Config, runs: Path | None = None, stored: frozenset[int] = frozenset()) -> DryRun:
+def dry_run(settings: Config, runs: Path | None = None, left: Left = whole) -> DryRun:
     """Work out a configuration without asking a device.
 
     Args:
         runs: where the file would be, for the free disk; the configured folder unless given.
-        stored: views that are not taken again.
+        left: what of the plan is still to be taken.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
             here: they are the timeline's violations.
     """
-    plan = replace(plan_of(settings), stored=stored)
+    plan = left(plan_of(settings))
     stage, camera, to_counts = connect.describe(settings)
     free = free_bytes(runs or Path(settings.storage.folder))
     worked = work_out(
@@ -150,12 +158,12 @@ class ReadyScan:
     info: ScanInfo
 
 
-def preflight(config: Config, instrument: Instrument, runs: Path, stored: frozenset[int] = frozenset()) -> ReadyScan:
+def preflight(config: Config, instrument: Instrument, runs: Path, left: Left = whole) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
         runs: where the file will be, for the free disk.
-        stored: views that are not taken again.
+        left: what of the plan is still to be taken.
 
     Raises:
         ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot
@@ -163,7 +171,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path, stored: frozen
         DeviceRefused: the camera does not take its settings.
     """
     stage, camera = instrument.devices.stage, instrument.devices.camera
-    plan = replace(plan_of(config), stored=stored)
+    plan = left(plan_of(config))
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, free = camera.timing, free_bytes(runs)
     axis_col = config.optics.axis_col

@@ -1,4 +1,4 @@
-"""Resume: a run that was killed, failed, stopped or aborted goes on; its missing views come into a file of their own.
+"""Resume: a run that was killed, failed, stopped or aborted goes on; what it lacks comes into a file of its own.
 
 The files that are there are only read (after `recover`, where their writer died): what is stored is never at risk. The
 new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first
@@ -8,8 +8,8 @@ file joins them all.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,15 @@ import h5py
 
 from beamline.config.load import Config, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
+from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.run_folder import CONFIG, EVENTS, SCAN, create_part, parts_of
 from beamline.storage import hdf5
-from beamline.storage.parts import JOINED, join, views_in, views_planned
+from beamline.storage.parts import JOINED, ends_missing, join, views_in, views_planned
 from beamline.storage.recover import Recovered, recover
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
+from drivers.frame import FrameKind
 
 _UNTOUCHED = "Nothing was changed."
 _IDENTITY = (  # what a device says of itself that no scan and no day changes
@@ -42,6 +44,7 @@ class ResumableRun:
         parts: its files so far, each with a frame at least.
         views: of the plan, in these files.
         planned: views of the whole plan.
+        ends: kinds of references after the views that are missing, where no view is; None where views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that counts for nothing.
     """
@@ -53,12 +56,20 @@ class ResumableRun:
     planned: int
     last_frame_time: float
     left_out: tuple[str, ...] = ()
+    ends: frozenset[FrameKind] | None = None
 
     @property
     def said(self) -> str:
         """One line for people."""
         missing = self.planned - len(self.views)
+        if self.ends is not None:
+            kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.ends))
+            return f"Preparing: {self.run} has all {self.planned} views, its {kinds} of the end are taken"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
+
+    def left(self, plan: ScanPlan) -> ScanPlan:
+        """What of the plan the run lacks."""
+        return replace(plan, stored=self.views, ends=self.ends)
 
     def begin(self, ready: ReadyScan) -> Path:
         """Make ordinary files of the parts whose writer died, and the folder of the new part.
@@ -128,9 +139,13 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
         raise ConfigError(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
+    ends = None
     if len(views) >= planned:
-        raise ConfigError(f"{run} has all {planned} views: nothing is missing. {_UNTOUCHED}")
-    return ResumableRun(run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out))
+        with ExitStack() as opened:
+            ends = ends_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
+        if not ends:
+            raise ConfigError(f"{run} has all {planned} views and its references: nothing is missing. {_UNTOUCHED}")
+    return ResumableRun(run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), ends)
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:

@@ -50,6 +50,32 @@ def views_planned(file: h5py.File) -> int | None:
     return None if angles is None else len(angles)
 
 
+def ends_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
+    """Kinds of references that the plan has after the views, and of which these files of a scan, in order, lack some
+    there."""
+    taken = _after_views(files)
+    return frozenset(kind for kind, n in _planned_after_views(files[0]).items() if len(taken[kind]) < n)
+
+
+def _planned_after_views(file: h5py.File) -> dict[FrameKind, int]:
+    """How many references the plan has after the views, in the order that they are taken in."""
+    plan = json.loads(file["/entry/record/plan"].asstr()[()])
+    fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
+    return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in ("end", "both")}
+
+
+def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
+    """Triggers, counted within their block, of the references after the last view of all files."""
+    rows = [int(file[layout.COMMITTED][()]) for file in files]
+    kinds, triggers = (
+        np.concatenate([file[path][:n] for file, n in zip(files, rows, strict=True)])
+        for path in (layout.KIND, layout.TRIGGER)
+    )
+    views = np.flatnonzero(kinds == FrameKind.PROJECTION)
+    after = np.arange(kinds.size) > (views[-1] if views.size else kinds.size)
+    return {kind: set(triggers[after & (kinds == kind)].tolist()) for kind in (FrameKind.FLAT, FrameKind.DARK)}
+
+
 def join(parts: Sequence[Path], joined: Path) -> int:
     """Make, or make again, the file that has the frames of all parts, in this order. Returns how many these are.
 
@@ -146,6 +172,10 @@ def _name_missing(files: Sequence[h5py.File], joined: h5py.File) -> None:
     plan = json.loads(files[0]["/entry/record/plan"].asstr()[()])
     before = sum(plan[kind]["count"] for kind in ("darks", "flats") if plan[kind]["at"] in ("start", "both"))
     stored = {before + view for file in files for view in views_in(file)}
+    taken, first = _after_views(files), before + len(plan.get("angles_deg", ()))
+    for kind, n in _planned_after_views(files[0]).items():
+        stored |= {first + trigger for trigger in taken[kind]}
+        first += n
     missing = {int(trigger) for file in files for trigger in file[layout.MISSING][()]} - stored
     del joined[layout.MISSING]
     joined[layout.MISSING] = np.array(sorted(missing), np.int64)

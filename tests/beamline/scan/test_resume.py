@@ -24,6 +24,7 @@ from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import parts_of
 from beamline.scan.states import State
 from beamline.storage.describe import describe
+from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import JOINED, joined_file_of
 from beamline.storage.readers.open import open_scan
@@ -194,6 +195,64 @@ def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypat
         selection = Selection(axis_col=5.5, correction=CorrectionSettings(air="none"), use_flags=False)
         prepared = prepare_projections(source, selection, lambda said: None)
     assert len(prepared.projections.data) == VIEWS
+
+
+def _without_a_flat(runs: Path, monkeypatch: pytest.MonkeyPatch, *overrides: str, at: int) -> Path:
+    ran = Ran(runs, FakeInstrument(Faults(lost={at + 1})), *overrides)
+    assert ran.folder is not None
+    return ran.folder
+
+
+@pytest.mark.parametrize(
+    ("end", "taken", "overrides"),
+    [
+        (_killed, "FF", ()),
+        (_without_a_flat, "FF", ()),
+        (ENDS["aborted"], "FFDDD", ("scan.darks.at=both", "scan.mode=step")),
+        (ENDS["aborted"], "FF", ("scan.flats.at=end",)),
+    ],
+)
+def test_references_of_the_end_alone_are_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: Callable[..., Path], taken: str, overrides: tuple[str, ...]
+) -> None:
+    at = (3 if "scan.flats.at=end" in overrides else FIRST) + VIEWS  # the first flat after the views
+    run = end(tmp_path, monkeypatch, *overrides, at=at)
+    with open_hdf5(run / "scan.h5") as first:
+        before = int((first[layout.KIND][()] != FrameKind.PROJECTION).sum())
+    instrument = FakeInstrument()
+    result = _go_on(run, instrument)
+    assert (result.path, result.missing) == (run / "joined.h5", ())
+    with h5py.File(run / "part-2/scan.h5") as part:
+        assert "".join(FrameKind(kind).name[0] for kind in part[layout.KIND][()]) == taken
+    assert not any(told == "arm stage" for told in instrument.log)
+    _assert_whole(run / "joined.h5", before + len(taken))
+    assert [finding for finding in validate(run / "joined.h5") if finding.severity == "error"] == []
+    assert describe(run / "joined.h5")["missing_triggers"] == 0
+    with open_scan(run / "joined.h5") as source:
+        prepared = prepare_projections(
+            source,
+            Selection(axis_col=5.5, correction=CorrectionSettings(air="none"), use_flags=False, accept_references=True),
+            lambda said: None,
+        )
+    assert len(prepared.projections.data) == VIEWS
+    with pytest.raises(ConfigError, match="has all 12 views and its references: nothing is missing"):
+        _go_on(run)
+
+
+def test_a_stop_before_references_of_the_end_leaves_the_run_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = _stopped(tmp_path, monkeypatch, at=FIRST + VIEWS, abort=True)
+    stop = StopRequest()
+    with open_for_resume(run) as series:
+        assert series.said.endswith("has all 12 views, its flats of the end are taken")
+        with pytest.raises(BeamlineError, match="Interrupted before anything was acquired"):
+            run_scan(
+                series.config, series, [lambda event: stop.stop() if event.event == "run_started" else None], stop,
+                instrument=FakeInstrument().connected(),
+            )  # fmt: skip
+    assert not (run / "joined.h5").exists()
+    assert _go_on(run).n_frames == FIRST + VIEWS + 1 + 2
 
 
 def test_verbs_reach_the_newest_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
