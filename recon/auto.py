@@ -2,84 +2,29 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.assess.edges import edge_steepness
-from recon.base.binning import bin_views
 from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import DataUse, Depth, Method, MethodResult, Progress, ReconProblem, RunControl, Traits
-from recon.base.method import TrialSettings as Trial
-from recon.base.noise import median_deviation
-from recon.base.volume import Grid, Volume
+from recon.base.method import Depth, Method, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.volume import Grid
 from recon.splatting.finish import SWEEPS
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
+from recon.trials import of_views, part_of, predicts_best
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out_weight import LEAST_VIEWS, ONE_IN, busiest_rows, slab_of, split_views
 from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.projector import Projector
-from recon.voxels.unexplained import LIMIT, unexplained
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-
-ROWS = 32  # of a slab; enough for total variation along z
-_SMALLEST = 64  # pixels a side: smaller detectors are not binned
-_MATTER = 0.1  # of the largest line integrals
-_ENOUGH = 0.5  # of the matter in the fullest rows
-_ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
 
 
 def _candidates() -> tuple[Method, ...]:
     # OS-SIRT-TV, a third of the cost, was nowhere the best by more than 0.02 dB (docs/exploration.md).
     return R2(), FistaTv(), Fbp()
-
-
-@dataclass(frozen=True, eq=False)
-class Score:
-    """What a volume predicts of views that it has not seen, and what it leaves of those that it was made from.
-
-    Attributes:
-        at: number of its method.
-        method: that made it.
-        residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
-        residual_seen: the same of views that it was made from, their mean.
-        volume: of the trial, [z, y, x].
-        hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
-    """
-
-    at: int
-    method: Method
-    residuals: F64
-    residual_seen: float = math.inf
-    volume: F32 | None = None
-    hides: Callable[[], bool] = lambda: False
-
-    @property
-    def residual(self) -> float:
-        """Of views held out."""
-        return float(self.residuals.mean())
-
-    @property
-    def overfit(self) -> float:
-        """By what factor it misses views held out by more than its own: above 1 it follows the noise of its own."""
-        return max(1.0, self.residual / self.residual_seen) if self.residual_seen > 0 else 1.0
-
-    @property
-    def penalised(self) -> float:
-        """The residual times `overfit`: line integrals average over the noise that a volume follows, so that views
-        held out say too little of it (docs/exploration.md)."""
-        return self.residual * self.overfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +35,8 @@ class Auto:
     resolution. One of eight views is held out. Nothing is tried of fewer than 16 views, and of rolled or tilted ones:
     the first candidate takes them; and of a sample that is wider than the field, which only a fit models. A volume that
     is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so neither is
-    preferred. Where methods are level, the first one that leaves no structure in its own views is taken
-    (docs/exploration.md).
+    preferred. Where methods are level, the first one is taken that leaves no structure in its own views and has edges
+    about as steep as the others' (docs/exploration.md).
 
     Attributes:
         candidates: the methods, by preference.
@@ -151,8 +96,8 @@ class Auto:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
 
     @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[Trial]:
-        return [Trial("method")]
+    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
+        return [TrialSettings("method")]
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)
@@ -163,188 +108,5 @@ class Auto:
 
 def is_wider(problem: ReconProblem) -> bool:
     """Whether the sample leaves the field, by some of the views: only methods with the trait `any_grid` model that."""
-    some = _of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
+    some = of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
     return leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry)
-
-
-def predicts_best(
-    part: ReconProblem,
-    methods: Sequence[Method],
-    control: RunControl,
-    spare: int | None = None,
-    order: Sequence[int] | None = None,
-) -> tuple[int | None, str]:
-    """Which of the methods predicts best what one of eight views shows that it has not seen; all residuals in words.
-
-    None where `control` ends the trials before two are done; one that it cuts short is not judged.
-
-    Args:
-        methods: by preference.
-        spare: one that is tried only where one after it would be taken.
-        order: in which they are tried; None: by preference.
-
-    Raises:
-        ValueError: no method takes these views or data.
-    """
-    n, geometry = part.geometry.n_views, part.geometry
-    seen, unseen = split_views(geometry)
-    trial, judge, some = (_of_views(part, views) for views in (seen, unseen, seen[:: ONE_IN // 2]))
-    scores: list[Score] = []
-    refused, begin = [], control.now()
-    quiet = RunControl(control.should_stop, now=control.now)
-
-    def stopped() -> bool:
-        return control.should_stop is not None and control.should_stop()
-
-    def attempt(at: int) -> None:
-        if stopped():
-            return
-        method = methods[at]
-        device = part.device if method.traits.device else "cpu"
-        try:
-            volume = method.run(replace(trial, device=device), quiet).volume
-        except ValueError as error:
-            refused.append(f"{method.name}: {error}")
-            return
-        if stopped():
-            return
-        own = float(_residuals(volume, some).mean())
-        hides = partial(_hides, volume, trial)
-        scores.append(Score(at, method, _residuals(volume, judge), own, volume.data, hides))
-        if control.on_progress is not None:
-            last, done = scores[-1].residual, len(scores) + len(refused)
-            seconds = control.now() - begin
-            control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
-
-    regular = [at for at in order or range(len(methods)) if at != spare]
-    for at in regular:
-        attempt(at)
-    if spare is not None and scores and best_of(scores)[0].at > spare:
-        attempt(spare)
-    if len(scores) < min(2, len(regular)) and stopped():
-        return None, "stopped before the choice"
-    if not scores:
-        raise ValueError("; ".join(refused))
-    best, hiding = best_of(scores)
-    steep = edge_steepness([s.volume for s in scores if s.volume is not None])
-    listed = [
-        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views, "
-        f"edges {edges:.2f}{', hides structure' * (s.at in hiding)})"
-        for s, edges in sorted(zip(scores, steep, strict=True), key=lambda pair: pair[0].residual)
-    ]
-    late = [methods[at].name for at in regular[len(scores) + len(refused) :]] if stopped() else []
-    return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
-
-
-def best_of(scores: Sequence[Score]) -> tuple[Score, list[int]]:
-    """The score to prefer: of those that are level the first that hides nothing; and those that hide.
-
-    Level with the smallest residual are those within two of its standard errors (by its scatter over the views) and
-    4 %, and likewise by the penalised residual. The residual alone prefers a volume that lost some noise, and with it a
-    thin crack, which few rays see; and FISTA-TV to a fit that it finished, though from the fit it comes nearer to the
-    sample (0.1 to 2.6 dB). The penalised one alone prefers what is smooth.
-    """
-    least = min(scores, key=lambda s: s.residual)
-    level = [
-        score
-        for score in sorted(scores, key=lambda s: s.at)
-        if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
-    ]
-    hiding: list[int] = []
-    for score in level if len(level) > 1 else ():
-        if not score.hides():
-            return score, hiding
-        hiding.append(score.at)
-    return least, hiding
-
-
-def _penalised(score: Score) -> float:
-    return score.penalised
-
-
-def _is_level(score: Score, least: Score, value: Callable[[Score], float]) -> bool:
-    by_scatter = _ERRORS * _standard_error(least.residuals) / least.residual if least.residual > 0 else 0.0
-    return value(score) <= value(least) * (1 + min(by_scatter, _NEAR - 1))
-
-
-def _standard_error(values: F64) -> float:
-    return float(values.std(ddof=1)) / math.sqrt(values.size) if values.size > 1 else 0.0
-
-
-def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
-    """A part of the problem for trials, and its name: a slab of so many rows, or all rows with binned pixels.
-
-    None where nothing can be held out or projected, and why.
-    """
-    geometry, (rows, cols) = problem.geometry, problem.geometry.detector_shape
-    data, weights = problem.projections, problem.use.weights
-    if geometry.n_views < LEAST_VIEWS:
-        return None, f"{geometry.n_views} views are too few to hold any out"
-    if not geometry.is_straight:
-        return None, "rolled or tilted views"
-    if not geometry.is_cone:
-        if rows <= height:
-            return problem, "all rows"
-        slab = busiest_rows(masked(data[:: max(1, len(data) // 8)])[0], height)
-        views, grid = slab_of(geometry, problem.grid, slab.start, slab.stop)
-        use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, slab]))
-        cut = np.ascontiguousarray(data[:, slab])
-        where = f"rows {slab.start} to {slab.stop - 1}"
-        return replace(problem, projections=cut, geometry=views, grid=grid, use=use), where
-    if min(rows, cols) < _SMALLEST:
-        return problem, "all rows"
-    middle = _middle_rows(problem, height)
-    if middle is not None:
-        return middle
-    filled = masked(data, weights)[0]
-    views = geometry.binned(2)
-    coarse = replace(
-        problem, projections=bin_views(filled, 2), geometry=views, grid=Grid.matching(views), use=DataUse()
-    )
-    return coarse, "binned 2 x 2"
-
-
-def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
-    """So many rows in the middle of a cone and the box that holds their rays; None where little matter is there."""
-    geometry, grid, weights = problem.geometry, problem.grid, problem.use.weights
-    first = round(geometry.axis_row - (height - 1) / 2)
-    rows = slice(first, first + height)
-    moved = np.abs(geometry.shifts[:, 1]).max() > 1
-    if moved or first < 0 or rows.stop > geometry.detector_shape[0]:
-        return None
-    some = masked(problem.projections[:: max(1, len(problem.projections) // 8)])[0]
-    if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
-        return None
-    views = geometry.rows(rows.start, rows.stop)
-    tall = (height + 1) * geometry.sample_pitch * (1 + geometry.reach / geometry.sod)  # at the far side of the field
-    slices = math.ceil(tall / grid.spacing[0])
-    box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
-    use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, rows]))
-    cut = np.ascontiguousarray(problem.projections[:, rows])
-    part = replace(problem, projections=cut, geometry=views, grid=box, use=use)
-    return part, f"rows {rows.start} to {rows.stop - 1}"
-
-
-def _of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
-    weights = problem.use.weights
-    return replace(
-        problem, projections=problem.projections[views], geometry=problem.geometry.select(views),
-        use=DataUse(None if weights is None else weights[views]),
-    )  # fmt: skip
-
-
-def _residuals(volume: Volume, problem: ReconProblem) -> F64:
-    """Median deviation [view] of the views from those of a volume, negative values at zero, on rays with matter."""
-    left = problem.projections - Projector(problem.geometry, volume.grid).forward(np.maximum(volume.data, 0))
-    if problem.use.weights is not None:
-        left[problem.use.weights == 0] = np.nan
-    matter = problem.projections > _MATTER * np.nanpercentile(problem.projections, 99)
-    seen = np.where(matter, left, np.nan) if matter.any() else left
-    found = np.array([median_deviation(view) for view in seen if np.isfinite(view).any()])
-    return found if found.size else np.zeros(1)
-
-
-def _hides(volume: Volume, problem: ReconProblem) -> bool:
-    """The volume leaves structure in the views that it was made from, such as a crack that it fills."""
-    left = unexplained(volume, masked(problem.projections)[0], problem.geometry, np.random.default_rng(problem.seed))
-    return left is not None and left.share > LIMIT

@@ -16,7 +16,7 @@ from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
 from recon.assess.plans import Choice, Speeds, best_steps, plans
 from recon.assess.time_model import duration_text
-from recon.auto import ROWS, is_wider, part_of, predicts_best
+from recon.auto import is_wider
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
@@ -28,6 +28,7 @@ from recon.splatting.finish import SUBSETS, SWEEPS
 from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
 from recon.splatting.splat import voxelize
+from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choice_cost
 from recon.voxels.ordered_fista import subsets_of

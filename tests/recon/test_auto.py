@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.auto import Auto, Score, best_of, part_of
+from recon.auto import Auto
 from recon.base.decisions import Decisions
-from recon.base.method import DataUse, MethodResult, ReconProblem, RunControl, Traits
+from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Volume
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
@@ -88,28 +88,6 @@ def test_a_volume_that_hides_a_thin_crack_is_not_preferred_where_residuals_are_l
     assert len(listed) == 2 and "hides structure" in found.settings["chosen_because"]
 
 
-@pytest.mark.parametrize(("residuals", "hiding", "best"), [
-    ([1.02, 1.00, 1.01], (), 0),  # level: the first
-    ([1.02, 1.00, 1.01], (0,), 1),
-    ([1.02, 1.00, 1.01], (0, 1), 2),
-    ([1.02, 1.00, 1.01], (0, 1, 2), 1),  # all hide something: the least residual
-    ([1.05, 1.00, 1.30], (), 1),  # beyond 4 %
-    ([1.05, 1.00, 1.30], (1,), 1),
-])  # fmt: skip
-def test_of_level_residuals_the_first_that_hides_nothing(
-    residuals: list[float], hiding: tuple[int, ...], best: int
-) -> None:
-    scatter = np.array([-0.1, 0.1, -0.1, 0.1])  # a standard error of 0.058: two are more than 4 %
-    scores = [Score(i, Fbp(), r + scatter, hides=lambda i=i: i in hiding) for i, r in enumerate(residuals)]  # type: ignore[misc]
-    assert best_of(scores)[0].at == best
-
-
-def test_with_many_views_residuals_are_level_within_two_standard_errors() -> None:
-    scatter = np.tile([-0.02, 0.02], 50)  # a standard error of 0.002
-    for off, best in ((0.003, 0), (0.005, 1)):
-        assert best_of([Score(0, Fbp(), 1 + off + scatter), Score(1, Fbp(), 1 + scatter)])[0].at == best
-
-
 def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
     @dataclass(frozen=True)
     class Refusing(Fbp):
@@ -157,33 +135,6 @@ def test_a_cone_is_tried_in_its_middle_or_at_half_the_resolution(axis_row: float
     found = recon.reconstruct(Projector(views, grid).forward(ball), views, Auto((Scaled(factor=0.3), Scaled())))
     assert found.settings["factor"] == 1.0
     assert where in found.settings["chosen_because"]
-
-
-def test_no_ray_of_the_middle_rows_leaves_their_box() -> None:
-    """A sample that fills it throws the same line integrals there as one that goes on above and below."""
-    views = recon.Geometry.cone(TURN, (80, 64), 1.0, 150.0, 300.0)
-    grid = recon.Grid.matching(views)
-
-    def column(box: recon.Grid) -> F32:
-        _, y, x = np.meshgrid(*box.coordinates(), indexing="ij")
-        return np.exp(-(x**2 + y**2) / (2 * 5**2)).astype(np.float32)
-
-    data = Projector(views, grid).forward(column(grid))
-    part, _ = part_of(ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
-    assert part.grid.shape[0] * part.grid.spacing[0] < 0.7 * grid.shape[0] * grid.spacing[0]
-    found = Projector(part.geometry, part.grid).forward(column(part.grid))
-    np.testing.assert_allclose(found, part.projections, atol=0.005 * data.max())
-
-
-def test_of_two_that_predict_alike_the_one_that_follows_its_noise_is_not_taken() -> None:
-    """0.9 of the other's residual, but 1.8 times what it leaves in its own views, where the other leaves as much."""
-    scatter = np.array([-0.01, 0.01])
-    honest, follower = (
-        Score(0, Fbp(), 1.0 + scatter, residual_seen=1.0),
-        Score(1, Fbp(), 0.9 + scatter, residual_seen=0.5),
-    )
-    assert best_of([honest, follower])[0].at == 0
-    assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, residual_seen=0.85)])[0].at == 1
 
 
 @dataclass(frozen=True, eq=False)

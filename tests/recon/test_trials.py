@@ -1,0 +1,71 @@
+"""What trials prefer, by their scores, and on which part of a scan they are made."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import recon
+from recon.base.method import DataUse, ReconProblem
+from recon.trials import Score, best_of, part_of
+from recon.voxels.direct import Fbp
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+
+
+@pytest.mark.parametrize(("edges", "best"), [((1.0, 0.9), 0), ((0.81, 1.0), 0), ((0.79, 1.0), 1)])
+def test_of_level_residuals_none_that_dulls_edges(edges: tuple[float, float], best: int) -> None:
+    scores = [Score(i, Fbp(), np.ones(9), edges=steep) for i, steep in enumerate(edges)]
+    taken, passed = best_of(scores)
+    assert (taken.at, bool(passed)) == (best, best == 1)
+
+
+@pytest.mark.parametrize(("residuals", "hiding", "best"), [
+    ([1.02, 1.00, 1.01], (), 0),  # level: the first
+    ([1.02, 1.00, 1.01], (0,), 1),
+    ([1.02, 1.00, 1.01], (0, 1), 2),
+    ([1.02, 1.00, 1.01], (0, 1, 2), 1),  # all hide something: the least residual
+    ([1.05, 1.00, 1.30], (), 1),  # beyond 4 %
+    ([1.05, 1.00, 1.30], (1,), 1),
+])  # fmt: skip
+def test_of_level_residuals_the_first_that_hides_nothing(
+    residuals: list[float], hiding: tuple[int, ...], best: int
+) -> None:
+    scatter = np.array([-0.1, 0.1, -0.1, 0.1])  # a standard error of 0.058: two are more than 4 %
+    scores = [Score(i, Fbp(), r + scatter, hides=lambda i=i: i in hiding) for i, r in enumerate(residuals)]  # type: ignore[misc]
+    assert best_of(scores)[0].at == best
+
+
+def test_with_many_views_residuals_are_level_within_two_standard_errors() -> None:
+    scatter = np.tile([-0.02, 0.02], 50)  # a standard error of 0.002
+    for off, best in ((0.003, 0), (0.005, 1)):
+        assert best_of([Score(0, Fbp(), 1 + off + scatter), Score(1, Fbp(), 1 + scatter)])[0].at == best
+
+
+def test_no_ray_of_the_middle_rows_leaves_their_box() -> None:
+    """A sample that fills it throws the same line integrals there as one that goes on above and below."""
+    views = recon.Geometry.cone(np.linspace(0, 2 * np.pi, 24, endpoint=False), (80, 64), 1.0, 150.0, 300.0)
+    grid = recon.Grid.matching(views)
+
+    def column(box: recon.Grid) -> F32:
+        _, y, x = np.meshgrid(*box.coordinates(), indexing="ij")
+        return np.exp(-(x**2 + y**2) / (2 * 5**2)).astype(np.float32)
+
+    data = Projector(views, grid).forward(column(grid))
+    part, _ = part_of(ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
+    assert part.grid.shape[0] * part.grid.spacing[0] < 0.7 * grid.shape[0] * grid.spacing[0]
+    found = Projector(part.geometry, part.grid).forward(column(part.grid))
+    np.testing.assert_allclose(found, part.projections, atol=0.005 * data.max())
+
+
+def test_of_two_that_predict_alike_the_one_that_follows_its_noise_is_not_taken() -> None:
+    """0.9 of the other's residual, but 1.8 times what it leaves in its own views, where the other leaves as much."""
+    scatter = np.array([-0.01, 0.01])
+    honest, follower = (
+        Score(0, Fbp(), 1.0 + scatter, residual_seen=1.0),
+        Score(1, Fbp(), 0.9 + scatter, residual_seen=0.5),
+    )
+    assert best_of([honest, follower])[0].at == 0
+    assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, residual_seen=0.85)])[0].at == 1
