@@ -24,6 +24,7 @@ __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions"
 REGISTRY = (  # modules in this folder, asked in this order
     "tiff_series",
     "tiff_stack",
+    "txrm",
     "nxtomo",
     "dxchange",
 )
@@ -38,7 +39,7 @@ class SourceOptions:
     """A scan, and what replaces what its file says.
 
     Attributes:
-        path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs.
+        path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
         quantity: what the pixels are, where the file does not say.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
             projection, or one for each frame.
@@ -120,7 +121,9 @@ def _open(path: Path, opening: Opening) -> ScanReader:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
     if not hdf5.is_hdf5(path):
-        raise DataError(f"{path} is neither HDF5 nor TIFF; a scan is one of these, or a folder or .zip of TIFFs.")
+        raise DataError(
+            f"{path} is neither HDF5 nor TIFF, nor a .txrm; a scan is one of these, or a folder or .zip of TIFFs."
+        )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
         held = contents(file)

@@ -1,4 +1,4 @@
-"""StacksSource: an HDF5 file with a dataset of projections and others of darks and flats, under any names.
+"""StacksSource: a scan with a stack of projections and others of darks and flats, such as HDF5 under any names.
 
 Such a layout does not say when the references were taken: the frames are numbered darks first, then flats, then
 projections.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -25,11 +25,17 @@ _LISTED = 10  # datasets of a file that an error names
 
 @dataclass(frozen=True)
 class Stack:
-    """Frames of one kind. `frames`: [frame, row, col], an h5py.Dataset, or an array; `name`: for messages."""
+    """Frames of one kind. `frames`: [frame, row, col], a dataset or an array; `name`: for messages."""
 
     kind: FrameKind
     name: str
     frames: Any
+
+
+class Closed(Protocol):
+    """What is closed with the scan."""
+
+    def close(self) -> None: ...
 
 
 class StacksSource(ScanReader):
@@ -38,9 +44,9 @@ class StacksSource(ScanReader):
     Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
     """
 
-    def __init__(self, file: h5py.File, stacks: Sequence[Stack], *, name: str, facts: Attributes) -> None:
+    def __init__(self, path: Path, file: Closed, stacks: Sequence[Stack], *, name: str, facts: Attributes) -> None:
         """Take over an open file. Angles are NaN; `stacks` are in the order of the frames, the projections last."""
-        self.path, self.format, self.facts = Path(file.filename), name, facts
+        self.path, self.format, self.facts = path, name, facts
         self._file, self._stacks = file, stacks
         self._check()
         sizes = [len(stack.frames) for stack in stacks]
@@ -99,7 +105,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> 
                 item = named(file, where)
                 image = item.ndim == 2 and kind != FrameKind.PROJECTION
                 stacks.append(Stack(kind, where, item[()][None] if image else item))
-        return StacksSource(file, stacks, name="hdf5_stacks", facts={"data": data})
+        return StacksSource(path, file, stacks, name="hdf5_stacks", facts={"data": data})
     except BaseException:
         file.close()
         raise

@@ -1,0 +1,195 @@
+"""Scans of Zeiss (Xradia) microscopes: .txrm, an OLE compound file with a stream for each image and each list.
+
+Stream names, types and units after two public readers: dxchange (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224;
+with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide views by the one reference without a
+dark, which the instrument has subtracted. Images are as they are stored.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.readers.base import Format, Opening
+from beamline.storage.readers.stacks import Stack, StacksSource
+from drivers.frame import FrameKind
+
+_SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
+_TYPES: dict[int, np.dtype[Any]] = {5: np.dtype("<u2"), 10: np.dtype("<f4")}
+_PER_STORAGE = 100  # images
+_CONE = 1  # of ImageInfo/XrayGeometry
+_ACQUIRED = 0  # of ImageInfo/AcquisitionMode; else a volume
+_APART = 0.5  # px that a view may be shifted by, and is used as it is
+
+
+class TxrmFile:
+    """The streams of a file. A context of readable() turns what is wrong with them into a DataError."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import olefile
+        except ImportError as error:
+            raise DataError(
+                f'{path} is a .txrm file, which needs the library olefile: pip install "splatline[txrm]".'
+            ) from error
+        self._ole = olefile.OleFileIO(path)
+
+    def bytes_of(self, name: str) -> bytes:
+        """The content of a stream; KeyError where there is none."""
+        if not self._ole.exists(name):
+            raise KeyError(f"there is no stream {name}")
+        return bytes(self._ole.openstream(name).read())
+
+    def numbers(self, name: str, dtype: str, n: int = 1) -> NDArray[Any] | None:
+        """The first n numbers of a stream; None where there is none, or fewer."""
+        if not self._ole.exists(name):
+            return None
+        content, wanted = self.bytes_of(name), n * np.dtype(dtype).itemsize
+        return np.frombuffer(content[:wanted], dtype) if len(content) >= wanted else None
+
+    def number(self, name: str) -> int | None:
+        """The first whole number of a stream; None where there is none."""
+        found = self.numbers(name, "<i4")
+        return None if found is None else int(found[0])
+
+    def image(self, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """An image [row, col]; ValueError where the stream has another size."""
+        return np.frombuffer(self.bytes_of(name), dtype).reshape(shape)
+
+    def close(self) -> None:
+        self._ole.close()
+
+
+class _Views:
+    """The projections [view, row, col], each read when it is asked for."""
+
+    ndim = 3
+
+    def __init__(self, file: TxrmFile, path: Path, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
+        self._file, self._path, self.shape, self.dtype = file, path, shape, dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: tuple[slice, slice]) -> NDArray[Any]:
+        views, rows = key
+        with hdf5.readable(self._path):
+            return np.array(
+                [
+                    self._file.image(f"ImageData{i // _PER_STORAGE + 1}/Image{i + 1}", self.shape[1:], self.dtype)[rows]
+                    for i in range(len(self))[views]
+                ]
+            )
+
+
+def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
+    """Open. `own_angles` False: the caller brings the angles, so the file may lack them.
+
+    DataError where olefile is not installed, or the file holds a volume, a mosaic, views that its own software has to
+    shift, or what cannot be read.
+    """
+    with hdf5.readable(path):
+        file = TxrmFile(path)
+        try:
+            return _source(path, file, own_angles)
+        except BaseException:
+            file.close()
+            raise
+
+
+def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
+    info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
+    lost = [name for name, value in info.items() if value is None]
+    if lost:
+        raise DataError(f"{path} is no .txrm scan: there is no stream ImageInfo/{lost[0]}.")
+    rows, cols, planned, kind = (int(value) for value in info.values() if value is not None)
+    n = min(planned, taken if (taken := file.number("ImageInfo/ImagesTaken")) is not None else planned)
+    if kind not in _TYPES or min(rows, cols) < 1 or rows * cols > 2**31:
+        raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
+    _refuse(path, file, n)
+    stacks = [Stack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
+    reference = _TYPES.get(
+        file.number("ReferenceData/DataType") or file.number("ReferenceData/ImageInfo/DataType") or 0
+    )
+    if reference is not None:
+        flat = file.image("ReferenceData/Image", (rows, cols), reference)[None]
+        dark = np.zeros_like(flat)  # subtracted by the instrument
+        stacks = [Stack(FrameKind.DARK, "dark", dark), Stack(FrameKind.FLAT, "ReferenceData/Image", flat), *stacks]
+    source = StacksSource(path, file, stacks, name="txrm", facts=_facts(file))
+    angles = file.numbers("ImageInfo/Angles", "<f4", n)
+    if own_angles:
+        if angles is None:
+            raise DataError(f"{path} does not say the angles of its {n} views: give --angles FILE (degrees).")
+        source.angles[-n:] = np.radians(angles.astype(np.float64))
+    _set_exposures(source, file, n)
+    _set_scale(source, file)
+    return source
+
+
+def _refuse(path: Path, file: TxrmFile, n: int) -> None:
+    if file.number("ImageInfo/AcquisitionMode") not in (None, _ACQUIRED):
+        raise DataError(f"{path} is a volume (.txm) or a single image, not a scan: give the .txrm file.")
+    if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):  # as the streams are spelt
+        raise DataError(
+            f"{path} is a mosaic; expected views of one field each. Stitch it with the microscope's program."
+        )
+    shifts = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
+    most = max((float(np.abs(each).max(initial=0)) for each in shifts if each is not None), default=0.0)
+    if not most < _APART:
+        raise DataError(
+            f"{path} holds shifts of its views, up to {most:.3g} pixels, that are not applied here. Export the aligned "
+            "views as TIFFs from the microscope's program, and give their angles with --angles."
+        )
+
+
+def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
+    """Seconds of the views and of the reference, which may have its own."""
+    views = file.numbers("ImageInfo/ExpTimes", "<f4", n)
+    source.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
+    for name in ("ReferenceData/ImageInfo/ExpTimes", "ReferenceData/ImageInfo/ExpTime", "ReferenceData/ExpTime"):
+        seconds = file.numbers(name, "<f4")
+        if seconds is not None and seconds[0] > 0:
+            source.exposures[source.image_key == FrameKind.FLAT] = seconds[0]
+            break
+
+
+def _set_scale(source: StacksSource, file: TxrmFile) -> None:
+    """Pixel size, which the file states at the sample (µm), and the distances of a cone (mm, of either sign)."""
+    pixel, near, far = (
+        None if found is None else abs(float(found[0]))
+        for found in (
+            file.numbers(f"ImageInfo/{name}", "<f4") for name in ("PixelSize", "StoRADistance", "DtoRADistance")
+        )
+    )
+    if pixel is not None and 0 < pixel < math.inf:
+        source.pixel_size_mm = pixel * 1e-3
+    if file.number("ImageInfo/XrayGeometry") == _CONE and near and far and math.isfinite(near + far):
+        source.cone = (near, near + far)
+        if source.pixel_size_mm is not None:
+            source.pixel_size_mm *= (near + far) / near
+
+
+def _facts(file: TxrmFile) -> dict[str, str | float | int]:
+    """What else the file says, in its own units."""
+    facts: dict[str, str | float | int] = {}
+    for name in ("Energy", "Current", "OpticalMagnification", "CamPixelSize", "Temperature"):
+        found = file.numbers(f"ImageInfo/{name}", "<f4")
+        if found is not None and np.isfinite(found[0]):
+            facts[name] = float(found[0])
+    return facts
+
+
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_SIGNATURE)) == _SIGNATURE
+
+
+FORMAT = Format(".txrm (Zeiss)", _recognises, lambda path, opening: open_txrm(path, own_angles=opening.own_angles))
