@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Set
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Set
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cache, partial
@@ -24,9 +24,10 @@ import serial
 
 from beamline.config.load import Config, config_folder, load
 from beamline.core.events import Event
-from beamline.core.stop import StopRequest
+from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import Instrument, connect
 from beamline.scan import run as run_module
+from beamline.scan.control import verbs_taken
 from beamline.scan.recorder import Recorder
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
@@ -326,6 +327,8 @@ class Rig:
     Attributes:
         at_frame: row of the file -> what happens when that frame has been taken.
         after_connecting: what happens once all devices are open.
+        pause: what pauses the scan that was begun last, whoever asks for it.
+        in_pause: what happens at each look at a paused scan, one after the other; after the last one it goes on.
         asked: what the operator was asked to do.
     """
 
@@ -342,11 +345,14 @@ class Rig:
         self.asked: list[str] = []
         self.after_connecting: Callable[[], None] = lambda: None
         self.at_frame: dict[int, Callable[[], object]] = {}
+        self.pause, self.in_pause = PauseRequest(), list[Callable[[], object]]()
         simulated, opens = register(f"rig-{uuid4().hex}", self.cable), serial.serial_for_url
         monkeypatch.setattr(
             serial, "serial_for_url", lambda url, **how: opens(simulated if url == PORT else url, **how)
         )
         monkeypatch.setattr(run_module, "connect", self._connect)
+        monkeypatch.setattr(run_module, "verbs_taken", self._verbs_taken)
+        monkeypatch.setattr(run_module, "_wait_in_pause", self._wait_in_pause)
         monkeypatch.setattr(run_module, "watched", lambda folder, emit: nullcontext())  # a process a scan
         monkeypatch.setattr(run_module, "Recorder", partial(_Recorder, self.at_frame))
 
@@ -389,6 +395,7 @@ class Rig:
         self.block()
         self.after_connecting = lambda: None
         self.at_frame.clear()
+        self.in_pause.clear()
         for fault in ("no_camera", "unplugged", "unplug_at", "refuse"):
             self.world.fault(fault, 0)
 
@@ -404,6 +411,23 @@ class Rig:
             return self.kind.levels(self.controller, SHUTTER)
         wishes = [wish for wish in self.asked if "shutter" in wish]
         return bool(wishes) and wishes[-1].startswith("Open")
+
+    def go_on(self) -> None:
+        """Nothing holds the scan any more."""
+        self.pause.resume()
+        for cause in Cause:
+            self.pause.release(cause)
+
+    @contextmanager
+    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
+        self.pause = pause
+        with verbs_taken(folder, stop, pause):
+            yield
+
+    def _wait_in_pause(self, recorder: Recorder) -> bool:
+        recorder.check()
+        (self.in_pause.pop(0) if self.in_pause else self.go_on)()
+        return False
 
     def _connect(self, config: Config, **how: Any) -> Instrument:
         bench = connect(config, **{**how, "clock": self.clock})

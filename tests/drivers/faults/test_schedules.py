@@ -1,4 +1,4 @@
-"""Seeded schedules of ports that die, for good or for a while, cameras that are unplugged, lost pulses and stops.
+"""Seeded schedules of ports that die, for good or for a while, cameras that are unplugged, lost pulses, pauses, stops.
 
 Every scan ends in a named state, as safe as its dead ports allow, without a thread, and with a file that says the
 truth.
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.core.stop import ScanAborted, ScanStopped, StopRequest
+from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import SAFE, UNSAFE
 from beamline.scan.states import State
@@ -55,6 +55,12 @@ def scheduled(rig_of: RigOf, runs: Path, seed: int) -> State | None:
         rig.cable.at_request[first + 1 + int(rng.integers(6))] = rig.cable.plug
     drop_in([lambda: rig.world.fault("unplugged")], 0.3)
     drop_in([stop.stop, stop.abort], 0.2)
+    drop_in([lambda: rig.pause.pause(), lambda: rig.pause.hold(Cause.BACKLOG, "a slow disk")], 0.6)
+    drop_in([lambda: rig.pause.no_beam("no beam", rig.clock.now() - rng.uniform(0, 0.4))], 0.3)
+    drop_in([rig.go_on], 0.2)
+    happens = [pull, rig.cable.plug, lambda: rig.world.fault("unplugged"), stop.stop, stop.abort]
+    for _ in range(rng.integers(0, 4)):
+        rig.in_pause.append(happens[int(rng.integers(5))] if rng.random() < 0.3 else lambda: None)
     if rng.random() < 0.3:
         rig.trigger_cable.lost = {int(k) for k in rng.choice(VIEWS, 2, replace=False)}
 
