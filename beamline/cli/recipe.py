@@ -18,7 +18,7 @@ from click.core import ParameterSource
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
     "output", "as_json", "report", "pdf", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
-    "follow", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats",
+    "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats",
 )  # fmt: skip
 """Options that are of one scan or one call, not of a recipe."""
 _NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint")

@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,6 +130,13 @@ def region_of(text: str) -> Region:
 @click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
 @click.option(
+    "--earlier",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE",
+    help="With --follow, of a run that goes on: an earlier part of it, whose views come first. May be repeated.",
+)
+@click.option(
     "--enough-loss",
     type=POSITIVE,
     metavar="DB",
@@ -195,6 +202,7 @@ def recon(
     report: bool,
     pdf: bool,
     follow: bool,
+    earlier: tuple[Path, ...],
     enough_loss: float | None,
     enough_gain: float | None,
     unfinished: bool,
@@ -259,9 +267,11 @@ def recon(
         raise click.UsageError("--axis try is for a finished scan: it needs all views.")
     if tried is not None and (dry or log is not None):
         raise click.UsageError("--axis try does not go with --dry-run or --log: it writes a picture of slices only.")
+    if earlier and not follow:
+        raise click.UsageError("--earlier is for a run that goes on: give --follow, or the joined.h5 of its parts.")
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
-        source=source,
+        source=replace(source, earlier=earlier),
         target=OutputPaths(output, page, pdf=sheet),
         selection=selection,
         method=method_with(method, {**settings, "filter": ramp}),

@@ -95,7 +95,7 @@ def scan(
         with stop_signals(stop), Terminal(sys.stderr) as terminal:
             sinks: list[Sink] = [terminal, *json_sinks]
             result = run_scan(
-                config, series or output, sinks, stop, **_commands(config, no_live, joins_parts=series is not None),
+                config, series or output, sinks, stop, **_commands(config, no_live, series),
                 ask=lambda request: terminal.ask(request, ask_operator),
             )  # fmt: skip
     if not as_json:
@@ -134,18 +134,19 @@ class _Commands(TypedDict, total=False):
     afterwards: LiveCommand
 
 
-def _commands(config: Config, no_live: bool, joins_parts: bool) -> _Commands:
+def _commands(config: Config, no_live: bool, series: ResumableRun | None) -> _Commands:
     """How the scan is reconstructed: while it runs, when it is complete, or not at all."""
     if no_live or not config.recon.live:
         return {}
     if config.recon.method == AUTO or not streams(config.recon.method):
         click.echo(f"{config.recon.method} needs the complete scan: the volume comes after it.", err=True)
         return {"afterwards": finished_command(config)}
-    if joins_parts:
-        click.echo("The views are in several files: the volume comes when they are joined.", err=True)
+    if series is not None and series.ends is not None:
+        click.echo("No view is taken: the volume comes when the references are joined with them.", err=True)
         return {"afterwards": finished_command(config)}
     _, camera, _ = describe(config)
-    return {"live": follow_command(config, live_plan(camera.shape, plan_of(config).angles.size, free_memory()))}
+    plan = live_plan(camera.shape, plan_of(config).angles.size, free_memory())
+    return {"live": follow_command(config, plan, series.parts if series else ())}
 
 
 @contextmanager

@@ -58,6 +58,7 @@ class ScanFollower:
         self._fit: StreamingFit | None = None
         self._frames = 0
         self._taken = 0  # frames that were corrected, or that are no views
+        self._part = 0  # of the scan, of the views that were corrected last
         self._history: list[Progress] = []
         self._begin = clock.now()
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
@@ -106,10 +107,29 @@ class ScanFollower:
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)
         new = views[views >= self._taken]
-        batch = new[:_BATCH]
+        batch = self._of_one_part(new)[:_BATCH]
         self._feed(batch, last=ended and batch.size == new.size)
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
+
+    def _of_one_part(self, new: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of the new views that are in the same part of the scan as the first of them.
+
+        Views of a later part have references of their own, which were not there when the correction was made.
+        """
+        if not new.size:
+            return new
+        starts = self.source.part_starts
+        parts = np.searchsorted(starts, new, "right") - 1
+        if parts[0] != self._part:
+            self._part = int(parts[0])
+            if self._newest is not None:
+                self._feed(np.empty(0, np.int64), last=True)
+            if self._parts:
+                self._correct_again(usable_views(self.source, self._options.selection.use_flags))
+            elif self._correction is not None:
+                self._correction = self._correction.renewed()
+        return new[parts == parts[0]]
 
     def _feed(self, frames: NDArray[np.int64], last: bool) -> None:
         """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
@@ -191,7 +211,7 @@ class ScanFollower:
         fed = np.concatenate([part.view_ids for part in self._parts])
         frames = fed[np.isin(fed, usable.frames)]
         gone = fed.size - frames.size
-        if not (gone or self._correction.outdated):
+        if not (gone or self._correction.outdated or self.source.part_starts.size > 1):
             return
         message = "Flats or darks came after views, or air columns changed: all views are corrected again"
         if gone:

@@ -97,8 +97,12 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     return f"{found}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"
 
 
-def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
-    """The command `beamline recon SCAN --follow` with the options of the configuration."""
+def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequence[Path] = ()) -> LiveCommand:
+    """The command `beamline recon SCAN --follow` with the options of the configuration.
+
+    Args:
+        earlier: files of the same scan, whose views come first.
+    """
     recon, plan = config.recon, plan or LivePlan()
 
     def command(scan: Path, output: Path) -> Sequence[str]:
@@ -110,7 +114,7 @@ def follow_command(config: Config, plan: LivePlan | None = None) -> LiveCommand:
             options["--bin"] = plan.binning
         if plan.every > 1:
             options["--views"] = f"every:{plan.every}"
-        return _words(scan, ["--follow"], options)
+        return _words(scan, ["--follow", *(word for part in earlier for word in ("--earlier", str(part)))], options)
 
     return command
 

@@ -123,6 +123,10 @@ class FrameFlags:
                 mark.scores[at], mark.regions[at] = self.scores[frame, i], self.regions[frame, i]
         return replace(mark, bits=bits)
 
+    def of_today(self) -> FrameFlags:
+        """The same by today's checks; a check that is no more is left out."""
+        return FrameFlags.of_marks([self.mark(frame) for frame in range(self.bits.size)])
+
     @property
     def flagged(self) -> NDArray[np.bool_]:
         """[frame]: some check flagged it, at any level."""

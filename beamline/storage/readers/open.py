@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,6 +16,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
+from beamline.storage.readers.chain import Chain
 from beamline.storage.readers.overlay import Overlay
 from beamline.storage.readers.stacks import contents, named_angles, open_stacks
 from beamline.storage.readers.tiff import load_images
@@ -49,6 +52,7 @@ class SourceOptions:
         darks_path, flats_path: for `data_path`: where its darks and flats are.
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
         angles_unit: "deg" or "rad", of these, instead of what the file says.
+        earlier: files of the same scan, which have ended; their frames come before those of `path`.
     """
 
     path: Path | str
@@ -62,6 +66,7 @@ class SourceOptions:
     flats_path: str | None = None
     angles_path: str | None = None
     angles_unit: str | None = None
+    earlier: tuple[Path, ...] = ()
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The scan with these replacements; see `open_scan`."""
@@ -101,7 +106,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
         if table is None and darks is None and flats is None and options.quantity is None:
-            return base
+            return _chained(options.earlier, base) if options.earlier else base
         return Overlay(
             base,
             angles=table,
@@ -113,6 +118,14 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     except BaseException:
         base.close()
         raise
+
+
+def _chained(earlier: Sequence[Path], last: ScanReader) -> ScanReader:
+    with ExitStack() as opened:
+        sources = [opened.enter_context(_open(path, Opening())) for path in earlier]
+        chain = Chain(sources, last)
+        opened.pop_all()
+    return chain
 
 
 def _open(path: Path, opening: Opening) -> ScanReader:

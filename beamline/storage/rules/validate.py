@@ -267,7 +267,7 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
 
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """A part of a scan that was resumed is not all of it."""
-    if (found := joined_file_of(source.path)) is not None:
+    if source.part_starts.size == 1 and (found := joined_file_of(source.path)) is not None:
         joined, n = found
         yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
 

@@ -18,15 +18,18 @@ from beamline.core.events import Event
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
+from beamline.projections.flags import UsableViews
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import axis_search, snapshots
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct import growing as module
 from beamline.reconstruct.follow import FollowTiming, follow
+from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.reconstruct.result import OutputPaths
+from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
@@ -41,7 +44,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
 from recon.voxels.enough_views import Goal
-from tests.beamline.scans import TwoCylinders, frames_of
+from tests.beamline.scans import DARK, TwoCylinders, frames_of
 
 EPOCH = 1.8e9
 TICK = 0.02  # s that pass with each look at the clock
@@ -262,6 +265,59 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
         assert len(again) == 1
     elif air != "auto":  # air columns that are found may change with the last views; others may not
         assert not again
+
+
+def _brighter(frame: Frame, index: int) -> Frame:
+    """The frame as a beam of 1.3 times the light gives it."""
+    counts = frame.counts if frame.kind is FrameKind.DARK else DARK + 1.3 * (frame.counts - DARK)
+    return replace(frame, counts=np.round(counts).astype(np.uint16), index=index, time=frame.time + 3600)
+
+
+def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The beam changed in between: views are corrected by the flats of their own part, already while they come."""
+    frames, clock, events = frames_of(INTERLACED), ScanClock(), list[Event]()
+    plan = {"angles_deg": np.degrees(INTERLACED.angles).tolist()}
+    plan |= {kind: {"count": 2, "at": "start"} for kind in ("darks", "flats")}
+    _schedule(clock, tmp_path / "scan.h5", frames[:16], status="stopped", plan=json.dumps(plan))
+    _close(clock)
+    later = [_brighter(frame, i) for i, frame in enumerate([*frames[:4], *frames[16:]])]
+    _schedule(clock, tmp_path / "rest.h5", later, plan=json.dumps(plan))
+
+    live: list[Projections] = []
+    judged: list[PreparedProjections] = []
+    again, write = ScanFollower._correct_again, follow_module.write_result
+
+    def as_it_was(self: ScanFollower, usable: UsableViews) -> None:
+        live.append(self._joined())
+        again(self, usable)
+
+    def write_and_keep(outcome: ReconOutcome, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
+        judged.append(prepared)
+        return write(outcome, prepared, *rest)
+
+    monkeypatch.setattr(ScanFollower, "_correct_again", as_it_was)
+    monkeypatch.setattr(follow_module, "write_result", write_and_keep)
+    selection = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air="none"))
+    source = SourceOptions(tmp_path / "rest.h5", earlier=(tmp_path / "scan.h5",))
+    goal = Goal(psnr_loss=0.01)
+    follow(_options(tmp_path, source=source, selection=selection, enough=goal), events.append, clock, RHYTHM)
+
+    join([tmp_path / "scan.h5", tmp_path / "rest.h5"], tmp_path / "joined.h5")
+    with open_scan(tmp_path / "joined.h5") as joined:
+        whole = prepare_projections(joined, selection, lambda said: None)
+    assert whole.projections.view_ids.size == 30
+    np.testing.assert_array_equal(judged[0].projections.data, whole.projections.data)
+    np.testing.assert_array_equal(judged[0].projections.view_ids, whole.projections.view_ids)
+    np.testing.assert_array_equal(judged[0].geometry.angles, whole.geometry.angles)
+    assert [part.view_ids.size for part in live] == [12, 30]
+    np.testing.assert_allclose(live[1].data, whole.projections.data, atol=1e-6)
+    first = next(event for event in events if event.event == "snapshot")
+    assert first.data["n_views"] >= 12 and first.time < EPOCH + 1e6 + 60
+    warned = [event.data["message"] for event in events if event.event == "warning"]
+    assert sum("goes on with a run" in said and "not stopped early" in said for said in warned) == 1
+    assert not any("flats of their own" in said or "parts of a scan" in said for said in warned)
 
 
 def test_nothing_is_corrected_twice_where_all_references_came_first(

@@ -60,6 +60,8 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     words = follow_command(small(), LivePlan(4, 2, 10**9))(Path("scan.h5"), Path("recon.h5"))
     assert words[words.index("--bin") + 1] == "4" and words[words.index("--views") + 1] == "every:2"
     assert "--bin" not in follow_command(small())(Path("scan.h5"), Path("recon.h5"))
+    words = follow_command(small(), earlier=[Path("a.h5"), Path("b.h5")])(Path("c.h5"), Path("recon.h5"))
+    assert words[words.index("--follow") :][:5] == ["--follow", "--earlier", "a.h5", "--earlier", "b.h5"]
 
 
 READY = """print('{"event": "state", "state": "ready"}', flush=True)\n"""
