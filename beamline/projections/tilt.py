@@ -15,7 +15,7 @@ from beamline.storage.readers.base import ScanSource
 from recon.prep.tilt import FEWEST_BANDS, STEEPEST, TiltEstimate, find_tilt
 
 _BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240
-_LOOK_BANDS, _LOOK_VIEWS = 8, 90  # for a warning
+_LOOK_BANDS, _LOOK_ROWS, _LOOK_VIEWS = 8, 2, 90  # for a warning, by views as they are
 _FEWEST_ROWS = 32  # that are looked at for a warning: half a pixel over fewer is no tilt of a stage
 _MATTERS = 0.5  # px over the rows
 _NOTHING = 0.05  # px over the rows, not worth new pixels
@@ -70,17 +70,14 @@ def warn_of_tilt(
         return
     frames = spread_views(source.angles[frames], _LOOK_VIEWS, frames)
     try:
-        found = _look(source, correction, frames, _LOOK_BANDS)
-        if abs(found.tilt) * rows < _MATTERS or abs(found.tilt) < found.uncertainty:
-            return
-        tilt, uncertainty = _refined(source, selection, frames, _LOOK_BANDS, found.tilt, 1)
+        found = _look(source, correction, frames, _LOOK_BANDS, _LOOK_ROWS)
     except (ValueError, DataError):
         return  # nothing is known, and nothing was asked
-    if abs(tilt) * rows > _MATTERS and abs(tilt) > _SURE * uncertainty:
+    if abs(found.tilt) * rows > _MATTERS and abs(found.tilt) > _SURE * found.uncertainty:
         warn(
-            f"The rotation axis seems to lean by {_text(tilt, uncertainty)} in the detector's plane, "
-            f"{abs(tilt) * rows:.1f} px over {rows} rows: edges double in the first and last slices. Give --tilt auto, "
-            "or --tilt 0 if it is straight."
+            f"The rotation axis seems to lean by {_text(found.tilt, found.uncertainty)} in the detector's plane, "
+            f"{abs(found.tilt) * rows:.1f} px over {rows} rows: edges double in the first and last slices. "
+            "Give --tilt auto, or --tilt 0 if it is straight."
         )
 
 
@@ -115,21 +112,23 @@ def _refined(
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     for _ in range(rounds):
         levelled = ScanCorrection(source, replace(plain, tilt_deg=math.degrees(tilt)), lambda _: None)
-        found = _look(source, levelled, frames, bands)
+        found = _look(source, levelled, frames, bands, _BAND_ROWS)
         tilt += found.tilt
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
             break
     return tilt, found.uncertainty
 
 
-def _look(source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], bands: int) -> TiltEstimate:
-    """The tilt that is left in corrected views, by bands of their rows that can be corrected.
+def _look(
+    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], bands: int, thick: int
+) -> TiltEstimate:
+    """The tilt that is left in corrected views, by bands of `thick` rows that can be corrected.
 
     Raises:
         ValueError: see `find_tilt`.
     """
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
-    thick = max(1, min(_BAND_ROWS, rows // bands))
+    thick = max(1, min(thick, rows // bands))
     means: list[NDArray[np.float32]] = []
     heights, ids = [], np.empty(0, np.int64)
     for first in np.unique(np.linspace(0, rows - thick, min(bands, rows)).round().astype(int)).tolist():

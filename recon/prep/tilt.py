@@ -20,6 +20,7 @@ FEWEST_BANDS = 4
 _DEEP = 0.2  # by which the logarithm of the mismatch must be lower at the axes found than it is typically
 _FLOOR = 1e-3  # mismatch; lower ones say nothing more
 _NEWTON, _CLOSE = 20, 1e-4  # steps, and px at which they end
+_OWN = 6  # px from the line within which a band's own axis is looked for
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,9 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
     The mismatch of a band with an axis is that of the double wedge, or where that does not tell it and the views go
     round the full turn, that of opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band
     whose noise is not known: it weighs little where a band fits badly with any axis, as air or a clipped row does. The
-    uncertainty is that of the jackknife over bands, or over neighbouring ones together, which see the same sample,
-    where that is larger (Efron & Stein 1981, Ann. Stat. 9, 586).
+    uncertainty has two parts: that of the jackknife over bands, or over neighbouring ones together, which see the same
+    sample, where that is larger (Efron & Stein 1981, Ann. Stat. 9, 586); and the scatter of the bands' own axes about
+    the line, as the jackknife is too small where few bands carry the estimate.
 
     A tilt also turns the views: rows mix by tilt times half the width. The estimate is exact where that is little, and
     is better of views that were levelled by a first one.
@@ -103,7 +105,26 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
         parts = np.array_split(every, count)
         without = np.array([_descend(splines, heights, np.setdiff1d(every, part), found)[1] for part in parts])
         spread = max(spread, math.sqrt((count - 1) * float(np.mean((without - without.mean()) ** 2))))
+    spread = math.hypot(spread, _scatter(splines, heights, found))
     return TiltEstimate(math.atan(found[1]), spread / (1 + found[1] ** 2), float(found[0]))
+
+
+def _scatter(splines: list[CubicSpline], heights: F64, line: F64) -> float:
+    """Standard deviation of the slope by how far from the line the bands have their own axes (weighted least squares).
+
+    A band's weight is the bend of its logarithm. Those at the ends, which turn the line, may be few: the scatter is
+    divided by how many bands carry the slope, not by their number.
+    """
+    at = line[0] + line[1] * heights
+    value, second = (np.array([spline(x, order) for spline, x in zip(splines, at, strict=True)]) for order in (0, 2))
+    weight = np.maximum(second, 0) / np.maximum(value, _FLOOR)
+    near = at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1)
+    near = np.clip(near, splines[0].x[0], splines[0].x[-1])
+    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - at
+    lever = weight * (heights - np.average(heights, weights=weight)) ** 2
+    carriers = lever.sum() ** 2 / (lever**2).sum()
+    variance = np.average(own**2, weights=weight) * heights.size / (heights.size - 2)
+    return math.sqrt(variance / carriers * weight.sum() / lever.sum())
 
 
 def _descend(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64], start: F64) -> F64:

@@ -39,14 +39,17 @@ class Balls:
         z, radius = rng.uniform(-rows / 2, rows / 2, self.count), rng.uniform(0.05, 0.12, self.count) * cols
         return np.stack([away * np.cos(turn), away * np.sin(turn), z, radius], axis=1)
 
-    def views(self) -> NDArray[np.float32]:
-        """Line integrals [view, row, col]."""
+    def views(self, only: NDArray[np.int64] | None = None) -> NDArray[np.float32]:
+        """Line integrals [view, row, col], of all rows or `only` some."""
         rows, cols = self.shape
-        x, y = np.meshgrid(np.arange(cols) - (cols - 1) / 2, np.arange(rows) - (rows - 1) / 2)
+        seen = np.arange(rows) if only is None else only
+        x, y = np.meshgrid(np.arange(cols) - (cols - 1) / 2, seen - (rows - 1) / 2)
         c, s = math.cos(math.radians(self.tilt_deg)), math.sin(math.radians(self.tilt_deg))
         u, v = c * x - s * y - (self.axis_col - (cols - 1) / 2), s * x + c * y
-        out = np.zeros((self.angles.size, rows, cols))
+        out = np.zeros((self.angles.size, seen.size, cols))
         for bx, by, z, radius in self.places:
+            if (np.abs(v - z) >= radius).all():
+                continue
             centre = bx * np.cos(self.angles) + by * np.sin(self.angles)
             out += 0.04 * np.sqrt(np.clip(radius**2 - (u - centre[:, None, None]) ** 2 - (v - z) ** 2, 0, None))
         return out.astype(np.float32)
