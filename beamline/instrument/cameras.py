@@ -11,6 +11,7 @@ import click
 
 from beamline.config.devices import DcamOrca
 from drivers.clock import Clock
+from drivers.frame_memory import FrameMemory
 
 if TYPE_CHECKING:
     from drivers.dcam.camera import DcamCamera
@@ -20,8 +21,8 @@ TELL_EVERY = 30.0
 """s between words on a sensor that is cooling down."""
 
 
-def make_camera(config: DcamOrca, clock: Clock) -> DcamCamera:
-    """The driver of the configured camera, connected.
+def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
+    """The driver of the configured camera, connected. `memory`: of the frames that it gives.
 
     Raises:
         DeviceError: no library, no camera, or it does not count its frames.
@@ -29,7 +30,7 @@ def make_camera(config: DcamOrca, clock: Clock) -> DcamCamera:
     from drivers.dcam.camera import DcamCamera
 
     library = None if config.library is None else Path(config.library)
-    return DcamCamera(library, config.index, clock=clock, options=options_of(config))
+    return DcamCamera(library, config.index, clock=clock, options=options_of(config), memory=memory)
 
 
 def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, check_stop: Callable[[], None]) -> None:

@@ -21,6 +21,7 @@ from beamline.instrument.operator import ask_operator
 from beamline.instrument.simulated import Simulated, clock_of, scene_of, simulated_devices
 from drivers import orca_quest
 from drivers.clock import Clock, SystemClock
+from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualSampleMover, ManualShutter
 from drivers.protocols import (
     BeamMonitor,
@@ -48,6 +49,7 @@ class Instrument:
         simulated: what the simulator knows; None at a real instrument.
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None where none is configured.
+        frame_memory: of the camera's frames; None where it is nobody's concern.
     """
 
     devices: Devices
@@ -55,6 +57,7 @@ class Instrument:
     simulated: Simulated | None
     close: Callable[[], None]
     beam_monitor: BeamMonitor | None = None
+    frame_memory: FrameMemory | None = None
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
@@ -84,16 +87,16 @@ def connect(
     """
     with ExitStack() as opened:
         if config.simulation is None:
-            clock, simulated = clock or SystemClock(), None
-            devices = _instrument(config, clock, ask or ask_operator, check_stop, opened)
+            clock, simulated, memory = clock or SystemClock(), None, FrameMemory()
+            devices = _instrument(config, clock, ask or ask_operator, check_stop, opened, memory)
         else:
-            clock = clock or clock_of(config.simulation.clock)
+            clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
         monitor = None
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        return Instrument(devices, clock, simulated, opened.pop_all().close, monitor)
+        return Instrument(devices, clock, simulated, opened.pop_all().close, monitor, memory)
 
 
 @contextmanager
@@ -141,13 +144,15 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
     return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
 
 
-def _instrument(config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack) -> Devices:
+def _instrument(
+    config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack, memory: FrameMemory
+) -> Devices:
     chosen = config.devices.camera
     if not isinstance(chosen, DcamOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
     stage = config.devices.stage.settings.connect(config.devices.stage.port, clock)
     opened.callback(stage.close)
-    camera = make_camera(chosen, clock)
+    camera = make_camera(chosen, clock, memory)
     opened.callback(camera.close)
     if chosen.cool_s:
         wait_until_cold(camera, chosen.cool_s, clock, check_stop)

@@ -27,7 +27,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, digest
 from beamline.monitor.watch import look, start
 from beamline.plan.plan import Block, Mode, Timeline
-from beamline.scan.recorder import Recorder
+from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.to_disk import ToDisk
@@ -41,6 +41,7 @@ RING = 8  # views that differ; they come by turns
 FEWEST = 32  # frames of a warm-up, which compiles the kernels and tells how many the time allows, and of a stage
 DARK, FLAT, ABSORPTION, RADIUS = 200, 12_000, 1.5, 0.8  # counts; line integral at the axis; share of half the width
 SATURATION = 65_535
+_MOST = 1000  # frames of a scan that is as long as memory matters for
 PERIOD = 1 / 120  # s that the frames say lie between them; they come as fast as they are taken
 
 
@@ -90,6 +91,13 @@ class Load:
         kind = kinds[slot // REFERENCES] if slot < 2 * REFERENCES else FrameKind.PROJECTION
         angle = np.nan if kind is not FrameKind.PROJECTION else np.pi * (row - 2 * REFERENCES) / n
         return Frame(self.images[slot], kind, row, row, row, angle, 1.8e9 + row * PERIOD, PERIOD)
+
+    @cached_property
+    def memory(self) -> FrameMemory:
+        """Of the frames that are taken, as a scan has it before its first frame."""
+        memory = FrameMemory()
+        memory.prepare(frames_in_memory(self.timeline(_MOST)), self.shape)
+        return memory
 
     @property
     def context(self) -> ScanContext:
@@ -193,11 +201,11 @@ def _pipeline(load: Load, folder: Path, n: int, clock: Clock) -> int:
     writer = _writer(load, folder, clock)
     monitor = start(load.context, load.checks)
     recorder = Recorder(writer, monitor, load.timeline(n), preview_bin=load.preview_bin, emit=lambda event, data: None)
-    status, memory = "failed", FrameMemory()
+    status = "failed"
     try:
         for row in range(n):
             frame = load.frame(row, n)
-            pixels = memory.take(load.shape)
+            pixels = load.memory.take(load.shape)
             np.copyto(pixels, frame.counts)  # as a driver copies it out of its ring
             recorder.put(replace(frame, counts=pixels))
         recorder.finish()
@@ -282,7 +290,7 @@ def summary(load: Load, taken: Sequence[Taken]) -> list[RateRow]:
 
 
 def _measure(name: str, load: Load, folder: Path, n: int, clock: Clock) -> Taken:
-    load.timeline(n)  # makes the images and their digests, once
+    load.timeline(n), load.memory  # makes the images, their digests and the memory, once
     try:
         with tempfile.TemporaryDirectory(prefix="beamline-bench-", dir=folder) as own:
             reset_peak_memory()

@@ -54,6 +54,17 @@ class Writer(Protocol):
     def flush(self) -> None: ...
 
 
+def _room(timeline: Timeline) -> int:
+    """Frames that may wait to be written."""
+    low, high = WAITING_FRAMES
+    return min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
+
+
+def frames_in_memory(timeline: Timeline) -> int:
+    """Frames of a scan that are in memory at one time, at most: waiting, in work, and on their way from the camera."""
+    return min(_room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
+
+
 _Checked = tuple[Frame, FrameDigest, tuple[Flag, ...]]
 
 
@@ -97,8 +108,7 @@ class Recorder:
         self._retaken, self._retaking = 0, False
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
-        low, high = WAITING_FRAMES
-        room = min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
+        room = _room(timeline)
         self._waiting: Queue[Frame | threading.Event | None] = Queue(room)
         self._checked: Queue[_Checked | Exception | threading.Event | None] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames

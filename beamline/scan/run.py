@@ -17,9 +17,10 @@ from beamline.config.monitor import policies
 from beamline.config.references import reference_limits
 from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
+from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
-from beamline.core.text import count
+from beamline.core.text import count, size
 from beamline.instrument.connect import Instrument, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
@@ -31,7 +32,7 @@ from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction
 from beamline.scan.preflight import ReadyScan, preflight, whole
-from beamline.scan.recorder import Recorder
+from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.scan.resume import ResumableRun
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
@@ -209,6 +210,7 @@ class _Run:
         path = self.folder / SCAN
         command = None if live is None else live(path, self.folder / RECON)
         self.emit("run_started", self._facts(path))
+        self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
             follower = None
@@ -217,6 +219,20 @@ class _Run:
                 ending.callback(follower.close)
                 follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
             return self._acquire_and_follow(writer, follower, release)
+
+    def _prepare_memory(self) -> None:
+        """Memory for the frames that may wait for the disk, before the first comes: at most half of what is free."""
+        memory, timeline = self.instrument.frame_memory, self.ready.timeline
+        if memory is None:
+            return
+        n = min(frames_in_memory(timeline), free_memory() // (2 * timeline.frame_bytes))
+        frames = f"memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
+        try:
+            why = memory.prepare(n, self.ready.timing.shape)
+            said = f"{frames}, is ready" + (f"; the system may swap it out ({why})" if why else " and locked")
+        except OSError as error:
+            said = f"{frames}, cannot be had before they come ({error.strerror or error})"
+        self.emit("state", {"state": self.states.state, "message": said[0].upper() + said[1:]})
 
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""

@@ -18,6 +18,7 @@ from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
 from drivers.dcam.structures import BufFrame
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.frame_memory import FrameMemory
 from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 
 _WAIT_SLICE = 0.1  # s; short, since an event between looking and waiting is missed
@@ -40,6 +41,7 @@ class DcamCamera:
         name: its name in error messages.
         clock: gives the time of the first frame of a run; the camera's own clock gives the differences after it.
         options: response to triggers, correction of counts, memory of the ring.
+        memory: of the frames that are taken.
 
     Raises:
         DeviceError: no library, no camera, or no two test frames with counts and times.
@@ -53,9 +55,11 @@ class DcamCamera:
         *,
         clock: Clock | None = None,
         options: DcamOptions | None = None,
+        memory: FrameMemory | None = None,
     ) -> None:
         self.name = name
         self._clock, self._options = clock or SystemClock(), options or DcamOptions()
+        self._memory = memory or FrameMemory()
         self._inside = threading.Lock()  # held while a frame is taken: close() waits for it
         self._ring_lock = threading.Lock()  # held while slots are read or freed
         self._ring: Ring | None = None  # set while armed
@@ -215,7 +219,7 @@ class DcamCamera:
 
     def _start(self, slots: int, mode: CaptureMode) -> Ring:
         """Allocate a ring and start a capture; it stays allocated until `_free`, also after an error."""
-        ring = self._held = Ring(self._dcam, self._camera, self.name, slots)
+        ring = self._held = Ring(self._dcam, self._camera, self.name, slots, self._memory)
         try:
             ring.start(mode, self._clock)
         except BaseException:

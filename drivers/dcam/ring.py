@@ -24,6 +24,7 @@ class Ring:
 
     Args:
         slots: number of frames that it holds; during a capture the oldest may be half overwritten at any moment.
+        memory: of the frames that are taken.
 
     Raises:
         DcamError: the memory cannot be allocated.
@@ -32,13 +33,13 @@ class Ring:
         overwritten: frames that were overwritten before they were taken.
     """
 
-    def __init__(self, dcam: Dcam, camera: int, device: str, slots: int) -> None:
+    def __init__(self, dcam: Dcam, camera: int, device: str, slots: int, memory: FrameMemory) -> None:
         self._dcam, self._camera, self._device, self._slots = dcam, camera, device, slots
         self._next = 0  # number of the next frame to take, counted from 0 in the order of arrival
         self._count = 0  # frames that had arrived at the last look
         self._overrun_reported = False  # and no frame was taken since
         self.overwritten = 0
-        self._memory = FrameMemory()
+        self._memory = memory
         dcam.buf_alloc(camera, slots)
 
     def start(self, mode: CaptureMode, clock: Clock) -> None:

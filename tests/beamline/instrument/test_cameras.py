@@ -12,6 +12,7 @@ import pytest
 from beamline.core.stop import ScanAborted
 from beamline.instrument import connect as devices
 from drivers.dcam.options import DcamOptions
+from drivers.frame_memory import FrameMemory
 from drivers.stages.pm16c.settings import PM16CSettings
 from tests.beamline.ball_scan import shipped
 from tests.beamline.closable import Closable
@@ -24,9 +25,11 @@ def test_every_camera_option_reaches_the_driver(
     waited: list[float] = []
 
     class Camera(Closable):
-        def __init__(self, library: Path, index: int, *, clock: object, options: DcamOptions) -> None:
+        def __init__(
+            self, library: Path, index: int, *, clock: object, options: DcamOptions, memory: FrameMemory
+        ) -> None:
             super().__init__()
-            self.library, self.options = library, options
+            self.library, self.options, self.memory = library, options, memory
             made.append(self)
 
         def wait_until_cold(self, timeout: float, progress: Callable[[float, str], None]) -> None:
@@ -50,10 +53,12 @@ def test_every_camera_option_reaches_the_driver(
         "cool_s": 90,
     }
     changes = [f"devices.camera.{key}={value}" for key, value in said.items()]
-    devices.connect(shipped("instrument", "scan.mode=step", *changes)).close()
+    instrument = devices.connect(shipped("instrument", "scan.mode=step", *changes))
+    instrument.close()
     assert "-19.5 °C, its cooler says busy" in capsys.readouterr().err
     (camera,) = made
     assert camera.library == Path("/opt/libdcamapi.so")
+    assert camera.memory is instrument.frame_memory is not None
     default = DcamOptions()
     for field in dataclasses.fields(DcamOptions):
         value = getattr(camera.options, field.name)

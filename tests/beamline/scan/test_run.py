@@ -33,6 +33,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
+from drivers.frame_memory import FrameMemory
 from recon.prep.correct import CorrectionSettings
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults
 from tests.beamline.ran import SMALL, Ran, small
@@ -425,3 +426,30 @@ def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> N
 )
 def test_exit_codes(error: BaseException, code: int) -> None:
     assert module.exit_code(error) == code
+
+
+def test_memory_for_the_frames_is_ready_before_the_first_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, tuple[int, int]]] = []
+
+    class Memory(FrameMemory):
+        def prepare(self, n: int, shape: tuple[int, int]) -> str:
+            asked.append((n, shape))
+            if len(asked) == 3:
+                raise OSError(errno.ENOMEM, "Cannot allocate memory")
+            return "" if len(asked) == 1 else "Operation not permitted"
+
+    said = []
+    for run in ("locked", "not permitted", "no memory"):
+        instrument, events = FakeInstrument(), list[Event]()
+        with_memory = replace(instrument.connected(), frame_memory=Memory())
+        run_scan(small(), tmp_path / run, [events.append], instrument=with_memory)
+        names = [event.event for event in events]
+        message = events[names.index("run_started") + 1]
+        assert message.data["state"] is State.PREPARING
+        said.append(message.data["message"])
+    assert asked == [(19, (8, 12))] * 3  # all frames of so short a scan
+    assert said == [
+        "Memory for 19 frames, 3.65 kB, is ready and locked",
+        "Memory for 19 frames, 3.65 kB, is ready; the system may swap it out (Operation not permitted)",
+        "Memory for 19 frames, 3.65 kB, cannot be had before they come (Cannot allocate memory)",
+    ]
