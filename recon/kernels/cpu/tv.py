@@ -19,6 +19,7 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 _f = np.float32
 _NO_FLOOR = -3.0e38
 Weights = tuple[float, float, float]
+Scratch = tuple[F32, F32]
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
@@ -83,7 +84,7 @@ def _primal(x: F32, p: F32, threshold: float, weights: Weights, floor: float, pl
                     out[i, j, k] = planes[run, 0, j, k]
 
 
-def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: F32) -> None:
+def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: Scratch) -> None:
     """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or none.
 
     Projected gradient ascent of the dual of min ½|y - x|² + threshold TV(y) (Chambolle 2004; with P: Beck & Teboulle
@@ -94,17 +95,22 @@ def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: b
     """
     pace = 1.9 / (4 * sum(w * w for w in weights)) / threshold
     floor = 0.0 if nonnegative else _NO_FLOOR
-    _dual_step(x, p, threshold, pace, weights, floor, scratch[:, 2], scratch[:, :2])
+    _dual_step(x, p, threshold, pace, weights, floor, *scratch)
 
 
-def primal(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: F32, out: F32) -> None:
+def primal(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: Scratch, out: F32) -> None:
     """out = P(x - threshold Dᵀ p); `out` may be `x`."""
-    _primal(x, p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch[:, :2], out)
+    _primal(x, p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch[1], out)
 
 
-def dual_scratch(shape: tuple[int, int, int]) -> F32:
-    """Scratch for `dual_step` and `primal`: three planes for each run of planes."""
-    return np.empty((_runs(shape), 3, shape[1], shape[2] + 1), np.float32)
+def dual_scratch(shape: tuple[int, int, int]) -> Scratch:
+    """Scratch for `dual_step` and `primal`: three planes for each run of planes.
+
+    Two arrays, each without gaps: from parts of one the compiler makes code that gathers single numbers, at a quarter
+    of the speed.
+    """
+    runs, (_, b, c) = _runs(shape), shape
+    return np.empty((runs, b, c + 1), np.float32), np.empty((runs, 2, b, c + 1), np.float32)
 
 
 def _runs(shape: tuple[int, int, int]) -> int:
