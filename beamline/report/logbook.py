@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -232,12 +233,16 @@ class _Page:
                 lines.append(line)
                 line = ""
             while long > wide and len(word) > 1:
-                n = next(n for n in range(len(word) - 1, 0, -1) if n == 1 or self._width(word[:n], size, style) <= wide)
+                n = max(1, bisect_right(range(1, len(word)), wide, key=partial(self._of_first, word, size, style)))
                 lines.append(word[:n])
                 word = word[n:]
                 long = self._width(word, size, style)
             line, so_far = (f"{line} {word}", so_far + gap + long) if line else (word, long)
         return [*lines, line] if line else lines or [""]
+
+    def _of_first(self, word: str, size: float, style: Mapping[str, Any], n: int) -> float:
+        """Inches of its first n letters."""
+        return self._width(word[:n], size, style)
 
     def _width(self, text: str, size: float, style: Mapping[str, Any]) -> float:
         """Inches."""

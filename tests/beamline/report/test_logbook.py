@@ -83,7 +83,7 @@ def test_the_page_says_what_the_report_says() -> None:
 
 
 def test_the_file_is_one_page_and_the_same_again(tmp_path: Path) -> None:
-    report, volume = _report(1, 1), _volume((20, 1000, 1000))
+    report, volume = _report(1, 1), _volume((3, 1000, 1000))
     write_logbook(tmp_path / "a.pdf", report, volume, "mm", NOW)
     written = (tmp_path / "a.pdf").read_bytes()
     assert written.startswith(b"%PDF-1.4") and b"/Count 1 " in written
