@@ -17,7 +17,6 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, printable, size, spans
-from beamline.scan.resume import recover_run
 from beamline.storage.archive import CODECS
 from beamline.storage.archive import archive as archive_scan
 from beamline.storage.describe import describe
@@ -105,6 +104,8 @@ def recover(file: Path, as_json: bool) -> None:
     Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is.
     """
+    from beamline.scan.resume import recover_run  # here: no other command of this module needs a configuration
+
     with terminated_like_interrupted(), json_events(as_json) as sinks:
         found, left_out = recover_run(file) if file.is_dir() else ([recover_scan(file)], [])
         for said in left_out:

@@ -223,9 +223,9 @@ class _Run:
     def _prepare_memory(self) -> None:
         """Memory for the frames that may wait for the disk, before the first comes: at most half of what is free."""
         memory, timeline = self.instrument.frame_memory, self.ready.timeline
-        if memory is None:
-            return
         n = min(frames_in_memory(timeline), free_memory() // (2 * timeline.frame_bytes))
+        if memory is None or n == 0:
+            return
         frames = f"memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
         try:
             why = memory.prepare(n, self.ready.timing.shape)
