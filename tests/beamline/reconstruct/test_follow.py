@@ -148,9 +148,9 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
     metrics = follow(_options(tmp_path, target=target, method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM)
 
-    names = [event.event for event in events]
+    names = [event.event for event in events if event.event != "kernels"]  # comes where kernels are compiled
     assert names[0] == "state"
-    assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
+    assert [event.data["state"] for event in events if event.event == "state"][:3] == ["warming_up", "ready", "waiting"]
     assert names.count("recon_started") == 1
     assert "snapshot" in names
     assert names[-1] == "done"
