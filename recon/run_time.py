@@ -28,9 +28,14 @@ Clock = Callable[[], float]
 F32 = NDArray[np.float32]
 Decided = Mapping[str, Sequence[Any]]
 
-_ROWS, _COLS, _VIEWS = 16, 128, (108, 216)  # of small runs; two numbers of views tell what a view costs
-_TRIED = 72, 64, 16  # views, columns and rows of trials of a weight
-_TALL, _SWEEPS = 96, 4  # most rows; iterations that are timed
+# Of small runs, at most: with fewer columns the time is not that of voxels and views. Two numbers of views tell what a
+# view costs.
+_SWEPT_ROWS, _SWEPT_COLS, _VIEWS = 32, 256, (72, 216)
+_SWEEPS = 4  # iterations that are timed
+_TRIED = 72, 192, 16  # views, columns and rows of trials of a weight
+_COMPILED = 24, 64, 16  # likewise, of a run that compiles
+_FEW_ROWS = 16  # of FBP and fits
+_FIT_COLS, _FIT_VIEWS = 128, 108
 _FBP_COLS, _FBP_VIEWS = 512, 180
 _STEPS = 12  # of a small fit
 
@@ -75,16 +80,18 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
 
 
 def _of_iterations(method: Method, iterations: int, extent: Extent, now: Clock) -> float:
-    deciding, decided = _took(method, _TRIED, 1 + _SWEEPS, Decisions(), now, twice=True)
-    following, _ = _took(method, _TRIED, 1 + _SWEEPS, Decisions(0, decided), now)
-    height = min(max(extent.heights), _TALL)  # rows are the innermost loop: few of them cost more each
-    few, many = (_of_sweeps(method, (views, _COLS // 2, height), decided, now) for views in _VIEWS)
+    _took(method, _COMPILED, 1, Decisions(), now)
+    tried = _TRIED[0], min(_TRIED[1], extent.cols), _TRIED[2]
+    deciding, decided = _took(method, tried, 1 + _SWEEPS, Decisions(), now)
+    following, _ = _took(method, tried, 1 + _SWEEPS, Decisions(0, decided), now)
+    cols, height = min(extent.cols, _SWEPT_COLS), min(max(extent.heights), _SWEPT_ROWS)
+    few, many = (_of_sweeps(method, (views, cols, height), decided, now) for views in _VIEWS)
     at = (extent.views - _VIEWS[0]) / (_VIEWS[1] - _VIEWS[0])
     sweep, start = (max(a + at * (b - a), 0.0) for a, b in zip(few, many, strict=True))
-    rays = extent.views * extent.cols**2 / (_TRIED[0] * _TRIED[1] ** 2)
+    rays = extent.views * extent.cols**2 / (tried[0] * tried[1] ** 2)
     # Trials on sixteen rows; how many depends on the data.
     once = 0.0 if extent.decided else rays * max(deciding - following, 0.0)
-    return (2 * extent.cols / _COLS) ** 2 * extent.rows / height * (start + iterations * sweep) + once
+    return (extent.cols / cols) ** 2 * extent.rows / height * (start + iterations * sweep) + once
 
 
 def _of_sweeps(method: Method, size: tuple[int, int, int], decided: Decided, now: Clock) -> tuple[float, float]:
@@ -95,13 +102,11 @@ def _of_sweeps(method: Method, size: tuple[int, int, int], decided: Decided, now
 
 
 def _took(
-    method: Method, size: tuple[int, int, int], iterations: int, decide: Decisions, now: Clock, twice: bool = False
+    method: Method, size: tuple[int, int, int], iterations: int, decide: Decisions, now: Clock
 ) -> tuple[float, Decided]:
-    """Seconds of so many iterations, and what was decided; `twice`: a run before compiles."""
+    """Seconds of so many iterations, and what was decided."""
     geometry, data = _sample(*size)
     one = with_settings(method, {"iterations": iterations})
-    if twice:
-        reconstruct(data, geometry, with_settings(method, {"iterations": 1}))
     begin = now()
     reconstruct(data, geometry, one, control=RunControl(decide=decide))
     return now() - begin, decide.made
@@ -115,12 +120,12 @@ def _of_fbp(extent: Extent, now: Clock) -> float:
         begin = now()
         reconstruct(data, geometry, Fbp())
         times.append(now() - begin)
-    share = min(times) / fbp_nanoseconds(views, cols, _ROWS)
+    share = min(times) / fbp_nanoseconds(views, cols, _FEW_ROWS)
     return share * sum(fbp_nanoseconds(extent.views, extent.cols, height) for height in extent.heights)
 
 
 def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
-    geometry, data = _sample(_VIEWS[0], _COLS)
+    geometry, data = _sample(_FIT_VIEWS, _FIT_COLS)
     count = default_count(Grid.matching(geometry))
 
     def took(steps: int) -> float:
@@ -130,7 +135,7 @@ def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
 
     took(2)
     step = (took(2 * _STEPS) - took(_STEPS)) / _STEPS
-    voxels = _ROWS * _COLS**2
+    voxels = _FEW_ROWS * _FIT_COLS**2
     given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
     fitted = 0.0
     for height in extent.heights:
@@ -143,7 +148,7 @@ def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
     return steps + finish + _of_fbp(extent, now)
 
 
-def _sample(views: int, cols: int, rows: int = _ROWS) -> tuple[Geometry, F32]:
+def _sample(views: int, cols: int, rows: int = _FEW_ROWS) -> tuple[Geometry, F32]:
     """Views of a disc with a hole, with some noise."""
     geometry = Geometry.parallel(np.arange(views) * np.pi / views, (rows, cols))
     grid = Grid.matching(geometry)

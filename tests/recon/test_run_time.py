@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import pytest
 
 import recon
 from recon import run_time
 from recon.auto import Auto
+from recon.base.decisions import Decisions
 from recon.run_time import Extent, run_seconds
 
 
@@ -19,19 +21,34 @@ def test_fbp_takes_twice_as_long_for_two_slabs_and_a_choice_as_long_as_its_parts
     assert run_seconds(Auto((recon.Fbp(),)), two, itertools.count().__next__) == pytest.approx(3 * seconds[0])
 
 
-def test_iterations_cost_by_their_number() -> None:
-    """By a clock that ticks once a run, whatever it does, an iteration costs nothing: what is left is one run."""
+def test_iterations_cost_by_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where each run takes a second, whatever it does, an iteration costs nothing: what is left is one run."""
+    monkeypatch.setattr(run_time, "_took", lambda *_: (1.0, {}))
     few, many = (
         run_seconds(recon.Sirt(iterations=n), Extent(108, 64, [16]), itertools.count().__next__) for n in (3, 300)
     )
     assert few == many == pytest.approx(1.0)
 
 
+def test_iterations_cost_by_voxels_and_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a law of so much a voxel, a voxel and view, and for trials a voxel of a slice and view."""
+
+    def took(_: Any, size: tuple[int, int, int], iterations: int, decide: Decisions, *__: Any) -> tuple[float, Any]:
+        views, cols, rows = size
+        trials = 0 if decide._followed else 50 * views * cols**2
+        return 1e-6 * (rows * cols**2 * (10 + iterations * (5 + views)) + trials), {"weight": [1.0]}
+
+    monkeypatch.setattr(run_time, "_took", took)
+    for views, cols, rows in ((90, 100, 8), (1800, 2048, 64)):
+        found = run_seconds(recon.OsSirtTv(iterations=40), Extent(views, cols, [rows]), itertools.count().__next__)
+        assert found == pytest.approx(1e-6 * cols**2 * (rows * (10 + 40 * (5 + views)) + 50 * views))
+
+
 def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where deciding takes 4 s of a small run, whatever its size."""
 
-    def took(*arguments: object, twice: bool = False) -> tuple[float, dict[str, list[float]]]:
-        return (5.0 if twice else 1.0), {}
+    def took(*arguments: Any) -> tuple[float, dict[str, list[float]]]:
+        return (1.0 if arguments[3]._followed else 5.0), {"weight": [1.0]}
 
     monkeypatch.setattr(run_time, "_took", took)
     rest, whole = (
