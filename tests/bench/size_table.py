@@ -1,15 +1,16 @@
-"""Whole commands by width: CPU and wall seconds a slice, and the peak of memory beside the plan's.
+"""Whole commands by width: CPU and wall seconds a slice, the peak of memory beside the plan's, PSNR to the truth.
 
-    python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS LIMIT]
+    python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS LIMIT OPTION ...]
 
 The scan is one TIFF of line integrals with the noise of 10 000 photons, of grains in a cylinder. One warm-up of 64
 columns compiles. A command that takes longer
-than LIMIT seconds (600) is ended.
+than LIMIT seconds (600) is ended. The rest goes to `recon` as it is.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import resource
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
+from beamline.storage.writers.recon_file import read_reconstruction
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
@@ -27,8 +29,8 @@ _PHOTONS = 1e4
 _MEMORY = "16G"
 
 
-def make(path: Path, cols: int, rows: int, views: int) -> None:
-    """The scan, in pixels; a path through the cylinder's middle has a line integral of 1.5."""
+def sample_of(cols: int, rows: int) -> Phantom:
+    """Grains in a cylinder, in pixels; a path through the cylinder's middle has a line integral of 1.5."""
     rng, side = np.random.default_rng(0), float(cols)
     places = zip(0.4 * side * np.sqrt(rng.random(200)), rng.uniform(0, 2 * np.pi, 200), strict=True)
     grains = [
@@ -37,7 +39,12 @@ def make(path: Path, cols: int, rows: int, views: int) -> None:
             places, rng.uniform(side / 200, side / 25, (200, 3)), rng.uniform(-rows / 2, rows / 2, 200), strict=True
         )
     ]
-    sample = Phantom.of((Cylinder(0.45 * side, 4.0 * rows, 1.5 / (0.9 * side)), *grains))
+    return Phantom.of((Cylinder(0.45 * side, 4.0 * rows, 1.5 / (0.9 * side)), *grains))
+
+
+def make(path: Path, cols: int, rows: int, views: int) -> None:
+    """The scan."""
+    rng, sample = np.random.default_rng(1), sample_of(cols, rows)
     scan = np.empty((views, rows, cols), np.float32)
     for view, angle in enumerate(np.pi * np.arange(views) / views):
         integrals = sample.line_integrals(float(angle), Detector.centred((rows, cols), 1.0))
@@ -53,7 +60,21 @@ def command(path: Path, method: str, cols: int, *more: str) -> list[str]:
     return [sys.executable, "-m", "beamline.cli.main", "recon", str(path), "-m", method, *options, *output, *more]
 
 
-def measure(folder: Path, method: str, cols: int, rows: int = 64, views: int = 90, limit: int = 600) -> None:
+def quality(path: Path, sample: Phantom) -> float:
+    """PSNR of a volume, dB: its peak is the truth's largest value; slice by slice."""
+    volume = read_reconstruction(path).volume
+    squares, peak = 0.0, 0.0
+    for z in range(volume.grid.shape[0]):
+        whole = (slice(0, n) for n in volume.grid.shape[1:])
+        truth = sample.attenuation(volume.grid.part(slice(z, z + 1), *whole))
+        squares += float(np.square(volume.data[z] - truth[0], dtype=np.float64).sum())
+        peak = max(peak, float(truth.max()))
+    return 10 * math.log10(peak**2 * volume.data.size / squares)
+
+
+def measure(
+    folder: Path, method: str, cols: int, rows: int = 64, views: int = 90, limit: int = 600, *more: str
+) -> None:
     small, path = folder / "warm.tif", folder / f"{cols}x{rows}x{views}.tif"
     for scan, size in ((small, (64, 16, 24)), (path, (cols, rows, views))):
         if not scan.exists():
@@ -66,7 +87,7 @@ def measure(folder: Path, method: str, cols: int, rows: int = 64, views: int = 9
     plan = json.loads(said.stdout.splitlines()[-1])
     before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     try:
-        subprocess.run(command(path, method, cols), check=True, capture_output=True, timeout=limit)
+        subprocess.run(command(path, method, cols, *more), check=True, capture_output=True, timeout=limit)
     except subprocess.TimeoutExpired:
         print(f"{method}, {cols} columns: more than {limit} s", flush=True)
         return
@@ -75,13 +96,14 @@ def measure(folder: Path, method: str, cols: int, rows: int = 64, views: int = 9
     print(
         f"{method}, {views} views of {rows} x {cols}: {busy / rows:.3f} CPU s and {wall / rows:.3f} s a slice "
         f"({busy / (rows * cols**2 * views) * 1e9:.1f} CPU ns a voxel and view), peak {after.ru_maxrss / 1e6:.2f} GB "
-        f"with the program, {plan['memory'] / 1e9:.2f} planned, {plan['seconds']:.0f} s expected",
+        f"with the program, {plan['memory'] / 1e9:.2f} planned, {plan['seconds']:.0f} s expected, "
+        f"{quality(path.with_suffix(f'.{method}.h5'), sample_of(cols, rows)):.2f} dB {' '.join(more)}",
         flush=True,
     )
     path.with_suffix(f".{method}.h5").unlink()
 
 
 if __name__ == "__main__":
-    _, where, name, *numbers = sys.argv
+    _, where, name, *rest = sys.argv
     Path(where).mkdir(exist_ok=True)
-    measure(Path(where), name, *map(int, numbers))
+    measure(Path(where), name, *map(int, rest[:4]), *rest[4:])
