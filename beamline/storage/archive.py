@@ -296,14 +296,21 @@ def _differences(raw: h5py.File, file: h5py.File, checksums: Mapping[str, list[i
                 yield f"image {row} of {path}"
     names: list[str] = []
     raw.visit(names.append)  # each object once, by one of its names
-    for name in names:
+    for name in ("/", *names):
         item, copied = raw[name], file.get(name)
-        if type(item) is not type(copied) or set(item.attrs) != set(copied.attrs):
+        if type(item) is not type(copied) or not _same_attributes(item, copied):
             yield name
         elif isinstance(item, h5py.Dataset) and not _is_stack(item) and not item.is_virtual:
             alike = item.shape == copied.shape and item.dtype == copied.dtype
             if not (alike and _same_values(item, copied)):
                 yield name
+
+
+def _same_attributes(one: h5py.HLObject, other: h5py.HLObject) -> bool:
+    return set(one.attrs) == set(other.attrs) and all(
+        one.attrs.get_id(name).dtype == other.attrs.get_id(name).dtype and _same(one.attrs[name], other.attrs[name])
+        for name in one.attrs
+    )
 
 
 def _same_values(one: h5py.Dataset, other: h5py.Dataset) -> bool:

@@ -93,6 +93,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     else:
         base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
+        if options.earlier:
+            base = _chained(options.earlier, base)
         table = None if angles is None else load_angles(angles)
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
         if options.angles_path is not None:
@@ -106,7 +108,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
         if table is None and darks is None and flats is None and options.quantity is None:
-            return _chained(options.earlier, base) if options.earlier else base
+            return base
         return Overlay(
             base,
             angles=table,

@@ -134,18 +134,39 @@ def test_damaged_frames_are_named_and_archived_only_on_request(scan: Path, tmp_p
     assert [finding.rule for finding in errors] == ["checksums"]
 
 
+def _pixel(file: h5py.File) -> None:
+    file[layout.DATA][4] = file[layout.DATA][4] + 1
+
+
+def _angle(file: h5py.File) -> None:
+    file[layout.ANGLE][4] = file[layout.ANGLE][4] + 1
+
+
+def _unit(file: h5py.File) -> None:
+    file[layout.ANGLE].attrs["units"] = "rad"
+
+
+def _root(file: h5py.File) -> None:
+    file["/"].attrs["default"] = "other"
+
+
 @pytest.mark.parametrize(
-    ("path", "said"), [(layout.DATA, "image 4 of /entry/data/data"), (layout.ANGLE, "entry/data/rotation_angle")]
+    ("spoil", "said"),
+    [
+        (_pixel, "image 4 of /entry/data/data"),
+        (_angle, "entry/data/rotation_angle"),
+        (_unit, "entry/data/rotation_angle"),
+        (_root, "/"),
+    ],
 )
 def test_what_a_disk_does_not_give_back_is_found(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, path: str, said: str
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Callable[[h5py.File], None], said: str
 ) -> None:
-    def spoil(partial: Path) -> None:
+    def spoilt(partial: Path) -> None:
         with h5py.File(partial, "r+") as file:
-            image = file[path][4]
-            file[path][4] = image + 1
+            spoil(file)
 
-    monkeypatch.setattr(module, "_forget", spoil)
+    monkeypatch.setattr(module, "_forget", spoilt)
     with pytest.raises(DataError, match=f"does not give back what was written: {said} differs"):
         archive(scan, tmp_path / "small.h5")
     assert left(tmp_path) == {"scan.h5"}

@@ -59,6 +59,8 @@ def test_a_chain_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) ->
             np.testing.assert_array_equal(chain.read(rows, slice(1, 3)), seen)
         assert (chain.finished, chain.checksummed, chain.plan) == (True, expected["checksummed"], expected["plan"])
         assert list(parts_joined(chain)) == []  # it is all of it
+    with SourceOptions(parts[-1], earlier=tuple(parts[:-1]), quantity="counts").open() as replaced:
+        assert replaced.image_key.size == 25
 
 
 def test_its_last_part_grows(tmp_path: Path) -> None:
