@@ -40,8 +40,7 @@ class Score:
         method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
         residual_seen: the same of views that it was made from, their mean.
-        volume: of the trial, [z, y, x].
-        edges: how steep its edges are, over those of the steepest, see `edge_steepness`.
+        steepness: of its edges, over those of the steepest volume that was tried, see `edge_steepness`.
         hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
     """
 
@@ -49,8 +48,7 @@ class Score:
     method: Method
     residuals: F64
     residual_seen: float = math.inf
-    volume: F32 | None = None
-    edges: float = 1.0
+    steepness: float = 1.0
     hides: Callable[[], bool] = lambda: False
 
     @property
@@ -92,7 +90,7 @@ def predicts_best(
     n, geometry = part.geometry.n_views, part.geometry
     seen, unseen = split_views(geometry)
     trial, judge, some = (of_views(part, views) for views in (seen, unseen, seen[:: ONE_IN // 2]))
-    scores: list[Score] = []
+    found: list[tuple[Score, F32]] = []
     refused, begin = [], control.now()
     quiet = RunControl(control.should_stop, now=control.now)
 
@@ -113,35 +111,40 @@ def predicts_best(
             return
         own = float(_residuals(volume, some).mean())
         hides = partial(_hides, volume, trial)
-        scores.append(Score(at, method, _residuals(volume, judge), own, volume.data, hides=hides))
+        score = Score(at, method, _residuals(volume, judge), own, hides=hides)
+        found.append((score, volume.data))
         if control.on_progress is not None:
-            last, done = scores[-1].residual, len(scores) + len(refused)
+            last, done = score.residual, len(found) + len(refused)
             seconds = control.now() - begin
             control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
+
+    def scores() -> list[Score]:
+        steep = edge_steepness([volume for _, volume in found])
+        return [replace(score, steepness=edges) for (score, _), edges in zip(found, steep, strict=True)]
 
     regular = [at for at in order or range(len(methods)) if at != spare]
     for at in regular:
         attempt(at)
-    if spare is not None and scores and best_of(scores)[0].at > spare:
+    if spare is not None and found and best_of(scores())[0].at > spare:
         attempt(spare)
-    if len(scores) < min(2, len(regular)) and stopped():
+    if len(found) < min(2, len(regular)) and stopped():
         return None, "stopped before the choice"
-    if not scores:
+    if not found:
         raise ValueError("; ".join(refused))
-    steep = edge_steepness([s.volume for s in scores if s.volume is not None])
-    scores = [replace(score, edges=edges) for score, edges in zip(scores, steep, strict=True)]
-    best, passed = best_of(scores)
+    best, passed = best_of(scores())
     listed = [
         f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views, "
-        f"edges {s.edges:.2f}{passed.get(s.at, '')})"
-        for s in sorted(scores, key=lambda s: s.residual)
+        f"edges {s.steepness:.2f}{', ' * (s.at in passed)}{passed.get(s.at, '')})"
+        for s in sorted(scores(), key=lambda s: s.residual)
     ]
-    late = [methods[at].name for at in regular[len(scores) + len(refused) :]] if stopped() else []
+    late = [methods[at].name for at in regular[len(found) + len(refused) :]] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
-    """The score to prefer: of those that are level the first that hides nothing and dulls no edges; and why others not.
+    """The score to prefer: of those that are level the first that hides nothing and dulls no edges.
+
+    Returns it, and for each level one that is passed over the reason, by its number.
 
     Level with the smallest residual are those within two of its standard errors (by its scatter over the views) and
     4 %, and likewise by the penalised residual. The residual alone prefers a volume that lost some noise, and with it a
@@ -154,13 +157,13 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
         for score in sorted(scores, key=lambda s: s.at)
         if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
     ]
-    steepest = max(score.edges for score in level)
+    steepest = max(score.steepness for score in level)
     passed: dict[int, str] = {}
     for score in level if len(level) > 1 else ():
-        if score.edges < _DULL * steepest:
-            passed[score.at] = ", dulls edges"
+        if score.steepness < _DULL * steepest:
+            passed[score.at] = "dulls edges"
         elif score.hides():
-            passed[score.at] = ", hides structure"
+            passed[score.at] = "hides structure"
         else:
             return score, passed
     return least, passed
@@ -234,6 +237,7 @@ def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str]
 
 
 def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
+    """The problem of these views alone."""
     weights = problem.use.weights
     return replace(
         problem, projections=problem.projections[views], geometry=problem.geometry.select(views),

@@ -94,9 +94,9 @@ def region_of(text: str) -> Region:
     "-m",
     "--method",
     type=click.Choice((AUTO, *names())),
-    help="auto: the one of r2, fista-tv and fbp that predicts views held out best and hides no structure; r2: "
-    "Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels. Default: auto; r2 "
-    "with --follow and with options of the fit.",
+    help="auto: the one of r2, fista-tv and fbp that predicts views held out best, hides no structure and dulls no "
+    "edges; r2: Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels. "
+    "Default: auto; r2 with --follow and with options of the fit.",
 )
 @selection_options
 @method_options

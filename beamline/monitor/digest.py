@@ -98,9 +98,9 @@ def checksum_of(image: NDArray[Any]) -> int:
     return zlib_ng.crc32(np.ascontiguousarray(image).data.cast("B"))
 
 
-def has_checksum(image: NDArray[Any], said: int) -> bool:
+def has_checksum(image: NDArray[Any], stored: int) -> bool:
     """Whether this is its checksum, or that of its bytes swapped: `ingest` wrote such of big-endian frames."""
-    return said == checksum_of(image) or said == checksum_of(image.byteswap())
+    return stored == checksum_of(image) or stored == checksum_of(image.byteswap())
 
 
 Numbers = tuple[float, float, float, float, float, float, float, float]

@@ -38,7 +38,7 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
         return selection, turned_text(selection.tilt_deg) if selection.tilt_deg else ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
     try:
-        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, _BANDS, 0.0, _ROUNDS)
+        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames)
     except ValueError as error:
         raise DataError(
             f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
@@ -100,9 +100,7 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
 
 
-def _refined(
-    source: ScanSource, selection: Selection, frames: NDArray[np.int64], bands: int, tilt: float, rounds: int
-) -> tuple[float, float]:
+def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64]) -> tuple[float, float]:
     """The tilt by views that were levelled by what is known of it, and its uncertainty; radians.
 
     Raises:
@@ -110,9 +108,10 @@ def _refined(
     """
     plain = replace(selection, phase=None, noise="log", find_tilt=False)
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
-    for _ in range(rounds):
+    tilt = 0.0
+    for _ in range(_ROUNDS):
         levelled = ScanCorrection(source, replace(plain, tilt_deg=math.degrees(tilt)), lambda _: None)
-        found = _look(source, levelled, frames, bands, _BAND_ROWS)
+        found = _look(source, levelled, frames, _BANDS, _BAND_ROWS)
         tilt += found.tilt
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
             break
@@ -128,19 +127,19 @@ def _look(
         ValueError: see `find_tilt`.
     """
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
-    thick = max(1, min(thick, rows // bands))
+    height = max(1, min(thick, rows // bands))
     means: list[NDArray[np.float32]] = []
     heights, ids = [], np.empty(0, np.int64)
-    for first in np.unique(np.linspace(0, rows - thick, min(bands, rows)).round().astype(int)).tolist():
+    for first in np.unique(np.linspace(0, rows - height, min(bands, rows)).round().astype(int)).tolist():
         try:
-            band = correction.at_once(frames, slice(first, first + thick))
+            band = correction.at_once(frames, slice(first, first + height))
         except DataError:
             continue  # no light there
         if not means:
             ids = band.view_ids
         if np.array_equal(band.view_ids, ids):
             means.append(band.data.mean(axis=1))
-            heights.append(first + (thick - 1) / 2)
+            heights.append(first + (height - 1) / 2)
     if len(means) < FEWEST_BANDS:
         raise ValueError(f"{len(means)} bands of rows, {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])

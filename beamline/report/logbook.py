@@ -233,14 +233,14 @@ class _Page:
                 lines.append(line)
                 line = ""
             while long > wide and len(word) > 1:
-                n = max(1, bisect_right(range(1, len(word)), wide, key=partial(self._of_first, word, size, style)))
+                n = max(1, bisect_right(range(1, len(word)), wide, key=partial(self._prefix_width, word, size, style)))
                 lines.append(word[:n])
                 word = word[n:]
                 long = self._width(word, size, style)
             line, so_far = (f"{line} {word}", so_far + gap + long) if line else (word, long)
         return [*lines, line] if line else lines or [""]
 
-    def _of_first(self, word: str, size: float, style: Mapping[str, Any], n: int) -> float:
+    def _prefix_width(self, word: str, size: float, style: Mapping[str, Any], n: int) -> float:
         """Inches of its first n letters."""
         return self._width(word[:n], size, style)
 

@@ -3,8 +3,7 @@
     python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS LIMIT OPTION ...]
 
 The scan is one TIFF of line integrals with the noise of 10 000 photons, of grains in a cylinder. One warm-up of 64
-columns compiles. A command that takes longer
-than LIMIT seconds (600) is ended. The rest goes to `recon` as it is.
+columns compiles. A command that takes longer than LIMIT seconds (600) is ended. OPTIONs go to `recon` as they are.
 """
 
 from __future__ import annotations

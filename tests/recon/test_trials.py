@@ -17,7 +17,7 @@ F32 = NDArray[np.float32]
 
 @pytest.mark.parametrize(("edges", "best"), [((1.0, 0.9), 0), ((0.81, 1.0), 0), ((0.79, 1.0), 1)])
 def test_of_level_residuals_none_that_dulls_edges(edges: tuple[float, float], best: int) -> None:
-    scores = [Score(i, Fbp(), np.ones(9), edges=steep) for i, steep in enumerate(edges)]
+    scores = [Score(i, Fbp(), np.ones(9), steepness=steep) for i, steep in enumerate(edges)]
     taken, passed = best_of(scores)
     assert (taken.at, bool(passed)) == (best, best == 1)
 

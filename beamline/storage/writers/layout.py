@@ -240,7 +240,7 @@ def create(
             file[f"{BEAM}/{name}"].attrs["units"] = unit
         file[f"{BEAM}/time"].attrs["description"] = "since 1970-01-01T00:00:00Z"
     _nxdata(file, rows, cols, info.pixel_size_mm)
-    _declare(file)
+    _declare_for_esrf(file)
 
     file[COMMITTED] = np.int64(0)
     file[FINISHED] = np.int8(0)
@@ -328,7 +328,7 @@ def settle(file: h5py.File) -> None:
         end = _end_time(file)
         del file[END_TIME]
         file[END_TIME] = end
-    _declare(file)
+    _declare_for_esrf(file)
     field = _field_of_view(file)
     if FIELD_OF_VIEW in file:
         del file[FIELD_OF_VIEW]
@@ -336,7 +336,7 @@ def settle(file: h5py.File) -> None:
         file[FIELD_OF_VIEW] = field
 
 
-def _declare(file: h5py.File) -> None:
+def _declare_for_esrf(file: h5py.File) -> None:
     """What ESRF's programs know an NXtomo by, also in a file of an earlier version."""
     entry = file[ENTRY]
     entry.attrs["definition"] = hdf5.text(file["/entry/definition"][()])

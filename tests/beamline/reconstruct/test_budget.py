@@ -383,12 +383,13 @@ def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
 
 
 def test_a_real_budget_of_processor_seconds(prepared: PreparedProjections) -> None:
-    """Four seconds, and a tenth of grace; other work on the machine does not count. Ticks show that time is used up."""
+    """Four seconds, and a tenth of grace; other work on the machine does not count. That the time is used up, the
+    first test shows."""
     warm_up()
     begin = time.process_time()
     done = within(4.0, prepared, [R2()], 0, RunControl(now=time.process_time), lambda w: None)
     took = time.process_time() - begin
     assert done.choice.is_gaussian_fit
-    assert took < 4.4
+    assert 1.5 < took < 4.4
     assert done.seconds == pytest.approx(took, abs=0.2)
     assert done.result.history[-1].residual < 0.2
