@@ -27,7 +27,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     try:
         found = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
         stacks = [Stack(kind, where, item) for kind, where, item in found if item is not None]
-        source = StacksSource(path, file, stacks, name="data_exchange", facts=_attributes(file))
+        source = StacksSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
         if own_angles:
             n_views = len(stacks[-1].frames)
             source.angles[-n_views:] = _theta(file, n_views)

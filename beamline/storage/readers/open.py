@@ -18,7 +18,7 @@ from beamline.storage.readers.angle_table import Angles, load_angles, parse_angl
 from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
 from beamline.storage.readers.chain import Chain
 from beamline.storage.readers.overlay import Overlay
-from beamline.storage.readers.stacks import contents, named_angles, open_stacks
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeries
 
@@ -99,7 +99,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
         if options.angles_path is not None:
             angles_from = f"{options.angles_path} in {path}"
-            table = named_angles(path, options.angles_path, options.angles_unit)
+            table = angles_at(path, options.angles_path, options.angles_unit)
         if table is None and isinstance(base, TiffSeries) and base.angle_text is not None:
             angles_from = f"{base.angle_text[0]} in {path}"
             table = parse_angles(base.angle_text[1], angles_from)
@@ -141,7 +141,7 @@ def _open(path: Path, opening: Opening) -> ScanReader:
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        held = contents(file)
+        held = datasets_text(file)
     raise DataError(
         f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
         "--angles-path, --darks-path, --flats-path."
@@ -153,11 +153,14 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
     if follow and replaced:
-        raise DataError(f"{options.path} cannot be followed with {', '.join(replaced)}: its counts still change.")
+        raise DataError(
+            f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "
+            "frames, and they still come."
+        )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:
             raise DataError(f"--{one} and --{other.replace('_', '-')} name the same thing twice: give one of them.")
     for name, needed in (("darks_path", "data_path"), ("flats_path", "data_path"), ("angles_unit", "angles_path")):
         if getattr(options, name) is not None and getattr(options, needed) is None:
             dashed = (f"--{each.replace('_', '-')}" for each in (name, needed))
-            raise DataError("{} is for a file whose layout is not known: give {}, too.".format(*dashed))
+            raise DataError("{} goes with {}: give both, or neither.".format(*dashed))

@@ -32,7 +32,7 @@ class Stack:
     frames: Any
 
 
-class Closed(Protocol):
+class Closable(Protocol):
     """What is closed with the scan."""
 
     def close(self) -> None: ...
@@ -44,9 +44,9 @@ class StacksSource(ScanReader):
     Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
     """
 
-    def __init__(self, path: Path, file: Closed, stacks: Sequence[Stack], *, name: str, facts: Attributes) -> None:
+    def __init__(self, path: Path, file: Closable, stacks: Sequence[Stack], *, format: str, facts: Attributes) -> None:
         """Take over an open file. Angles are NaN; `stacks` are in the order of the frames, the projections last."""
-        self.path, self.format, self.facts = path, name, facts
+        self.path, self.format, self.facts = path, format, facts
         self._file, self._stacks = file, stacks
         self._check()
         sizes = [len(stack.frames) for stack in stacks]
@@ -102,16 +102,16 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> 
         stacks = []
         for kind, where in given:
             if where is not None:
-                item = named(file, where)
+                item = dataset_at(file, where)
                 image = item.ndim == 2 and kind != FrameKind.PROJECTION
                 stacks.append(Stack(kind, where, item[()][None] if image else item))
-        return StacksSource(path, file, stacks, name="hdf5_stacks", facts={"data": data})
+        return StacksSource(path, file, stacks, format="hdf5_stacks", facts={"data": data})
     except BaseException:
         file.close()
         raise
 
 
-def named_angles(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
+def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
     """Radians of the dataset `where` of an HDF5 file, a list or a column, by `unit` or its attribute `units`.
 
     Args:
@@ -121,7 +121,7 @@ def named_angles(path: Path, where: str, unit: str | None) -> NDArray[np.float64
         DataError: it is not there, is no list, or nothing says its unit.
     """
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        item = named(file, where)
+        item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{where} in {path} is {item.shape}; expected a list of angles.")
         hdf5.require_real(item.dtype, f"{where} in {path}")
@@ -133,15 +133,15 @@ def named_angles(path: Path, where: str, unit: str | None) -> NDArray[np.float64
         return np.ravel(np.asarray(item[()], np.float64)) * factor
 
 
-def named(file: h5py.File, where: str) -> h5py.Dataset:
+def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
     """The dataset at a path; DataError where there is none, with those that the file has."""
     item = hdf5.dataset(file, where)
     if item is None:
-        raise DataError(f"{file.filename} has no dataset {where}. {contents(file)}")
+        raise DataError(f"{file.filename} has no dataset {where}. {datasets_text(file)}")
     return item
 
 
-def contents(file: h5py.File) -> str:
+def datasets_text(file: h5py.File) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
     found: list[h5py.Dataset] = []
     file.visititems(lambda _, item: found.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)

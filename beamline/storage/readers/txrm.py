@@ -25,11 +25,11 @@ _TYPES: dict[int, np.dtype[Any]] = {5: np.dtype("<u2"), 10: np.dtype("<f4")}
 _PER_STORAGE = 100  # images
 _CONE = 1  # of ImageInfo/XrayGeometry
 _ACQUIRED = 0  # of ImageInfo/AcquisitionMode; else a volume
-_APART = 0.5  # px that a view may be shifted by, and is used as it is
+_LARGEST_SHIFT = 0.5  # px that a view may be shifted by, and is used as it is
 
 
 class TxrmFile:
-    """The streams of a file. A context of readable() turns what is wrong with them into a DataError."""
+    """The streams of a file. Used within hdf5.readable, which turns its errors into a DataError."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -110,7 +110,9 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         raise DataError(f"{path} is no .txrm scan: there is no stream ImageInfo/{lost[0]}.")
     rows, cols, planned, kind = (int(value) for value in info.values() if value is not None)
     n = min(planned, taken if (taken := file.number("ImageInfo/ImagesTaken")) is not None else planned)
-    if kind not in _TYPES or min(rows, cols) < 1 or rows * cols > 2**31:
+    if min(rows, cols) < 1 or rows * cols > 2**31:
+        raise DataError(f"{path} says that its images have {rows} x {cols} pixels: it is damaged.")
+    if kind not in _TYPES:
         raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
     _refuse(path, file, n)
     stacks = [Stack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
@@ -121,7 +123,7 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         flat = file.image("ReferenceData/Image", (rows, cols), reference)[None]
         dark = np.zeros_like(flat)  # subtracted by the instrument
         stacks = [Stack(FrameKind.DARK, "dark", dark), Stack(FrameKind.FLAT, "ReferenceData/Image", flat), *stacks]
-    source = StacksSource(path, file, stacks, name="txrm", facts=_facts(file))
+    source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
         if angles is None:
@@ -141,7 +143,7 @@ def _refuse(path: Path, file: TxrmFile, n: int) -> None:
         )
     shifts = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
     most = max((float(np.abs(each).max(initial=0)) for each in shifts if each is not None), default=0.0)
-    if not most < _APART:
+    if not most < _LARGEST_SHIFT:
         raise DataError(
             f"{path} holds shifts of its views, up to {most:.3g} pixels, that are not applied here. Export the aligned "
             "views as TIFFs from the microscope's program, and give their angles with --angles."

@@ -102,8 +102,8 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but there are 5"),
         ({"angles": [0.0] * 5}, "--angles and --angles-path name the same thing twice"),
         ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path name the same thing twice"),
-        ({"data_path": None}, "--darks-path is for a file whose layout is not known: give --data-path, too"),
-        ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit is for .*: give --angles-path, too"),
+        ({"data_path": None}, "--darks-path goes with --data-path: give both, or neither"),
+        ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit goes with --angles-path: give both, or neither"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, object], message: str) -> None:
@@ -115,7 +115,7 @@ def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, object], me
 def test_a_layout_that_is_not_known_says_what_the_file_has(path: Path) -> None:
     with pytest.raises(DataError, match=r"no scan of a format that is read.* /raw/images \(5 x 4 x 6\).*--data-path"):
         open_scan(path)
-    with pytest.raises(DataError, match="cannot be followed with --data-path, --angles-path"):
+    with pytest.raises(DataError, match=r"cannot be followed with --data-path, --angles-path: .* must fit all frames"):
         open_scan(SourceOptions(path, **PATHS), follow=True)
     (path.parent / "s.txt").write_text("no")
     with pytest.raises(DataError, match="cannot be read as HDF5"):

@@ -120,6 +120,8 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"ImageInfo__DataType": np.int32(7)}, "4 x 40 pixels of type 7; expected type 5"),
+        ({"ImageInfo__ImageHeight": np.int32(0)}, r"s\.txrm says that its images have 0 x 40 pixels: it is damaged\."),
+        ({"ImageInfo__ImageWidth": np.int32(2**30)}, "4 x 1073741824 pixels: it is damaged"),
         ({"ImageInfo__ImageWidth": None}, "no stream ImageInfo/ImageWidth"),
         ({"ImageInfo__ImageWidth": np.int32(41)}, "damaged, or not laid out as it should be"),
         ({"ImageInfo__NoOfImages": np.int32(0)}, "holds no projections"),
