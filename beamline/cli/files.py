@@ -136,9 +136,10 @@ def ingest(
     as_json: bool,
     **said: Any,
 ) -> None:
-    """Copy the scan IN (multi-page TIFF, folder or .zip of TIFFs, HDF5) into the new HDF5 scan OUT.h5.
+    """Copy the scan IN into the new HDF5 scan OUT.h5.
 
-    Frames are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
+    IN: a multi-page TIFF, folder or .zip of TIFFs, .txrm, or HDF5 (--data-path where its layout is not known). Frames
+    are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
     """
     clock = SystemClock()
     began = clock.now()
@@ -171,7 +172,7 @@ def ingest(
     type=click.Choice([*CODECS]),
     default=next(iter(CODECS)),
     show_default=True,
-    help="Compressor, all lossless. blosc2: zstd of bits in planes. bitshuffle-lz4: fast, and most widely read.",
+    help="Compressor, all lossless. blosc2: zstd after a bit shuffle. bitshuffle-lz4: fast, and most widely read.",
 )
 @click.option("--keep-damaged", is_flag=True, help="Archive frames that differ from their checksum, as they are.")
 @json_option

@@ -51,7 +51,7 @@ _COMMANDS = {
     "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
     "archive": _Entry("files", "Write a compressed copy of a scan file, compared with it frame by frame."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor."),
-    "ingest": _Entry("files", "Convert a multi-page TIFF into an HDF5 scan, page by page."),
+    "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
     "export": _Entry(
         "export", "Copy a volume to another format: TIFF, npy, NRRD, OME-Zarr, with grey values if wanted."
     ),

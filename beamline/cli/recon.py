@@ -216,7 +216,9 @@ def recon(
     as_json: bool,
     **values: Any,
 ) -> None:
-    """Reconstruct the scan in FILE: NXtomo, Diamond NeXus, Data Exchange, multi-page TIFF, folder or .zip of TIFFs.
+    """Reconstruct the scan in FILE: HDF5, multi-page TIFF, folder or .zip of TIFFs, .txrm.
+
+    HDF5 is NXtomo, Diamond NeXus, Data Exchange, or any layout whose datasets --data-path and its like name.
 
     Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
     and a report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or
