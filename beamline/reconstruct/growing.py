@@ -43,6 +43,11 @@ _BATCH = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
 _AXIS_MOVES = 1.0  # px by which a better axis makes the fit begin anew
 
+# Why all views are corrected again.
+_OUTDATED = "Flats or darks came after views, or air columns changed: all views are corrected again"
+_NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
+_SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
+
 
 class ScanFollower:
     """A scan's file and the volume that grows with it. Who follows it says when to look, to fit and to finish."""
@@ -52,13 +57,13 @@ class ScanFollower:
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
         self._axis = AxisSearch(source, options.selection, warn)
         self._correction: ScanCorrection | None = None
-        self._parts: list[Projections] = []  # line integrals of the views taken: what the volume grows from
+        self._batches: list[Projections] = []  # line integrals of the views taken: what the volume grows from
         self._newest: Projections | None = None  # in the fit already; corrected again when the next view is there
         self._references_follow = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
         self._taken = 0  # frames that were corrected, or that are no views
-        self._part = 0  # of the scan, of the views that were corrected last
+        self._file_part = 0  # part of the file whose views were corrected last
         self._history: list[Progress] = []
         self._begin = clock.now()
         self._enough = None if options.enough is None else EnoughViews(options.enough, options.seed)
@@ -76,7 +81,7 @@ class ScanFollower:
     @property
     def n_views_taken(self) -> int:
         """Views that have fed the fit."""
-        return sum(part.view_ids.size for part in self._parts) + (self._newest is not None)
+        return sum(batch.view_ids.size for batch in self._batches) + (self._newest is not None)
 
     @property
     def has_volume(self) -> bool:
@@ -107,37 +112,36 @@ class ScanFollower:
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)
         new = views[views >= self._taken]
-        batch = self._of_one_part(new)[:_BATCH]
+        parts = np.searchsorted(self.source.part_starts, new, "right") - 1
+        if new.size and parts[0] != self._file_part:
+            self._begin_part(int(parts[0]))
+        batch = new[parts == parts[:1]][:_BATCH]  # of one part: those of the next are corrected by other references
         self._feed(batch, last=ended and batch.size == new.size)
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
 
-    def _of_one_part(self, new: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Those of the new views that are in the same part of the scan as the first of them.
+    def _begin_part(self, part: int) -> None:
+        """Views of a later part of the file come: correct by its references, which the correction does not have yet.
 
-        Views of a later part have references of their own, which were not there when the correction was made.
+        The fit takes in the last view of the part before, which waited for the next, and learns all views again.
         """
-        if not new.size:
-            return new
-        starts = self.source.part_starts
-        parts = np.searchsorted(starts, new, "right") - 1
-        if parts[0] != self._part:
-            self._part = int(parts[0])
-            if self._newest is not None:
-                self._feed(np.empty(0, np.int64), last=True)
-            if self._parts:
-                self._correct_again(usable_views(self.source, self._options.selection.use_flags))
-            elif self._correction is not None:
-                self._correction = self._correction.renewed()
-        return new[parts == parts[0]]
+        assert self._correction is not None
+        self._file_part = part
+        if self._newest is not None:
+            self._feed(np.empty(0, np.int64), last=True)
+        if self._batches:
+            usable = usable_views(self.source, self._options.selection.use_flags)
+            self._correct_again(usable, _NEXT_PART)
+        else:
+            self._correction = self._correction.renewed()
 
     def _feed(self, frames: NDArray[np.int64], last: bool) -> None:
         """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
         assert self._correction is not None and self._fit is not None
-        part = self._correction.feed(frames, last=last)
-        if part is not None:
-            self._parts.append(part)
-            data, views, newest = part.data, part.view_ids, self._newest
+        batch = self._correction.feed(frames, last=last)
+        if batch is not None:
+            self._batches.append(batch)
+            data, views, newest = batch.data, batch.view_ids, self._newest
             if newest is not None:
                 if not np.array_equal(data[0], newest.data[0]):
                     self._fit.replace_newest(data[0])
@@ -196,33 +200,33 @@ class ScanFollower:
         self._sink(Event("recon_started", self._clock.now(), data))
         options = self._options
         fit = options.streaming.stream(template, options.seed, self._clock.now)
-        for part in self._parts:
-            fit.add_views(part.data, self.source.angles[part.view_ids])
+        for batch in self._batches:
+            fit.add_views(batch.data, self.source.angles[batch.view_ids])
         self._newest = None
         return fit
 
-    def _correct_again(self, usable: UsableViews) -> None:
+    def _correct_again(self, usable: UsableViews, why: str) -> None:
         """Line integrals by all references and air columns, in place of those that the model has learnt from.
+
+        Does nothing where the views are of one part, and these are what they were. `why` is said, unless views are
+        unlearned.
 
         Where views of these are not usable any longer, the model goes on without them, at the first rates: a check
         found them bad when it had seen later ones, or they were taken again.
         """
         assert self._correction is not None and self._fit is not None
-        fed = np.concatenate([part.view_ids for part in self._parts])
+        fed = np.concatenate([batch.view_ids for batch in self._batches])
         frames = fed[np.isin(fed, usable.frames)]
         gone = fed.size - frames.size
         if not (gone or self._correction.outdated or self.source.part_starts.size > 1):
             return
-        message = "Flats or darks came after views, or air columns changed: all views are corrected again"
         if gone:
-            message = (
-                f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
-            )
-        self._sink(Event("state", self._clock.now(), {"state": "correcting", "message": message}))
+            why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
+        self._sink(Event("state", self._clock.now(), {"state": "correcting", "message": why}))
         self._correction = self._correction.renewed()
-        self._parts = []
-        self._parts = [self._correction.at_once(frames)]
-        self._fit.replace_views(self._parts[0].data, self.source.angles[frames] if gone else None)
+        self._batches = []
+        self._batches = [self._correction.at_once(frames)]
+        self._fit.replace_views(self._batches[0].data, self.source.angles[frames] if gone else None)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False where there is nothing to fit yet."""
@@ -242,10 +246,10 @@ class ScanFollower:
 
     def ask_whether_enough(self) -> None:
         """Where there is a goal, say what the views to come would add, and once that the views so far are enough."""
-        if self._enough is None or sum(part.view_ids.size for part in self._parts) < self._enough.next_look:
+        if self._enough is None or sum(batch.view_ids.size for batch in self._batches) < self._enough.next_look:
             return
         try:
-            taken = [part.view_ids for part in self._parts]
+            taken = [batch.view_ids for batch in self._batches]
             planned = planned_views(self.source, self._options.selection, self.axis_col, taken)
         except NotPlannedError as error:
             self._warn(f"What more views of this scan would add is not known: {error}. It is not stopped early.")
@@ -287,7 +291,8 @@ class ScanFollower:
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."
             )
-        self._correct_again(usable)
+        assert self._correction is not None
+        self._correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
         prepared = self._prepared(self.axis_col, usable)
         self._sink(
             Event(
@@ -333,9 +338,9 @@ class ScanFollower:
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""
-        if len(self._parts) > 1:
-            self._parts = [merge_and_empty(self._parts)]
-        return self._parts[0]
+        if len(self._batches) > 1:
+            self._batches = [merge_and_empty(self._batches)]
+        return self._batches[0]
 
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         projections = self._joined()

@@ -291,9 +291,9 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     judged: list[PreparedProjections] = []
     again, write = ScanFollower._correct_again, follow_module.write_result
 
-    def as_it_was(self: ScanFollower, usable: UsableViews) -> None:
+    def as_it_was(self: ScanFollower, usable: UsableViews, why: str) -> None:
         live.append(self._joined())
-        again(self, usable)
+        again(self, usable, why)
 
     def write_and_keep(outcome: ReconOutcome, prepared: PreparedProjections, *rest: Any) -> dict[str, float]:
         judged.append(prepared)
@@ -315,6 +315,9 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     np.testing.assert_array_equal(judged[0].geometry.angles, whole.geometry.angles)
     assert [part.view_ids.size for part in live] == [12, 30]
     np.testing.assert_allclose(live[1].data, whole.projections.data, atol=1e-6)
+    states = [event.data for event in events if event.event == "state" and event.data["state"] == "correcting"]
+    begun, at_the_end = (data["message"] for data in states)
+    assert "next part of the run begin" in begun and "The run has several parts" in at_the_end
     first = next(event for event in events if event.event == "snapshot")
     assert first.data["n_views"] >= 12 and first.time < EPOCH + 1e6 + 60
     warned = [event.data["message"] for event in events if event.event == "warning"]
