@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import BeamlineError, ConfigError
-from beamline.reconstruct.slurm import is_slurm, refuse_slurm, slurm_jobs, submitted
+from beamline.reconstruct.slurm import is_slurm, require_accepted, slurm_jobs, submitted
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, RunControl
@@ -136,7 +136,7 @@ def local_workers(spec: str | None) -> int:
 def refuse_unusable(spec: str) -> None:
     """Raises ConfigError where a cluster cannot be asked for work, before there is any; no jobs are submitted."""
     if is_slurm(spec):
-        refuse_slurm(spec)
+        require_accepted(spec)
     elif not local_workers(spec):
         with connected(spec):
             pass

@@ -100,30 +100,37 @@ def _cluster(jobs: SlurmJobs) -> Any:
     )
 
 
-def _refuse_refused(cluster: Any) -> None:
-    """Raises RuntimeError where Slurm would refuse the cluster's jobs.
+def _ask_slurm(cluster: Any) -> str:
+    """Why Slurm would refuse the cluster's jobs; empty where it would take them.
 
     What it refuses when the library submits it, nobody would hear of.
     """
-    looked = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
-    if looked.returncode:
-        raise RuntimeError(looked.stderr.strip() or f"sbatch ended with {looked.returncode}")
+    asked = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
+    if not asked.returncode:
+        return ""
+    return " ".join(asked.stderr.split()) or f"sbatch ended with {asked.returncode}"
 
 
-def refuse_slurm(spec: str) -> None:
+def require_accepted(spec: str) -> None:
     """Ask Slurm whether it would take the jobs of `slurm` or `slurm:CONFIG.yaml`; none is submitted.
 
     Raises:
-        ConfigError: it would not, or as `slurm_jobs`.
+        ConfigError: it would not, or the cluster cannot be started, or as `slurm_jobs`.
     """
+    jobs = slurm_jobs(spec)
     try:
-        with _cluster(slurm_jobs(spec)) as cluster:
-            _refuse_refused(cluster)
-    except (OSError, RuntimeError, ValueError) as error:
+        with _cluster(jobs) as cluster:
+            refusal = _ask_slurm(cluster)
+    except (OSError, RuntimeError, ValueError) as error:  # distributed turns what it meets into a RuntimeError
         raise ConfigError(
-            f"--cluster {spec}: Slurm refuses the jobs ({' '.join(str(error).split())}). Mend the configuration of "
-            "the jobs, and ask Slurm with sinfo what there is. Nothing was read."
+            f"--cluster {spec}: the cluster cannot be started ({' '.join(str(error).split())}). Mend the configuration "
+            "of the jobs, or this machine's network. Nothing was read."
         ) from error
+    if refusal:
+        raise ConfigError(
+            f"--cluster {spec}: Slurm refuses the jobs ({refusal}). Mend the configuration of the jobs, and ask Slurm "
+            "with sinfo what there is. Nothing was read."
+        )
 
 
 @contextmanager
@@ -134,6 +141,7 @@ def submitted(jobs: SlurmJobs) -> Iterator[Any]:
         RuntimeError: Slurm refuses them.
     """
     with _cluster(jobs) as cluster:
-        _refuse_refused(cluster)
+        if refusal := _ask_slurm(cluster):
+            raise RuntimeError(refusal)
         cluster.scale(jobs=jobs.jobs)
         yield cluster

@@ -13,7 +13,7 @@ import recon
 from beamline.core.errors import ConfigError
 from beamline.reconstruct import finished, slurm
 from beamline.reconstruct.cluster import connected
-from beamline.reconstruct.slurm import SlurmJobs, is_slurm, slurm_jobs
+from beamline.reconstruct.slurm import SlurmJobs, is_slurm, require_accepted, slurm_jobs
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, RunControl
@@ -86,9 +86,19 @@ def test_slurm_is_asked_before_the_scan_is_read(fake: Path, monkeypatch: pytest.
     write_exchange(Path("scan.h5"), TwoCylinders(angles=np.radians(np.arange(0, 180, 20.0)), shape=(4, 16), axis_col=8))
     monkeypatch.setattr(finished, "prepare_within", lambda *_: pytest.fail("too late"))
     result = beamline("recon", "scan.h5", "-m", "sirt", "--cluster", "slurm", "-o", "out.h5")
-    assert result.exit_code == 2 and "invalid partition specified: day" in result.stderr, result.output
+    assert result.exit_code == 2 and "Slurm refuses the jobs (invalid partition specified: day)" in result.stderr
     assert "--cpus-per-task=8" in Path("asked.sh").read_text()
     assert not list(fake.glob("out*"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no shell")
+@pytest.mark.filterwarnings("ignore")
+def test_a_scheduler_that_cannot_be_started_is_not_said_to_be_refused(fake: Path) -> None:
+    pytest.importorskip("dask_jobqueue", reason="the extra `cluster` is not installed")
+    Path("jobs.yaml").write_text("interface: none9\n")
+    with pytest.raises(ConfigError, match=r"the cluster cannot be started \(.*none9.*Nothing was read"):
+        require_accepted("slurm:jobs.yaml")
+    assert not Path("tested.sh").exists()
 
 
 @pytest.mark.parametrize(
