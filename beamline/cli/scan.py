@@ -57,7 +57,7 @@ _SAID_WITHIN = 0.2  # s
     "run",
     metavar="RUN",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Take the missing views of the run in this folder, which ended early, with its own configuration.",
+    help="Take what the run in this folder lacks (views, or darks and flats at the end), with its own configuration.",
 )
 def scan(
     file: Path | None,
@@ -121,7 +121,7 @@ def _faults(result: RunResult) -> list[str]:
 
 
 def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sinks: Sequence[Sink]) -> None:
-    worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.left)
+    worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.remaining)
     if not json_sinks:
         click.echo("\n".join(worked.lines()))
     refuse_violations(worked.timeline)
@@ -141,8 +141,8 @@ def _commands(config: Config, no_live: bool, series: ResumableRun | None) -> _Co
     if config.recon.method == AUTO or not streams(config.recon.method):
         click.echo(f"{config.recon.method} needs the complete scan: the volume comes after it.", err=True)
         return {"afterwards": finished_command(config)}
-    if series is not None and series.ends is not None:
-        click.echo("No view is taken: the volume comes when the references are joined with them.", err=True)
+    if series is not None and series.end_references is not None:
+        click.echo("Only darks and flats are taken: the volume is made of joined.h5 afterwards.", err=True)
         return {"afterwards": finished_command(config)}
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).angles.size, free_memory())

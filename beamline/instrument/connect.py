@@ -49,7 +49,7 @@ class Instrument:
         simulated: what the simulator knows; None at a real instrument.
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None where none is configured.
-        frame_memory: of the camera's frames; None where it is nobody's concern.
+        frame_memory: of the camera's frames; None for a simulated camera.
     """
 
     devices: Devices

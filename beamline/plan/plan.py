@@ -49,8 +49,8 @@ class ScanPlan:
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
         retake_share: of the views, how many with an alarm of the monitor are taken again at most; 0: none.
         stored: views that need not be taken: earlier files of the same scan have them.
-        ends: kinds of references that are still to be taken after the views, where all else is stored; None: all that
-            are planned, before and after the views.
+        end_references: kinds of references that are still to be taken after the views, where all else is stored; None:
+            all that are planned, before and after the views.
     """
 
     angles: NDArray[np.float64]
@@ -63,7 +63,7 @@ class ScanPlan:
     scheme: str
     retake_share: float = 0.0
     stored: frozenset[int] = frozenset()
-    ends: frozenset[FrameKind] | None = None
+    end_references: frozenset[FrameKind] | None = None
 
     @property
     def retakes(self) -> int:

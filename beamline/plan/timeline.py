@@ -170,17 +170,18 @@ def _blocks(
     plan: ScanPlan, flight: Flight | None, scale: Scale, stage: StageLimits, camera: CameraTiming
 ) -> Iterable[Block]:
     row = 0
+    missing = plan.end_references
     before = [(FrameKind.DARK, plan.darks), (FrameKind.FLAT, plan.flats)]
     for kind, field in before:
         if field.count and field.at in (Place.START, Place.BOTH):
-            yield _static(kind, field, row, plan, camera, stored=plan.ends is not None)
+            yield _static(kind, field, row, plan, camera, stored=missing is not None)
             row += field.count
     views = _views(plan, flight, row, scale, stage)
     yield views
     row += views.n
     for kind, field in reversed(before):
         if field.count and field.at in (Place.END, Place.BOTH):
-            yield _static(kind, field, row, plan, camera, stored=plan.ends is not None and kind not in plan.ends)
+            yield _static(kind, field, row, plan, camera, stored=missing is not None and kind not in missing)
             row += field.count
 
 

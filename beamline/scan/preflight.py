@@ -32,11 +32,11 @@ from drivers.protocols import CameraSettings, CameraTiming, StageLimits, Trigger
 from recon.base.choices import AUTO
 from recon.methods import streams
 
-Left = Callable[[ScanPlan], ScanPlan]
+Remaining = Callable[[ScanPlan], ScanPlan]
 """A plan without what earlier files of the same scan have."""
 
 
-def whole(plan: ScanPlan) -> ScanPlan:
+def all_of(plan: ScanPlan) -> ScanPlan:
     """All of it."""
     return plan
 
@@ -79,18 +79,18 @@ class DryRun:
         }
 
 
-def dry_run(settings: Config, runs: Path | None = None, left: Left = whole) -> DryRun:
+def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = all_of) -> DryRun:
     """Work out a configuration without asking a device.
 
     Args:
         runs: where the file would be, for the free disk; the configured folder unless given.
-        left: what of the plan is still to be taken.
+        remaining: what of the plan is still to be taken.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
             here: they are the timeline's violations.
     """
-    plan = left(plan_of(settings))
+    plan = remaining(plan_of(settings))
     stage, camera, to_counts = connect.describe(settings)
     free = free_bytes(runs or Path(settings.storage.folder))
     worked = work_out(
@@ -158,12 +158,12 @@ class ReadyScan:
     info: ScanInfo
 
 
-def preflight(config: Config, instrument: Instrument, runs: Path, left: Left = whole) -> ReadyScan:
+def preflight(config: Config, instrument: Instrument, runs: Path, remaining: Remaining = all_of) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
         runs: where the file will be, for the free disk.
-        left: what of the plan is still to be taken.
+        remaining: what of the plan is still to be taken.
 
     Raises:
         ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot
@@ -171,7 +171,7 @@ def preflight(config: Config, instrument: Instrument, runs: Path, left: Left = w
         DeviceRefused: the camera does not take its settings.
     """
     stage, camera = instrument.devices.stage, instrument.devices.camera
-    plan = left(plan_of(config))
+    plan = remaining(plan_of(config))
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
     timing, free = camera.timing, free_bytes(runs)
     axis_col = config.optics.axis_col

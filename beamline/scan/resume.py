@@ -21,7 +21,7 @@ from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.run_folder import CONFIG, EVENTS, SCAN, create_part, parts_of
 from beamline.storage import hdf5
-from beamline.storage.parts import JOINED, ends_missing, join, views_in, views_planned
+from beamline.storage.parts import JOINED, end_references_missing, join, views_in, views_planned
 from beamline.storage.recover import Recovered, recover
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
@@ -44,7 +44,7 @@ class ResumableRun:
         parts: its files so far, each with a frame at least.
         views: of the plan, in these files.
         planned: views of the whole plan.
-        ends: kinds of references after the views that are missing, where no view is; None where views are.
+        end_references: kinds of references after the views that are missing, where no view is; None where views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that counts for nothing.
     """
@@ -56,20 +56,20 @@ class ResumableRun:
     planned: int
     last_frame_time: float
     left_out: tuple[str, ...] = ()
-    ends: frozenset[FrameKind] | None = None
+    end_references: frozenset[FrameKind] | None = None
 
     @property
     def said(self) -> str:
         """One line for people."""
         missing = self.planned - len(self.views)
-        if self.ends is not None:
-            kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.ends))
-            return f"Preparing: {self.run} has all {self.planned} views, its {kinds} of the end are taken"
+        if self.end_references is not None:
+            kinds = " and ".join(f"{kind.name.lower()}s" for kind in sorted(self.end_references))
+            return f"Preparing: {self.run} has all {self.planned} views, its missing {kinds} of the end are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
 
-    def left(self, plan: ScanPlan) -> ScanPlan:
+    def remaining(self, plan: ScanPlan) -> ScanPlan:
         """What of the plan the run lacks."""
-        return replace(plan, stored=self.views, ends=self.ends)
+        return replace(plan, stored=self.views, end_references=self.end_references)
 
     def begin(self, ready: ReadyScan) -> Path:
         """Make ordinary files of the parts whose writer died, and the folder of the new part.
@@ -139,13 +139,15 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
         raise ConfigError(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
-    ends = None
+    end_references = None
     if len(views) >= planned:
         with ExitStack() as opened:
-            ends = ends_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
-        if not ends:
+            end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
+        if not end_references:
             raise ConfigError(f"{run} has all {planned} views and its references: nothing is missing. {_UNTOUCHED}")
-    return ResumableRun(run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), ends)
+    return ResumableRun(
+        run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
+    )
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:

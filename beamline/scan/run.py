@@ -31,7 +31,7 @@ from beamline.scan.beam_log import BeamLog
 from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveCommand, LiveReconstruction
-from beamline.scan.preflight import ReadyScan, preflight, whole
+from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.scan.resume import ResumableRun
 from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
@@ -133,7 +133,7 @@ def run_scan(
         instrument = instrument or connected.enter_context(
             connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
         )
-        ready = preflight(config, instrument, place, series.left if series else whole)
+        ready = preflight(config, instrument, place, series.remaining if series else all_of)
         _refuse_stop(stop)
         folder = series.begin(ready) if series else create_run_folder(place, config.sample.name, SystemClock().now())
         with ExitStack() as stack:

@@ -50,9 +50,12 @@ def views_planned(file: h5py.File) -> int | None:
     return None if angles is None else len(angles)
 
 
-def ends_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references that the plan has after the views, and of which these files of a scan, in order, lack some
-    there."""
+def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
+    """Kinds of references of which files of a scan lack some that the plan has after the views.
+
+    Args:
+        files: all of the scan, in the order that they were taken in.
+    """
     taken = _after_views(files)
     return frozenset(kind for kind, n in _planned_after_views(files[0]).items() if len(taken[kind]) < n)
 
