@@ -35,8 +35,8 @@ class Auto:
     resolution. One of eight views is held out. Nothing is tried of fewer than 16 views, and of rolled or tilted ones:
     the first candidate takes them; and of a sample that is wider than the field, which only a fit models. A volume that
     is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so neither is
-    preferred. Where methods are level, the first one is taken that leaves no structure in its own views and has edges
-    about as steep as the others' (docs/exploration.md).
+    preferred. Where methods are level, the first one is taken that leaves no structure in its own views and does
+    not dull edges (docs/exploration.md).
 
     Attributes:
         candidates: the methods, by preference.

@@ -28,7 +28,7 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # of the largest line integrals
 _ENOUGH = 0.5  # of the matter in the fullest rows
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
-_DULL = 0.8  # of the steepest edges: 0.91 to 1 of regularised volumes that were good, 0.76 of one that lost 4 dB
+_DULL = 0.8  # of the steepness of another volume that is as good in all else
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +144,8 @@ def predicts_best(
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     """The score to prefer: of those that are level the first that hides nothing and dulls no edges.
 
+    Dull are edges beside which those of another level one that follows noise no more are steeper: noise alone makes a
+    volume steeper where edges are soft.
     Returns it, and for each level one that is passed over the reason, by its number.
 
     Level with the smallest residual are those within two of its standard errors (by its scatter over the views) and
@@ -157,10 +159,9 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
         for score in sorted(scores, key=lambda s: s.at)
         if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
     ]
-    steepest = max(score.steepness for score in level)
     passed: dict[int, str] = {}
     for score in level if len(level) > 1 else ():
-        if score.steepness < _DULL * steepest:
+        if any(other.overfit <= score.overfit and score.steepness < _DULL * other.steepness for other in level):
             passed[score.at] = "dulls edges"
         elif score.hides():
             passed[score.at] = "hides structure"
@@ -253,7 +254,7 @@ def _residuals(volume: Volume, problem: ReconProblem) -> F64:
     matter = problem.projections > _MATTER * np.nanpercentile(problem.projections, 99)
     seen = np.where(matter, left, np.nan) if matter.any() else left
     found = np.array([median_deviation(view) for view in seen if np.isfinite(view).any()])
-    return found if found.size else np.zeros(1)
+    return found if found.size else np.full(1, np.inf)
 
 
 def _hides(volume: Volume, problem: ReconProblem) -> bool:
