@@ -41,7 +41,7 @@ RING = 8  # views that differ; they come by turns
 FEWEST = 32  # frames of a warm-up, which compiles the kernels and tells how many the time allows, and of a stage
 DARK, FLAT, ABSORPTION, RADIUS = 200, 12_000, 1.5, 0.8  # counts; line integral at the axis; share of half the width
 SATURATION = 65_535
-_MOST = 1000  # frames of a scan that is as long as memory matters for
+_LONG = 1000  # frames: a scan of more has no more of them in memory
 PERIOD = 1 / 120  # s that the frames say lie between them; they come as fast as they are taken
 
 
@@ -96,8 +96,12 @@ class Load:
     def memory(self) -> FrameMemory:
         """Of the frames that are taken, as a scan has it before its first frame."""
         memory = FrameMemory()
-        memory.prepare(frames_in_memory(self.timeline(_MOST)), self.shape)
+        memory.prepare(frames_in_memory(self.timeline(_LONG)), self.shape)
         return memory
+
+    def prepare(self) -> None:
+        """Make images, digests and memory now: else the first stage that needs them would be measured with it."""
+        _ = self.memory  # its timeline is that of the digests, and they are of the images
 
     @property
     def context(self) -> ScanContext:
@@ -290,7 +294,7 @@ def summary(load: Load, taken: Sequence[Taken]) -> list[RateRow]:
 
 
 def _measure(name: str, load: Load, folder: Path, n: int, clock: Clock) -> Taken:
-    load.timeline(n), load.memory  # makes the images, their digests and the memory, once
+    load.prepare()
     try:
         with tempfile.TemporaryDirectory(prefix="beamline-bench-", dir=folder) as own:
             reset_peak_memory()

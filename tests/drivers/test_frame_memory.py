@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import mmap
 import re
 from pathlib import Path
 
@@ -55,7 +56,7 @@ def test_frames_of_another_size_have_memory_of_their_own() -> None:
 def test_prepared_memory_is_there_before_the_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether it may be locked or not: no page is got when a frame is written to it."""
     resource = pytest.importorskip("resource")
-    shape = (2048, 8192)  # 32 MiB: 8192 pages of 4 KiB
+    shape = (2048, 8192)  # 32 MiB: 8192 pages of 4 KiB, where the system has no larger ones
 
     def faults_of_two_frames(memory: FrameMemory) -> int:
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -64,7 +65,7 @@ def test_prepared_memory_is_there_before_the_frames(monkeypatch: pytest.MonkeyPa
             frame[:] = 1
         return int(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
-    assert faults_of_two_frames(FrameMemory()) > 256  # in pages of 16 KiB, too
+    unprepared = faults_of_two_frames(FrameMemory())
     memory = FrameMemory()
     memory.prepare(2, shape)
     assert faults_of_two_frames(memory) < 100
@@ -76,6 +77,8 @@ def test_prepared_memory_is_there_before_the_frames(monkeypatch: pytest.MonkeyPa
     memory = FrameMemory()
     assert memory.prepare(2, shape) == "Operation not permitted"
     assert faults_of_two_frames(memory) < 100
+    if unprepared < 256:
+        pytest.skip(f"{unprepared} faults without it: the system has pages so large that their number proves nothing")
 
 
 def test_prepared_memory_is_used_again_and_more_is_got_when_it_is_out() -> None:
@@ -100,7 +103,7 @@ def test_locked_memory_is_given_back_with_the_last_frame() -> None:
     memory, before = FrameMemory(), locked()
     if memory.prepare(4, (64, 64)):
         pytest.skip("this user may not lock memory")
-    assert locked() - before == 4 * 8192
+    assert locked() - before == 4 * -(-8192 // mmap.PAGESIZE) * mmap.PAGESIZE
     held = memory.take((64, 64))[:2, :2]
     memory.prepare(0, (64, 64))
     assert locked() > before

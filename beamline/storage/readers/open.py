@@ -16,8 +16,8 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
-from beamline.storage.readers.chain import Chain
 from beamline.storage.readers.overlay import Overlay
+from beamline.storage.readers.parts_source import PartsSource
 from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeries
@@ -94,7 +94,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
         if options.earlier:
-            base = _chained(options.earlier, base)
+            base = _of_parts(options.earlier, base)
         table = None if angles is None else load_angles(angles)
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
         if options.angles_path is not None:
@@ -122,12 +122,12 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         raise
 
 
-def _chained(earlier: Sequence[Path], last: ScanReader) -> ScanReader:
+def _of_parts(earlier: Sequence[Path], last: ScanReader) -> ScanReader:
     with ExitStack() as opened:
         sources = [opened.enter_context(_open(path, Opening())) for path in earlier]
-        chain = Chain(sources, last)
+        parts = PartsSource(sources, last)
         opened.pop_all()
-    return chain
+    return parts
 
 
 def _open(path: Path, opening: Opening) -> ScanReader:

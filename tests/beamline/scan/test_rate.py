@@ -35,6 +35,13 @@ def test_each_stage_is_measured_once_a_round_and_its_file_removed(tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
+def test_all_that_stages_share_is_made_before_they_are_measured() -> None:
+    load, shared = replace(LOAD), {"images", "digests", "memory"}
+    assert not shared & vars(load).keys()
+    load.prepare()
+    assert shared <= vars(load).keys()
+
+
 def test_a_frame_that_is_not_in_its_row_counts_as_lost(tmp_path: Path) -> None:
     frames = [LOAD.frame(row, FEWEST) for row in range(9)]
     frames[6] = replace(frames[6], counts=frames[7].counts)

@@ -1,4 +1,4 @@
-"""Chain: the parts of a scan that grows, as the file that joins them has them once it has ended."""
+"""PartsSource: the parts of a scan that grows, as the file that joins them has them once it has ended."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _append(writer: NXtomoWriter, frames: list[Frame], replaces: int = -1) -> No
         writer.append(row, digest(frame.counts), [Flag(CHECKS[1].name, Level.WARN, i, 1.0, 0.0, "")] if last else [])
 
 
-def test_a_chain_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_it_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) -> None:
     frames, parts = frames_of(SCAN), [tmp_path / name for name in ("one.h5", "two.h5", "three.h5")]
     for path, some in zip(parts, (frames[:7], frames[:9], frames[4:]), strict=True):
         with _writer(path) as writer:
@@ -49,16 +49,16 @@ def test_a_chain_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) ->
     with open_scan(tmp_path / "joined.h5") as joined:  # not while the parts are open in another mode
         expected = {name: getattr(joined, name) for name in (*fields, "plan", "checksummed")}
         flagged, pixels = joined.flags, [joined.read(rows, slice(1, 3)) for rows in chosen]
-    with SourceOptions(parts[-1], earlier=tuple(parts[:-1])).open(follow=True) as chain:
-        assert chain.refresh() == 25
+    with SourceOptions(parts[-1], earlier=tuple(parts[:-1])).open(follow=True) as source:
+        assert source.refresh() == 25
         for name in fields:
-            np.testing.assert_array_equal(getattr(chain, name), expected[name])
+            np.testing.assert_array_equal(getattr(source, name), expected[name])
         for name in flags:
-            np.testing.assert_array_equal(getattr(chain.flags, name), getattr(flagged, name))
+            np.testing.assert_array_equal(getattr(source.flags, name), getattr(flagged, name))
         for rows, seen in zip(chosen, pixels, strict=True):
-            np.testing.assert_array_equal(chain.read(rows, slice(1, 3)), seen)
-        assert (chain.finished, chain.checksummed, chain.plan) == (True, expected["checksummed"], expected["plan"])
-        assert list(parts_joined(chain)) == []  # it is all of it
+            np.testing.assert_array_equal(source.read(rows, slice(1, 3)), seen)
+        assert (source.finished, source.checksummed, source.plan) == (True, expected["checksummed"], expected["plan"])
+        assert list(parts_joined(source)) == []  # it is all of it
     with SourceOptions(parts[-1], earlier=tuple(parts[:-1]), quantity="counts").open() as replaced:
         assert replaced.image_key.size == 25
 
@@ -69,23 +69,23 @@ def test_its_last_part_grows(tmp_path: Path) -> None:
         _append(writer, frames[:6])
     with _writer(tmp_path / "two.h5") as writer:
         options = SourceOptions(tmp_path / "two.h5", earlier=(tmp_path / "one.h5",))
-        with options.open(follow=True) as chain:
-            assert (chain.image_key.size, chain.part_starts.tolist(), chain.finished) == (6, [0, 6], False)
+        with options.open(follow=True) as source:
+            assert (source.image_key.size, source.part_starts.tolist(), source.finished) == (6, [0, 6], False)
             _append(writer, frames[6:8])
-            assert chain.refresh() == 8
-            np.testing.assert_array_equal(chain.read([7])[0], frames[7].counts)
-            assert chain.flags is not None and chain.flags.flagged.tolist() == [False] * 5 + [True, False, True]
+            assert source.refresh() == 8
+            np.testing.assert_array_equal(source.read([7])[0], frames[7].counts)
+            assert source.flags is not None and source.flags.flagged.tolist() == [False] * 5 + [True, False, True]
 
 
-def test_damaged_frames_are_those_of_the_chain(tmp_path: Path) -> None:
+def test_damaged_frames_are_counted_over_all_parts(tmp_path: Path) -> None:
     for name in ("one.h5", "two.h5"):
         with _writer(tmp_path / name) as writer:
             _append(writer, frames_of(SCAN)[:6])
     with h5py.File(tmp_path / "two.h5", "r+") as file:
         file[layout.DATA][2, 0, 0] ^= 8
-    with SourceOptions(tmp_path / "two.h5", earlier=(tmp_path / "one.h5",)).open() as chain:
-        chain.read(slice(None))
-        assert chain.damaged == {8}
+    with SourceOptions(tmp_path / "two.h5", earlier=(tmp_path / "one.h5",)).open() as source:
+        source.read(slice(None))
+        assert source.damaged == {8}
 
 
 def test_parts_of_other_scans_are_refused(tmp_path: Path) -> None:

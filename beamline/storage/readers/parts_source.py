@@ -1,4 +1,4 @@
-"""Chain: the frames of several files of one scan as one; the last of them may still grow."""
+"""PartsSource: the frames of several files of one scan as one; the last of them may still grow."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.base import WHOLE, Attributes, ScanReader, ScanSource, frame_indices
 
 
-class Chain(ScanReader):
+class PartsSource(ScanReader):
     """A ScanSource of the frames of `earlier`, which have ended, and then of `last`, whose path and facts it has.
 
-    What is known of a frame by its row, such as the row that it replaces, counts from the first frame of the chain.
+    What is known of a frame by its row, such as the row that it replaces, counts from the first frame of all.
     """
 
     def __init__(self, earlier: Sequence[ScanSource], last: ScanSource) -> None:
-        """Chain them; DataError where frames are of another shape or type. The chain closes all of them."""
+        """Put them together; DataError where frames are of another shape or type. It closes all of them."""
         self._sources = (*earlier, last)
         for source in earlier:
             if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
@@ -59,14 +59,16 @@ class Chain(ScanReader):
         if all(source.replaces is None for source in self._sources):
             return None
         rows = []
-        for source, first in zip(self._sources, self._firsts, strict=False):
+        for source, first in zip(self._sources, self._firsts[:-1], strict=True):
             known = np.full(source.image_key.size, -1) if source.replaces is None else source.replaces
             rows.append(np.where(known < 0, -1, known + first))
         return np.concatenate(rows)
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
-        return np.concatenate([s.part_starts + first for s, first in zip(self._sources, self._firsts, strict=False)])
+        return np.concatenate(
+            [s.part_starts + first for s, first in zip(self._sources, self._firsts[:-1], strict=True)]
+        )
 
     @property
     def checksummed(self) -> bool:
@@ -74,7 +76,7 @@ class Chain(ScanReader):
 
     @property
     def damaged(self) -> frozenset[int]:
-        pairs = zip(self._sources, self._firsts, strict=False)
+        pairs = zip(self._sources, self._firsts[:-1], strict=True)
         return frozenset(int(row + first) for source, first in pairs for row in source.damaged)
 
     @property
