@@ -17,8 +17,8 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, printable, size, spans
-from beamline.storage.archive import CODECS
 from beamline.storage.archive import archive as archive_scan
+from beamline.storage.compressed_copy import CODECS
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
@@ -180,7 +180,8 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
     """Write a compressed copy of the HDF5 scan SCAN, and compare every frame of it with SCAN.
 
     The copy is lossless and opens like SCAN. Each frame is read back from the finished file and compared by its CRC-32.
-    SCAN is never deleted: the command says when that may be done. Nothing is overwritten, and a failure leaves nothing.
+    SCAN is never deleted: the last line names the files that may be. Nothing is overwritten, and a failure leaves
+    nothing.
     """
     clock = SystemClock()
     began = clock.now()
@@ -196,6 +197,11 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
     click.echo(f"output   {output} ({codec})")
     click.echo(f"size     {size(done.raw_bytes)} -> {size(done.bytes)}, ratio {facts['ratio']:.2f}")
     click.echo(f"speed    {done.raw_bytes / max(facts['seconds'], 1e-9) / 1e6:.0f} MB/s, written and compared")
+    verified = f"verified {count(done.frames, 'frame')}, each as in {scan}"
     if done.damaged:
-        click.echo(f"damaged  {count(len(done.damaged), 'frame')} of {scan}, kept as they are: {spans(done.damaged)}")
-    click.echo(f"verified {count(done.frames, 'frame')}, each as in {scan}: the raw may be deleted")
+        click.echo(f"damaged  {count(len(done.damaged), 'frame')} of {scan}, kept unchanged: {spans(done.damaged)}")
+        verified += f", also its {count(len(done.damaged), 'damaged frame')}"
+    click.echo(verified)
+    raw, *others = map(str, done.sources)
+    more = f"; where nothing but its frames is wanted of them, also {', '.join(others)}" if others else ""
+    click.echo(f"the raw may be deleted: {raw}{more}")

@@ -31,7 +31,8 @@ def test_an_archive_serves_as_the_raw_file_does(folder: Path) -> None:
     ratio = (folder / "scan.h5").stat().st_size / (folder / "small.h5").stat().st_size
     assert lines["size"].endswith(f"ratio {ratio:.2f}")
     assert lines["speed"].endswith("MB/s, written and compared")
-    assert lines["verified"] == "19 frames, each as in scan.h5: the raw may be deleted"
+    assert lines["verified"] == "19 frames, each as in scan.h5"
+    assert result.stdout.splitlines()[-1] == "the raw may be deleted: scan.h5"
     assert (folder / "scan.h5").exists()
     for command in (("info",), ("validate", "--deep")):
         raw, small = (beamline(*command, name) for name in ("scan.h5", "small.h5"))
@@ -50,6 +51,7 @@ def test_its_facts_for_machines(folder: Path) -> None:
     *_, progress, done = [json.loads(line) for line in result.stdout.splitlines()]
     assert (progress["event"], progress["stage"]) == ("progress", "archive")
     assert (done["event"], done["frames"], done["codec"], done["damaged"]) == ("done", 19, "bitshuffle-lz4", [])
+    assert done["sources"] == ["scan.h5"]
     assert done["ratio"] == pytest.approx((folder / "scan.h5").stat().st_size / done["bytes"])
 
 
@@ -58,7 +60,25 @@ def test_damaged_frames_end_it_or_are_said(folder: Path) -> None:
         file[layout.DATA][6, 1, 2] ^= 1
     result = beamline("archive", "scan.h5", "-o", "small.h5")
     assert (result.exit_code, left(folder)) == (5, {"scan.h5"})
-    assert "1 frame of scan.h5 differ" in result.stderr
+    assert "1 frame of scan.h5 differs from what was written" in result.stderr
     result = beamline("archive", "scan.h5", "-o", "small.h5", "--keep-damaged")
     assert result.exit_code == 0
-    assert "damaged  1 frame of scan.h5, kept as they are: 6" in result.stdout
+    assert "damaged  1 frame of scan.h5, kept unchanged: 6" in result.stdout
+    assert "19 frames, each as in scan.h5, also its 1 damaged frame\n" in result.stdout
+
+
+def test_all_files_that_it_draws_from_are_named(folder: Path) -> None:
+    counts = SCAN.counts()
+    (folder / "part-2").mkdir()
+    drawn = h5py.VirtualLayout(counts.shape, counts.dtype)
+    for name, rows in (("scan.h5", slice(0, 7)), ("part-2/scan.h5", slice(7, None))):
+        with h5py.File(name, "w") as file:
+            drawn[rows] = h5py.VirtualSource(file.create_dataset("images", data=counts[rows]))
+    with h5py.File("joined.h5", "w") as file:
+        file.create_virtual_dataset("exchange/data", drawn)
+        file["exchange/theta"] = np.degrees(SCAN.angles)
+    result = beamline("archive", "joined.h5", "-o", "small.h5")
+    assert result.exit_code == 0, result.output
+    *_, last = result.stdout.splitlines()
+    others = f"scan.h5, {Path('part-2/scan.h5')}"
+    assert last == f"the raw may be deleted: joined.h5; where nothing but its frames is wanted of them, also {others}"

@@ -18,7 +18,9 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage import archive as module
-from beamline.storage.archive import CODECS, archive
+from beamline.storage import compressed_copy
+from beamline.storage.archive import archive
+from beamline.storage.compressed_copy import CODECS
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate
@@ -71,7 +73,7 @@ def test_all_but_the_size_is_as_in_the_raw_file(scan: Path, tmp_path: Path, code
     seen: list[tuple[int, int]] = []
     done = archive(scan, tmp_path / "small.h5", codec, progress=lambda n, total: seen.append((n, total)))
     assert content(done.path) == content(scan)
-    assert (done.frames, done.damaged, done.raw_bytes) == (22, (), scan.stat().st_size)
+    assert (done.frames, done.damaged, done.sources, done.raw_bytes) == (22, (), (scan,), scan.stat().st_size)
     assert done.bytes == done.path.stat().st_size < scan.stat().st_size
     assert seen[-1] == (1, 1)  # MB
     assert [finding for finding in validate(done.path, lambda n, total: None) if finding.severity == "error"] == []
@@ -112,6 +114,7 @@ def test_a_joined_scan_becomes_one_file(tmp_path: Path) -> None:
         with pytest.raises(DataError, match=r"one of 2 parts.*joined\.h5"):
             archive(part, tmp_path / "small.h5")
     done = archive(joined, tmp_path / "small.h5")
+    assert done.sources == (joined, *parts)
     assert done.raw_bytes == sum(path.stat().st_size for path in (joined, *parts))
     expected = content(joined)
     for path in (joined, *parts):
@@ -125,7 +128,7 @@ def test_damaged_frames_are_named_and_archived_only_on_request(scan: Path, tmp_p
     with h5py.File(scan, "r+") as file:
         for row in (3, 7):
             file[layout.DATA][row, 5, 6] ^= 64
-    with pytest.raises(DataError, match=r"2 frames of .* differ from the checksums .*: 3, 7\."):
+    with pytest.raises(DataError, match=r"2 frames of .* differ from what was written, by the stored checksum: 3, 7\."):
         archive(scan, tmp_path / "small.h5")
     assert left(tmp_path) == {"scan.h5"}
     done = archive(scan, tmp_path / "small.h5", keep_damaged=True)
@@ -166,7 +169,7 @@ def test_what_a_disk_does_not_give_back_is_found(
         with h5py.File(partial, "r+") as file:
             spoil(file)
 
-    monkeypatch.setattr(module, "_forget", spoilt)
+    monkeypatch.setattr(module, "_drop_from_cache", spoilt)
     with pytest.raises(DataError, match=f"does not give back what was written: {said} differs"):
         archive(scan, tmp_path / "small.h5")
     assert left(tmp_path) == {"scan.h5"}
@@ -217,7 +220,7 @@ def test_a_disk_that_is_too_small_is_known_before(scan: Path, tmp_path: Path, mo
 def test_an_end_before_its_time_leaves_nothing(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    stored: Callable[..., int] = module.checksum_of
+    stored: Callable[..., int] = compressed_copy.checksum_of
 
     def fails_at_the_ninth(image: np.ndarray) -> int:
         nonlocal calls
@@ -227,7 +230,7 @@ def test_an_end_before_its_time_leaves_nothing(
         return stored(image)
 
     calls = 0
-    monkeypatch.setattr(module, "checksum_of", fails_at_the_ninth)
+    monkeypatch.setattr(compressed_copy, "checksum_of", fails_at_the_ninth)
     with pytest.raises((KeyboardInterrupt, DataError)):
         archive(scan, tmp_path / "small.h5")
     assert left(tmp_path) == {"scan.h5"}
