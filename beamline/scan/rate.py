@@ -101,7 +101,7 @@ class Load:
 
     def prepare(self) -> None:
         """Make images, digests and memory now: else the first stage that needs them would be measured with it."""
-        _ = self.memory  # its timeline is that of the digests, and they are of the images
+        _ = self.memory  # it needs the timeline, that the digests, and they the images
 
     @property
     def context(self) -> ScanContext:
