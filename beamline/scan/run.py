@@ -221,9 +221,10 @@ class _Run:
             return self._acquire_and_follow(writer, follower, release)
 
     def _prepare_memory(self) -> None:
-        """Memory for the frames that may wait for the disk, before the first comes: at most half of what is free."""
+        """Memory for the frames that may wait for the disk, before the first comes: at most a quarter of what is
+        free, as a live volume takes half."""
         memory, timeline = self.instrument.frame_memory, self.ready.timeline
-        n = min(frames_in_memory(timeline), free_memory() // (2 * timeline.frame_bytes))
+        n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
         if memory is None or n == 0:
             return
         frames = f"memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"

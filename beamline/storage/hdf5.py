@@ -214,10 +214,11 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
     return np.ravel(np.asarray(item[()], np.float64)) * factor
 
 
-def missing_links(item: h5py.Dataset) -> list[str]:
-    """Files, and datasets of its own file, that a virtual dataset draws on and that are not there, or of another shape.
+def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
+    """Files, and datasets of its own file, that a virtual dataset draws on and that cannot be read, or differ in shape.
 
-    For the first HDF5 gives fill values without a word, with the others it crashes or reads for ever.
+    HDF5 gives fill values without a word for what is in another file, and crashes or reads for ever for what is in its
+    own. Sources that are virtual, too, are followed `within` so many files.
     """
     if not item.is_virtual:
         return []
@@ -227,9 +228,28 @@ def missing_links(item: h5py.Dataset) -> list[str]:
             drawn = dataset(item.file, source.dset_name)
             if drawn is None or drawn.shape[1:] != source.src_space.shape[1:]:
                 lost.add(source.dset_name)
-        elif not (folder / source.file_name).is_file():
+        elif not _is_there(folder / source.file_name, source, within):
             lost.add(str(folder / source.file_name))
     return sorted(lost)
+
+
+def _is_there(path: Path, source: Any, within: int) -> bool:
+    """Whether another file has the frames, of their shape, that a source of a virtual dataset names."""
+    if within == 0:
+        return False
+    try:
+        with open_hdf5(path) as file:
+            drawn = dataset(file, source.dset_name)
+            return drawn is not None and _holds(drawn, source) and not missing_links(drawn, within - 1)
+    except (DataError, OSError):
+        return False
+
+
+def _holds(drawn: h5py.Dataset, source: Any) -> bool:
+    space = source.src_space
+    if not space.shape:  # all of it, whatever its shape is
+        return int(drawn.size) == source.vspace.get_select_npoints() and drawn.shape[1:] == source.vspace.shape[1:]
+    return drawn.shape[1:] == space.shape[1:] and space.get_select_bounds()[1][0] < drawn.shape[0]
 
 
 def require_possible(item: h5py.Dataset) -> None:

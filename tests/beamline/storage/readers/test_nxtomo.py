@@ -209,7 +209,40 @@ def test_frames_in_a_linked_file_that_is_gone(tmp_path: Path) -> None:
         open_scan(path)
 
 
-def test_virtual_frames_of_a_file_that_is_gone_are_no_zeros(tmp_path: Path) -> None:
+def _gone(pixels: Path) -> None:
+    pixels.unlink()
+
+
+def _renamed(pixels: Path) -> None:
+    with h5py.File(pixels, "r+") as file:
+        file.move("data", "other")
+
+
+def _shorter(pixels: Path) -> None:
+    with h5py.File(pixels, "r+") as file:
+        frames = file["data"][:5]
+        del file["data"]
+        file["data"] = frames
+
+
+def _drawn_from_what_is_gone(pixels: Path) -> None:
+    pixels.unlink()
+    layout = h5py.VirtualLayout((6, 4, 5), "u2")
+    layout[:] = h5py.VirtualSource(pixels.with_name("gone.h5"), "data", (6, 4, 5))
+    with h5py.File(pixels, "w") as file:
+        file.create_virtual_dataset("data", layout)
+
+
+def _drawn_from_itself(pixels: Path) -> None:
+    pixels.unlink()
+    layout = h5py.VirtualLayout((6, 4, 5), "u2")
+    layout[:] = h5py.VirtualSource(pixels.with_name("f.nxs"), "entry1/tomo_entry/instrument/detector/data", (6, 4, 5))
+    with h5py.File(pixels, "w") as file:
+        file.create_virtual_dataset("data", layout)
+
+
+@pytest.mark.parametrize("lose", [_gone, _renamed, _shorter, _drawn_from_what_is_gone, _drawn_from_itself])
+def test_virtual_frames_that_cannot_be_read_are_no_zeros(tmp_path: Path, lose: Callable[[Path], None]) -> None:
     path = foreign(tmp_path / "f.nxs")
     with h5py.File(path, "r+") as file, h5py.File(tmp_path / "pixels.h5", "w") as pixels:
         detector = file["entry1/tomo_entry/instrument/detector"]
@@ -220,7 +253,7 @@ def test_virtual_frames_of_a_file_that_is_gone_are_no_zeros(tmp_path: Path) -> N
         detector.create_virtual_dataset("data", virtual)
     with open_scan(path) as source:
         assert source.read([5])[0, -1, -1] == 119
-    (tmp_path / "pixels.h5").unlink()
+    lose(tmp_path / "pixels.h5")
     with pytest.raises(DataError, match=r"draws its frames from .*pixels\.h5, which is not there"):
         open_scan(path)
 

@@ -72,7 +72,7 @@ def swap(file: h5py.File, path: str, values: object, **attributes: str) -> None:
 
 
 def no_definition(file: h5py.File) -> None:
-    del file["entry/definition"]
+    del file["entry/definition"], file["entry"].attrs["definition"]
 
 
 def float_frames(file: h5py.File) -> None:
