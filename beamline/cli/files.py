@@ -204,4 +204,4 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
     click.echo(verified)
     raw, *others = map(str, done.sources)
     more = f"; where nothing but its frames is wanted of them, also {', '.join(others)}" if others else ""
-    click.echo(f"the raw may be deleted: {raw}{more}")
+    click.echo(f"the raw file may be deleted: {raw}{more}")

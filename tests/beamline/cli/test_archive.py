@@ -32,7 +32,7 @@ def test_an_archive_serves_as_the_raw_file_does(folder: Path) -> None:
     assert lines["size"].endswith(f"ratio {ratio:.2f}")
     assert lines["speed"].endswith("MB/s, written and compared")
     assert lines["verified"] == "19 frames, each as in scan.h5"
-    assert result.stdout.splitlines()[-1] == "the raw may be deleted: scan.h5"
+    assert result.stdout.splitlines()[-1] == "the raw file may be deleted: scan.h5"
     assert (folder / "scan.h5").exists()
     for command in (("info",), ("validate", "--deep")):
         raw, small = (beamline(*command, name) for name in ("scan.h5", "small.h5"))
@@ -80,5 +80,5 @@ def test_all_files_that_it_draws_from_are_named(folder: Path) -> None:
     result = beamline("archive", "joined.h5", "-o", "small.h5")
     assert result.exit_code == 0, result.output
     *_, last = result.stdout.splitlines()
-    others = f"scan.h5, {Path('part-2/scan.h5')}"
-    assert last == f"the raw may be deleted: joined.h5; where nothing but its frames is wanted of them, also {others}"
+    also = f"where nothing but its frames is wanted of them, also scan.h5, {Path('part-2/scan.h5')}"
+    assert last == f"the raw file may be deleted: joined.h5; {also}"
