@@ -121,6 +121,11 @@ def _frames_of_archivable(scan: Path) -> int:
     if (found := joined_file_of(scan)) is not None:
         joined, n = found
         raise DataError(f"{scan} is one of {n} parts of a scan. Archive all of it: {joined}. Nothing was written.")
+    if later := sorted(scan.resolve().parent.glob("part-*/scan.h5")) if scan.name == "scan.h5" else []:
+        raise DataError(
+            f"{scan} is the first part of a run that was resumed ({later[0]}), and its parts are not joined. "
+            f"`beamline recover {scan.parent}` joins them; then archive joined.h5. Nothing was written."
+        )
     return frames
 
 
@@ -196,4 +201,10 @@ def _same_values(one: h5py.Dataset, other: h5py.Dataset) -> bool:
 
 def _same(one: Any, other: Any) -> bool:
     a, b = np.asarray(one), np.asarray(other)
-    return bool((a == b).all()) if a.dtype.hasobject else a.tobytes() == b.tobytes()
+    if not a.dtype.hasobject:
+        return a.tobytes() == b.tobytes()
+    if a.dtype.names:
+        return all(_same(a[name], b[name]) for name in a.dtype.names)
+    if a.ndim:
+        return a.shape == b.shape and all(_same(x, y) for x, y in zip(a.ravel(), b.ravel(), strict=True))
+    return bool(a == b)

@@ -107,18 +107,27 @@ def _copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
 
 
 def image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
-    """Every dataset of images, once. DataError where a link leads to another file, which a copy would still need."""
+    """Every dataset of images, once.
+
+    DataError where something would not be in a copy: values in another file, other than frames, and references between
+    objects, which are places in this one.
+    """
     names: list[str] = []
     raw.visit_links(names.append)  # an error within a visit would end h5py
     found: dict[_Place, h5py.Dataset] = {}
-    for name in names:
-        link = raw.get(name, getlink=True)
-        item = raw[name] if isinstance(link, h5py.HardLink) else None
+    for name in ("/", *names):
+        link = raw.get(name, getlink=True) if name != "/" else None
+        item = raw[name] if link is None or isinstance(link, h5py.HardLink) else None
+        if item is not None and _refers(item):
+            raise DataError(
+                f"{raw.filename}: {name} holds references to other objects of the file, which a copy would not keep. "
+                "Keep the raw file. Nothing was written."
+            )
         if item is not None and is_image_dataset(item):
             if lost := hdf5.missing_links(item):
                 raise DataError(f"{raw.filename} draws its frames from {lost[0]}, which is not there or differs.")
             found[_place(item)] = item
-        elif others := [link.filename] if isinstance(link, h5py.ExternalLink) else drawn_from(item):
+        elif others := [link.filename] if isinstance(link, h5py.ExternalLink) else _kept_in(item):
             raise DataError(
                 f"{raw.filename} draws {name} from {others[0]} by a link; an archive would still need that file. "
                 "`beamline ingest` makes one file of both. Nothing was written."
@@ -132,7 +141,8 @@ def is_image_dataset(item: h5py.HLObject) -> bool:
         return False
     if item.is_virtual:
         return bool(drawn_from(item))
-    return math.prod(item.shape[1:]) * item.dtype.itemsize >= _IMAGE
+    wide = math.prod(item.shape[1:]) * item.dtype.itemsize >= _IMAGE
+    return wide and len(item) > 0 and item.dtype.itemsize <= 8 and not item.external
 
 
 def drawn_from(item: h5py.HLObject) -> list[str]:
@@ -140,6 +150,24 @@ def drawn_from(item: h5py.HLObject) -> list[str]:
     if not (isinstance(item, h5py.Dataset) and item.is_virtual):
         return []
     return [source.file_name for source in item.virtual_sources() if source.file_name != "."]
+
+
+def _kept_in(item: h5py.HLObject | None) -> list[str]:
+    """The other files that hold the values of a dataset."""
+    raw_files = [str(name) for name, *_ in item.external or ()] if isinstance(item, h5py.Dataset) else []
+    return raw_files or ([] if item is None else drawn_from(item))
+
+
+def _refers(item: h5py.HLObject) -> bool:
+    """An object, or one of its attributes, holds references."""
+    dtypes = [item.attrs.get_id(name).dtype for name in item.attrs]
+    return any(map(_is_reference, dtypes)) or (isinstance(item, h5py.Dataset) and _is_reference(item.dtype))
+
+
+def _is_reference(dtype: np.dtype[Any]) -> bool:
+    parts = [field[0] for field in dtype.fields.values()] if dtype.fields else []
+    parts += [part for part in (h5py.check_vlen_dtype(dtype), dtype.base) if isinstance(part, np.dtype)]
+    return h5py.check_ref_dtype(dtype) is not None or any(_is_reference(part) for part in parts if part is not dtype)
 
 
 def images(dataset: h5py.Dataset) -> Iterator[NDArray[Any]]:

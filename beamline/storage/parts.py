@@ -99,6 +99,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
 
 def joined_file_of(part: Path) -> tuple[Path, int] | None:
     """The file that joins this one with other parts of its scan, and how many it joins; None where there is none."""
+    part = part.resolve()
     for folder in (part.parent, part.parent.parent):  # that of the run, or of a later part in it
         joined = folder / JOINED
         if not joined.is_file():
@@ -108,7 +109,7 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
                 names = [source.file_name for source in file[layout.DATA].virtual_sources()]
         except (DataError, *hdf5.ALTERED):
             continue
-        if part.resolve() in [(folder / name).resolve() for name in names]:
+        if part in [(folder / name).resolve() for name in names]:
             return joined, len(names)
     return None
 

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
@@ -18,9 +19,10 @@ from beamline.storage.readers.angle_table import Angles, load_angles, parse_angl
 from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
 from beamline.storage.readers.overlay import Overlay
 from beamline.storage.readers.parts_source import PartsSource
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
+from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeries
+from drivers.frame import FrameKind
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
@@ -107,6 +109,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             if table is None:
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
+        if table is not None and isinstance(base, StacksSource):
+            _refuse_all_frames(base, table, angles_from)
         if table is None and darks is None and flats is None and options.quantity is None:
             return base
         return Overlay(
@@ -120,6 +124,16 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     except BaseException:
         base.close()
         raise
+
+
+def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str) -> None:
+    """DataError for an angle for each frame, where the order in which darks and flats were taken is not known."""
+    n = int((base.image_key == FrameKind.PROJECTION).sum())
+    if n < base.image_key.size == table.size:
+        raise DataError(
+            f"{name} has {table.size} angles, one for each frame, and {base.path} does not say when its darks and "
+            f"flats were taken: say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
+        )
 
 
 def _of_parts(earlier: Sequence[Path], last: ScanReader) -> ScanReader:

@@ -79,13 +79,13 @@ class _Views:
 
     def __getitem__(self, key: tuple[slice, slice]) -> NDArray[Any]:
         views, rows = key
+        wanted = range(len(self))[views]
+        out = np.empty((len(wanted), len(range(self.shape[1])[rows]), self.shape[2]), self.dtype)
         with hdf5.readable(self._path):
-            return np.array(
-                [
-                    self._file.image(f"ImageData{i // _PER_STORAGE + 1}/Image{i + 1}", self.shape[1:], self.dtype)[rows]
-                    for i in range(len(self))[views]
-                ]
-            )
+            for part, i in zip(out, wanted, strict=True):  # a whole image at a time: its file has no smaller pieces
+                name = f"ImageData{i // _PER_STORAGE + 1}/Image{i + 1}"
+                part[:] = self._file.image(name, self.shape[1:], self.dtype)[rows]
+        return out
 
 
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
@@ -114,6 +114,8 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         raise DataError(f"{path} says that its images have {rows} x {cols} pixels: it is damaged.")
     if kind not in _TYPES:
         raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
+    if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
+        raise DataError(f"{path} says that it has {n} images of {rows} x {cols} pixels, and is too small for them.")
     _refuse(path, file, n)
     stacks = [Stack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
     reference = _TYPES.get(

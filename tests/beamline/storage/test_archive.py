@@ -93,6 +93,9 @@ def test_scans_of_other_programs(tmp_path: Path) -> None:
         file["nothing"] = h5py.Empty("f8")
         file.attrs["fixed"] = np.bytes_(b"text of fixed length")
         file.attrs["of none"] = h5py.Empty("f4")
+        file.create_dataset("no images", (0, 64, 64), "u2")
+        file.create_dataset("lists", data=np.array([np.arange(3), np.arange(2)], object), dtype=h5py.vlen_dtype("i4"))
+        file["not a number"] = np.array([(1.0, b"a"), (np.nan, b"b")], [("value", "f8"), ("name", "S1")])
     done = archive(raw, tmp_path / "small.h5")
     with open_scan(raw) as one, open_scan(done.path) as other:
         np.testing.assert_array_equal(one.read(slice(None)), other.read(slice(None)))
@@ -103,6 +106,40 @@ def test_scans_of_other_programs(tmp_path: Path) -> None:
         assert file["nothing"].shape is None
         assert file.attrs.get_id("fixed").dtype == "S20"
         assert isinstance(file.attrs["of none"], h5py.Empty)
+
+
+def _external(file: h5py.File) -> None:
+    name = Path(file.filename).with_name("beam.raw")
+    np.arange(4.0).tofile(name)
+    file.create_dataset("beam", (4,), "f8", external=[(name.name, 0, 32)])
+
+
+def _reference(file: h5py.File) -> None:
+    file["exchange"].attrs["first"] = file["exchange/theta"].ref
+
+
+def _scale(file: h5py.File) -> None:
+    file["exchange/theta"].make_scale("angle")
+    file["exchange/data"].dims[0].attach_scale(file["exchange/theta"])
+
+
+@pytest.mark.parametrize(
+    ("make", "said"), [(_external, "beam from beam.raw"), (_reference, "exchange holds"), (_scale, "references")]
+)
+def test_what_a_copy_would_not_hold_is_refused(tmp_path: Path, make: Callable[[h5py.File], None], said: str) -> None:
+    raw = write_exchange(tmp_path / "exchange.h5", SCAN)
+    with h5py.File(raw, "r+") as file:
+        make(file)
+    with pytest.raises(DataError, match=said):
+        archive(raw, tmp_path / "small.h5")
+    assert not (tmp_path / "small.h5").exists()
+
+
+def test_the_first_part_of_a_run_that_is_not_joined_is_refused(scan: Path, tmp_path: Path) -> None:
+    (tmp_path / "part-2").mkdir()
+    shutil.copy(scan, tmp_path / "part-2")
+    with pytest.raises(DataError, match=r"first part of a run .*beamline recover .* then archive joined\.h5"):
+        archive(scan, tmp_path / "small.h5")
 
 
 def test_a_joined_scan_becomes_one_file(tmp_path: Path) -> None:

@@ -57,10 +57,11 @@ def test_a_unit_that_is_given_goes_before_the_file(path: Path, unit: str) -> Non
             np.testing.assert_allclose(source.angles[5:], expected)
 
 
-def test_one_angle_for_each_frame_or_some_of_them(path: Path) -> None:
+def test_of_one_angle_for_each_frame_those_of_the_projections_are_named(path: Path) -> None:
+    """Nothing says whether darks and flats were taken before the projections or after them."""
     said = {**PATHS, "angles_path": "/motors/of_all", "angles_unit": "deg"}
-    with open_scan(SourceOptions(path, **said)) as source:
-        np.testing.assert_allclose(np.degrees(source.angles), np.linspace(0, 450, 10))
+    with pytest.raises(DataError, match=r"has 10 angles, one for each frame, .* --angle-rows A:B which 5 belong"):
+        open_scan(SourceOptions(path, **said))
     with open_scan(SourceOptions(path, **said, angle_rows="2:7")) as source:
         np.testing.assert_allclose(np.degrees(source.angles[5:]), np.linspace(0, 450, 10)[2:7])
 

@@ -125,6 +125,10 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
         ({"ImageInfo__ImageWidth": None}, "no stream ImageInfo/ImageWidth"),
         ({"ImageInfo__ImageWidth": np.int32(41)}, "damaged, or not laid out as it should be"),
         ({"ImageInfo__NoOfImages": np.int32(0)}, "holds no projections"),
+        (
+            {"ImageInfo__NoOfImages": np.int32(2**31 - 1), "ImageInfo__ImagesTaken": None},
+            "2147483647 images of 4 x 40 pixels, and is too small",
+        ),
         ({"ImageInfo__AcquisitionMode": np.int32(2)}, "a volume"),
         ({"ImageInfo__MosiacRows": np.int32(2)}, "is a mosaic"),
         ({"Alignment__X-Shifts": np.linspace(-3, 1, 120).astype("<f4")}, "up to 3 pixels, that are not applied"),
