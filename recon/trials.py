@@ -131,11 +131,12 @@ def predicts_best(
         return None, "stopped before the choice"
     if not found:
         raise ValueError("; ".join(refused))
-    best, passed = best_of(scores())
+    judged = scores()
+    best, passed = best_of(judged)
     listed = [
         f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views, "
         f"edges {s.steepness:.2f}{', ' * (s.at in passed)}{passed.get(s.at, '')})"
-        for s in sorted(scores(), key=lambda s: s.residual)
+        for s in sorted(judged, key=lambda s: s.residual)
     ]
     late = [methods[at].name for at in regular[len(found) + len(refused) :]] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])

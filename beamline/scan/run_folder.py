@@ -9,10 +9,11 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO
 
+from beamline.storage.parts import PART
+
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
-PART = "part-{}"  # of a run that was resumed: the folder of a later part
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:

@@ -32,7 +32,7 @@ from beamline.storage.compressed_copy import (
     images,
     is_image_dataset,
 )
-from beamline.storage.parts import joined_file_of
+from beamline.storage.parts import joined_file_of, other_parts
 from beamline.storage.readers.open import open_scan
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
@@ -121,10 +121,10 @@ def _frames_of_archivable(scan: Path) -> int:
     if (found := joined_file_of(scan)) is not None:
         joined, n = found
         raise DataError(f"{scan} is one of {n} parts of a scan. Archive all of it: {joined}. Nothing was written.")
-    if later := sorted(scan.resolve().parent.glob("part-*/scan.h5")) if scan.name == "scan.h5" else []:
+    if others := other_parts(scan):
         raise DataError(
-            f"{scan} is the first part of a run that was resumed ({later[0]}), and its parts are not joined. "
-            f"`beamline recover {scan.parent}` joins them; then archive joined.h5. Nothing was written."
+            f"{scan} is a part of a run that was resumed, as {others[0]} is, and its parts are not joined. "
+            "`beamline recover RUN` joins them; then archive joined.h5. Nothing was written."
         )
     return frames
 

@@ -61,7 +61,7 @@ class CompressedCopy:
     def group(self, source: h5py.Group, target: h5py.Group) -> None:
         """All that is in a group; what has several names in the raw file has them in the copy."""
         self._paths[_place(source)] = target.name
-        _copy_attributes(source, target)
+        hdf5.copy_attributes(source, target)
         for name in source:
             link = source.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
@@ -84,7 +84,7 @@ class CompressedCopy:
             name, source.shape, source.dtype, chunks=(1, *source.shape[1:]), maxshape=source.maxshape,
             fillvalue=source.fillvalue, **self._codec,
         )  # fmt: skip
-        _copy_attributes(source, made)
+        hdf5.copy_attributes(source, made)
         said = _stored_checksums(source)
         checksums = self.checksums[source.name] = []
         for row, image in enumerate(images(source)):
@@ -93,17 +93,6 @@ class CompressedCopy:
             if said is not None and not has_checksum(image, int(said[row])):
                 self.damaged.add(row)
             self._counter.add(image)
-
-
-def _copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
-    """With their types and shapes as they are."""
-    for name in source.attrs:
-        given = source.attrs.get_id(name)
-        made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
-        if given.get_space().get_simple_extent_type() != h5py.h5s.NULL:
-            values = np.empty(given.shape, given.dtype)
-            given.read(values)
-            made.write(values)
 
 
 def image_datasets(raw: h5py.File) -> list[h5py.Dataset]:

@@ -214,6 +214,17 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
     return np.ravel(np.asarray(item[()], np.float64)) * factor
 
 
+def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
+    """All attributes of an object, with their types and shapes as they are, to one that has none of them."""
+    for name in source.attrs:
+        given = source.attrs.get_id(name)
+        made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())
+        if given.get_space().get_simple_extent_type() != h5py.h5s.NULL:
+            values = np.empty(given.shape, given.dtype)
+            given.read(values)
+            made.write(values)
+
+
 def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
     """Files, and datasets of its own file, that a virtual dataset draws on and that cannot be read, or differ in shape.
 

@@ -27,6 +27,9 @@ from drivers.frame import FrameKind
 JOINED = "joined.h5"
 """The file of all parts, in the folder of the run, where its first part is."""
 
+PART = "part-{}"
+"""The folder of a later part, in that of the run."""
+
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = ("/exchange", "/implements", layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
@@ -97,6 +100,14 @@ def join(parts: Sequence[Path], joined: Path) -> int:
             raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
 
 
+def other_parts(part: Path) -> list[Path]:
+    """The files of the other parts of its run, joined or not."""
+    part = part.resolve()
+    run = part.parent.parent if part.parent.match(PART.format("*")) else part.parent
+    files = (run / part.name, *sorted(run.glob(f"{PART.format('*')}/{part.name}")))
+    return [file for file in files if file.is_file() and file != part]
+
+
 def joined_file_of(part: Path) -> tuple[Path, int] | None:
     """The file that joins this one with other parts of its scan, and how many it joins; None where there is none."""
     part = part.resolve()
@@ -118,16 +129,16 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     rows = [int(file[layout.COMMITTED][()]) for file in files]
     firsts = np.cumsum([0, *rows])
     values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in layout.GROWING}
-    for column, first in zip(values[layout.REPLACES], firsts, strict=False):
+    for column, first in zip(values[layout.REPLACES], firsts[:-1], strict=True):
         column[column >= 0] += first
     values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
     _copy(files[0]["/"], joined, {path: np.concatenate(parts) for path, parts in values.items()})
     for path in _VIRTUAL:
         item = files[0][path]
         virtual = h5py.VirtualLayout((firsts[-1], *item.shape[1:]), item.dtype)
-        for file, name, first, n in zip(files, names, firsts, rows, strict=False):
+        for file, name, first, n in zip(files, names, firsts[:-1], rows, strict=True):
             virtual[first : first + n] = h5py.VirtualSource(Path(name).as_posix(), path, file[path].shape)[:n]
-        _copy_attributes(item, joined.create_virtual_dataset(path, virtual))
+        hdf5.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
     for path, item in _links(files[0]):
         joined[path] = joined[item]
     for path in (layout.END_TIME, layout.STATUS):
@@ -143,7 +154,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
 
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
     """Copy a group, with these values for the datasets named; without what is virtual, made anew, or a link."""
-    _copy_attributes(source, target)
+    hdf5.copy_attributes(source, target)
     for name, item in source.items():
         path = f"{source.name.rstrip('/')}/{name}"
         if path in _MADE_ANEW or path in _VIRTUAL or _target(item) not in ("", path):
@@ -151,7 +162,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
         if isinstance(item, h5py.Group):
             _copy(item, target.create_group(name), values)
         elif path in values:
-            _copy_attributes(item, target.create_dataset(name, data=values[path]))
+            hdf5.copy_attributes(item, target.create_dataset(name, data=values[path]))
         else:
             source.copy(name, target)
 
@@ -166,11 +177,6 @@ def _target(item: h5py.HLObject) -> str:
     return hdf5.attribute(item, "target")
 
 
-def _copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
-    for name, value in source.attrs.items():
-        target.attrs[name] = value
-
-
 def _name_missing(files: Sequence[h5py.File], joined: h5py.File) -> None:
     """Of the triggers that gave no frame, those that gave none in a later part either."""
     plan = json.loads(files[0]["/entry/record/plan"].asstr()[()])
@@ -183,4 +189,4 @@ def _name_missing(files: Sequence[h5py.File], joined: h5py.File) -> None:
     missing = {int(trigger) for file in files for trigger in file[layout.MISSING][()]} - stored
     del joined[layout.MISSING]
     joined[layout.MISSING] = np.array(sorted(missing), np.int64)
-    _copy_attributes(files[0][layout.MISSING], joined[layout.MISSING])
+    hdf5.copy_attributes(files[0][layout.MISSING], joined[layout.MISSING])

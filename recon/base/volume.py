@@ -110,9 +110,8 @@ class Grid:
     @property
     def first(self) -> tuple[float, float, float]:
         """Centre (z, y, x) of voxel [0, 0, 0] in mm."""
-        return tuple(  # type: ignore[return-value]
-            c - (n - 1) / 2 * edge for n, c, edge in zip(self.shape, self.centre, self.spacing, strict=True)
-        )
+        z, y, x = (c - (n - 1) / 2 * edge for n, c, edge in zip(self.shape, self.centre, self.spacing, strict=True))
+        return z, y, x
 
     def part(self, z: slice, y: slice, x: slice) -> Grid:
         """The box of these voxels, slices with first and end."""

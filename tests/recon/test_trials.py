@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from operator import contains
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -45,7 +48,7 @@ def test_of_level_residuals_the_first_that_hides_nothing(
     residuals: list[float], hiding: tuple[int, ...], best: int
 ) -> None:
     scatter = np.array([-0.1, 0.1, -0.1, 0.1])  # a standard error of 0.058: two are more than 4 %
-    scores = [Score(i, Fbp(), r + scatter, hides=lambda i=i: i in hiding) for i, r in enumerate(residuals)]  # type: ignore[misc]
+    scores = [Score(i, Fbp(), r + scatter, hides=partial(contains, hiding, i)) for i, r in enumerate(residuals)]
     assert best_of(scores)[0].at == best
 
 

@@ -316,8 +316,10 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     assert [part.view_ids.size for part in live] == [12, 30]
     np.testing.assert_allclose(live[1].data, whole.projections.data, atol=1e-6)
     states = [event.data for event in events if event.event == "state" and event.data["state"] == "correcting"]
-    begun, at_the_end = (data["message"] for data in states)
-    assert "next part of the run begin" in begun and "The run has several parts" in at_the_end
+    messages = [data["message"] for data in states]
+    assert len(messages) == 2
+    assert "next part of the run begin" in messages[0]
+    assert "The run has several parts" in messages[1]
     first = next(event for event in events if event.event == "snapshot")
     assert first.data["n_views"] >= 12 and first.time < EPOCH + 1e6 + 60
     warned = [event.data["message"] for event in events if event.event == "warning"]

@@ -135,11 +135,11 @@ def test_what_a_copy_would_not_hold_is_refused(tmp_path: Path, make: Callable[[h
     assert not (tmp_path / "small.h5").exists()
 
 
-def test_the_first_part_of_a_run_that_is_not_joined_is_refused(scan: Path, tmp_path: Path) -> None:
+def test_parts_of_a_run_that_are_not_joined_are_refused(scan: Path, tmp_path: Path) -> None:
     (tmp_path / "part-2").mkdir()
-    shutil.copy(scan, tmp_path / "part-2")
-    with pytest.raises(DataError, match=r"first part of a run .*beamline recover .* then archive joined\.h5"):
-        archive(scan, tmp_path / "small.h5")
+    for part in (scan, Path(shutil.copy(scan, tmp_path / "part-2"))):
+        with pytest.raises(DataError, match=r"a part of a run .*beamline recover .* then archive joined\.h5"):
+            archive(part, tmp_path / "small.h5")
 
 
 def test_a_joined_scan_becomes_one_file(tmp_path: Path) -> None:

@@ -327,7 +327,7 @@ class Rig:
     Attributes:
         at_frame: row of the file -> what happens when that frame has been taken.
         after_connecting: what happens once all devices are open.
-        pause: what pauses the scan that was begun last, whoever asks for it.
+        pause: the request that pauses the scan begun last.
         in_pause: what happens at each look at a paused scan, one after the other; after the last one it goes on.
         asked: what the operator was asked to do.
     """

@@ -225,20 +225,20 @@ def _shorter(pixels: Path) -> None:
         file["data"] = frames
 
 
-def _drawn_from_what_is_gone(pixels: Path) -> None:
+def _drawn_from(pixels: Path, name: str, dataset: str) -> None:
     pixels.unlink()
     layout = h5py.VirtualLayout((6, 4, 5), "u2")
-    layout[:] = h5py.VirtualSource(pixels.with_name("gone.h5"), "data", (6, 4, 5))
+    layout[:] = h5py.VirtualSource(pixels.with_name(name), dataset, (6, 4, 5))
     with h5py.File(pixels, "w") as file:
         file.create_virtual_dataset("data", layout)
+
+
+def _drawn_from_what_is_gone(pixels: Path) -> None:
+    _drawn_from(pixels, "gone.h5", "data")
 
 
 def _drawn_from_itself(pixels: Path) -> None:
-    pixels.unlink()
-    layout = h5py.VirtualLayout((6, 4, 5), "u2")
-    layout[:] = h5py.VirtualSource(pixels.with_name("f.nxs"), "entry1/tomo_entry/instrument/detector/data", (6, 4, 5))
-    with h5py.File(pixels, "w") as file:
-        file.create_virtual_dataset("data", layout)
+    _drawn_from(pixels, "f.nxs", "entry1/tomo_entry/instrument/detector/data")
 
 
 @pytest.mark.parametrize("lose", [_gone, _renamed, _shorter, _drawn_from_what_is_gone, _drawn_from_itself])

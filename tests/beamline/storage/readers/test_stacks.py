@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -107,8 +108,8 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit goes with --angles-path: give both, or neither"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, object], message: str) -> None:
-    with pytest.raises(DataError, match=message) as refused, open_scan(SourceOptions(path, **{**PATHS, **said})):  # type: ignore[arg-type]
+def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message) as refused, open_scan(SourceOptions(path, **{**PATHS, **said})):
         pass
     assert "\n" not in str(refused.value)
 
