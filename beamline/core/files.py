@@ -1,4 +1,4 @@
-"""Atomic files: written completely or not at all, and never over an existing one unless asked."""
+"""Atomic files: written completely or not at all, and never over an existing one unless asked; folders of parts."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from beamline.core.errors import DataError
+
+PART = "part-{}"
+"""The folder of a later part of a scan that was resumed, in that of the run."""
 
 
 def refuse_existing(path: Path) -> None:

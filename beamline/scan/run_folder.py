@@ -9,7 +9,7 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO
 
-from beamline.storage.parts import PART
+from beamline.core.files import PART
 
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import PART, whole_file
 from beamline.storage import hdf5
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
@@ -26,10 +26,6 @@ from drivers.frame import FrameKind
 
 JOINED = "joined.h5"
 """The file of all parts, in the folder of the run, where its first part is."""
-
-PART = "part-{}"
-"""The folder of a later part, in that of the run."""
-
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = ("/exchange", "/implements", layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
