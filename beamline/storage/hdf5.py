@@ -72,8 +72,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
     if missing:
         raise DataError(
-            f"{path} is cut off: {missing} bytes are missing at its end, as its head says. A copy: copy it again, or "
-            "use the original. A file that its disk did not take: `beamline recover` keeps its frames. Nothing was read."
+            f"{path} is cut off: {missing} bytes are missing at its end, as its head says. Copy it again, or use the "
+            "original. Where its disk did not take them, `beamline recover` keeps its frames. Nothing was read."
         )
     if being_written:
         raise DataError(

@@ -68,11 +68,10 @@ class Changes:
                     f"{self.path} needs {size(room)} on its disk to be changed, {size(free)} are free. Nothing was "
                     "changed."
                 )
-            with whole_file(journal, replace=True) as partial:
-                with partial.open("xb") as file:
-                    file.write(_journal(self))
-                    file.flush()
-                    to_disk(file.fileno())
+            with whole_file(journal, replace=True) as partial, partial.open("xb") as file:
+                file.write(_journal(self))
+                file.flush()
+                to_disk(file.fileno())
             _folder_to_disk(journal.parent)
         except OSError as error:
             with suppress(OSError):

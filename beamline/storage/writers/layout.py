@@ -38,7 +38,6 @@ from numpy.typing import NDArray
 from beamline.core.version import version
 from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
-from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
