@@ -102,12 +102,16 @@ def recover(file: Path, as_json: bool) -> None:
     """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
 
     Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
-    program, has its /exchange view and the status `failed`. A file that is in order is left as it is.
+    program, has its /exchange view and the status `failed`. A file that is in order is left as it is. What changes is
+    written to FILE.journal first, so that this can be run again after whatever stopped it; it says what room it needs.
     """
     from beamline.scan.resume import recover_run  # here: no other command of this module needs a configuration
 
+    def say(what: str) -> None:
+        click.echo(what, err=True)
+
     with terminated_like_interrupted(), json_events(as_json) as sinks:
-        found, left_out = recover_run(file) if file.is_dir() else ([recover_scan(file)], [])
+        found, left_out = recover_run(file, say) if file.is_dir() else ([recover_scan(file, say)], [])
         for said in left_out:
             click.echo(f"Warning: {said}", err=True)
         for sink in sinks:

@@ -7,7 +7,7 @@ file joins them all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -206,8 +206,11 @@ def _words(identity: Mapping[str, str]) -> str:
     return ", ".join(f"{key} {value}" for key, value in identity.items()) or "none"
 
 
-def recover_run(run: Path) -> tuple[list[Recovered], list[str]]:
+def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:
     """Recover every part of a run, and join them where there are several: the joined file comes last.
+
+    Args:
+        say: is told what room each needs, before anything is written to it.
 
     Returns:
         what became of each file, and a sentence on each part that was left out.
@@ -218,7 +221,7 @@ def recover_run(run: Path) -> tuple[list[Recovered], list[str]]:
     found, left_out = _files(run)
     if not found:
         raise DataError(f"{run} is no folder of a run: it has no {SCAN}. {_UNTOUCHED}")
-    done = [recover(part) for part in found]
+    done = [recover(part, say) for part in found]
     if len(parts := [one.path for one in done if one.frames]) > 1:
         frames = join(parts, run / JOINED)
         with hdf5.open_hdf5(run / JOINED) as file:

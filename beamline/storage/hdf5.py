@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.text import printable
+from beamline.storage.journal import pending
+from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
 
 DEGREE = np.pi / 180
@@ -50,12 +52,14 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
+    if (changes := pending(path)) is not None:
+        return h5py.File(Overlay(path, changes.ranges), "r")
     problems = []
     head = superblock(path)
     missing = 0 if head is None else head.missing
     being_written = head is not None and head.open_for_writing and head.intact
-    # A follower takes no lock, so as not to stop the writer from adding the /exchange view at the end; but a writer in
-    # this same process shares its file with us, and then HDF5 wants the same locking of both.
+    # A follower takes no lock, so as not to be taken for a writer; but a writer in this same process shares its file
+    # with us, and then HDF5 wants the same locking of both.
     growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
     for swmr, locking in (growing, whole, shared) if follow else (whole, growing, shared):
         if swmr and (missing or not (follow or being_written)):
@@ -69,7 +73,7 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if missing:
         raise DataError(
             f"{path} is cut off: {missing} bytes are missing at its end, as its head says. Copy it again, or use the "
-            "original. Nothing was read."
+            "original. Where its disk did not take them, `beamline recover` keeps its frames. Nothing was read."
         )
     if being_written:
         raise DataError(

@@ -28,7 +28,7 @@ JOINED = "joined.h5"
 """The file of all parts, in the folder of the run, where its first part is."""
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
-_MADE_ANEW = ("/exchange", "/implements", layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
+_MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_in(file: h5py.File) -> frozenset[int]:
@@ -143,7 +143,8 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
     joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
     _name_missing(files, joined)
-    layout.settle(joined)
+    joined[layout.IMAGE_KEY_CONTROL] = joined[layout.KIND]
+    layout.state_field_of_view(joined, layout.view_angles(joined))
     add_exchange_view(joined)
     return int(firsts[-1])
 

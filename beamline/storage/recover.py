@@ -1,24 +1,35 @@
-"""recover: an ordinary scan file of one whose writer died, in its place; every frame that was committed is kept."""
+"""recover: an ordinary scan file of one whose writer died, in its place; every frame that was committed is kept.
+
+HDF5 mends the file in memory, the result is read, and only then the few bytes that differ are written, by a journal:
+whatever stops it, it can be run again.
+"""
 
 from __future__ import annotations
 
+import shutil
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
+import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.text import count
-from beamline.storage import hdf5
+from beamline.core.text import count, size, spans
+from beamline.monitor.digest import has_checksum
+from beamline.storage import hdf5, journal
+from beamline.storage.journal import Changes
+from beamline.storage.overlay import Overlay
 from beamline.storage.parts import views_in, views_planned
 from beamline.storage.superblock import SIZE, Superblock, superblock
-from beamline.storage.writer_lock import held
+from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.exchange_view import has_exchange_view, with_exchange_view
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
+COMPARED = 2**31  # bytes of the last frames: more than a machine that loses power has not brought to the disk yet
 
 
 @dataclass(frozen=True)
@@ -30,6 +41,9 @@ class Recovered:
         frames: committed, and kept.
         dropped: frames at the end that were not committed when the writer died, and are cut off.
         missing: views that were planned and not taken; None where the file does not hold its plan.
+        lost: frames that were committed and are not on the disk; they are cut off, with all after them.
+        damaged: frames, of the last 2 GB, that differ from their checksum; they are kept.
+        remark: what could not be done though the frames are in order; "" where all was done.
     """
 
     path: Path
@@ -37,62 +51,60 @@ class Recovered:
     frames: int
     dropped: int
     missing: int | None
+    lost: tuple[int, ...] = ()
+    damaged: tuple[int, ...] = ()
+    remark: str = ""
 
     def said(self) -> str:
-        """One line for people."""
+        """A line for people."""
         if not self.changed:
-            return f"{self.path} is in order, with {count(self.frames, 'frame')}; nothing was changed."
-        gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
-        views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
-        return f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{views}."
+            said = f"{self.path} is in order, with {count(self.frames, 'frame')}; nothing was changed."
+        else:
+            gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
+            lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""
+            damaged = f"; frames {spans(self.damaged)} differ from their checksum" if self.damaged else ""
+            views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
+            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{views}."
+        return f"{said} {self.remark}".strip()
 
 
-def recover(path: Path) -> Recovered:
+def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
     """Clear the mark of the dead writer, cut what was not committed, and add what a writer adds at the end.
 
-    Only the 48 bytes of the head are written before the file was read; where it cannot be read, they are put back.
+    Args:
+        say: is told what room that needs, before anything is written.
 
     Raises:
-        DataError: no scan of ours, a file that is cut off or damaged, one that a running program has open, or one that
-            changed within 10 s: then nothing is changed.
+        DataError: no scan of ours, a damaged file, one that a running program has open, or one that changed within
+            10 s: then nothing is changed. Or a disk that does not take it: then it can be run again.
     """
-    head = _checked(path)
-    if not head.open_for_writing:
-        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-            _require_ours(path, file)
-            if file[layout.FINISHED][()] and "exchange" in file:
-                return Recovered(path, False, int(file[layout.COMMITTED][()]), 0, None)
-    _write_head(path, head.closed())
-    try:
-        with h5py.File(path, "r") as file:
-            _require_ours(path, file)
-            for name in layout.GROWING:
-                file[name][:]
-            hdf5.text(file[layout.STATUS][()]), len(file[layout.DATA]), _views_missing(file)  # it must be able to end
-    except (*hdf5.ALTERED, DataError) as error:
-        _write_head(path, head)
-        if isinstance(error, DataError):
-            raise
-        raise DataError(
-            f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
-        ) from error
-    with h5py.File(path, "r+", libver=layout.LIBVER) as file:
-        return _finished(path, file)
-
-
-def _checked(path: Path) -> Superblock:
-    head = superblock(path) if path.is_file() else None
-    if head is None or not head.intact:
-        raise DataError(f"{path} is not there, or no HDF5 file that this program wrote. Nothing was changed.")
-    if head.missing:
-        raise DataError(
-            f"{path} is cut off: {head.missing} bytes are missing at its end, as its head says. Nothing was changed."
-        )
+    if not path.is_file():
+        raise DataError(f"{path} is not there. Nothing was changed.")
     if held(path):
         raise DataError(
             f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
             "Nothing was changed."
         )
+    lock = None
+    with suppress(OSError):  # a file that nobody can write to may be in order
+        lock = WriterLock(path, exclusive=True)
+    try:
+        begun = journal.finish(path)
+        head = _checked(path)
+        if head.open_for_writing or head.missing or not _finished(path):
+            done, mended = _mended(path, head)
+        else:
+            done, mended = _as_it_is(path, begun), Changes(path, head.size, ())
+        return _with_view(done, mended, say)
+    finally:
+        if lock is not None:
+            lock.release()
+
+
+def _checked(path: Path) -> Superblock:
+    head = superblock(path)
+    if head is None or not head.intact:
+        raise DataError(f"{path} is no HDF5 file that this program wrote. Nothing was changed.")
     if head.open_for_writing and (age := time.time() - path.stat().st_mtime) < QUIET:
         raise DataError(
             f"{path} changed {max(age, 0):.0f} s ago and is marked as being written. If its writer is dead, try again "
@@ -101,33 +113,133 @@ def _checked(path: Path) -> Superblock:
     return head
 
 
+def _finished(path: Path) -> bool:
+    with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
+        _require_ours(path, file)
+        return bool(file[layout.FINISHED][()])
+
+
+def _as_it_is(path: Path, changed: bool) -> Recovered:
+    with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
+        return Recovered(path, changed, int(file[layout.COMMITTED][()]), 0, _views_missing(file) if changed else None)
+
+
+def _with_view(done: Recovered, mended: Changes, say: Callable[[str], None]) -> Recovered:
+    """Carry it out with the /exchange view; without it where the disk takes only that."""
+    with hdf5.readable(done.path), h5py.File(Overlay(done.path, mended.ranges), "r") as file:
+        if has_exchange_view(file):
+            _announce(mended, say)
+            mended.carry_out()
+            return done
+    try:
+        whole = with_exchange_view(done.path, mended.ranges)
+        _announce(whole, say)
+        whole.carry_out()
+    except DataError as error:
+        if journal.pending(done.path) is not None:
+            raise
+        mended.carry_out()
+        return replace(done, remark=f"It has no /exchange view: {error}")
+    return replace(done, changed=True)
+
+
+def _announce(changes: Changes, say: Callable[[str], None]) -> None:
+    if changes.ranges:
+        free = shutil.disk_usage(changes.path.parent).free
+        say(f"{changes.path}: to recover it takes {size(changes.room)} on its disk, {size(free)} are free.")
+
+
 def _require_ours(path: Path, file: h5py.File) -> None:
     if layout.COMMITTED not in file:
         raise DataError(f"{path} is no scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
 
 
-def _finished(path: Path, file: h5py.File) -> Recovered:
-    frames, written = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
-    for name in (layout.DATA, layout.PREVIEW, *layout.GROWING):
+def _mended(path: Path, head: Superblock) -> tuple[Recovered, Changes]:
+    """What becomes of it, and what has to change for that."""
+    end = max(head.end, head.size) if head.open_for_writing else head.end
+    overlay = Overlay(path, length=end)
+    overlay.put(0, head.closed(end).head)
+    try:
+        with h5py.File(overlay, "r") as file:
+            _require_ours(path, file)
+            _read(file)
+        with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:
+            committed, written = int(file[layout.COMMITTED][()]), len(file[layout.DATA])
+            frames = _cut(file, committed, head.size)
+        overlay.seek(0)
+        made = replace(head, head=overlay.read(SIZE))
+        if made.missing:  # all that is left lies before, or the next lines would not read it
+            overlay.put(0, made.closed(head.size).head)
+            overlay.truncate(head.size)
+        with h5py.File(overlay, "r") as file:
+            _read(file)
+            lost, dropped = tuple(range(frames, committed)), max(0, written - committed)
+            done = Recovered(path, True, frames, dropped, _views_missing(file), lost, _damaged(file))
+    except hdf5.ALTERED as error:
+        raise DataError(
+            f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
+        ) from error
+    return done, overlay.changes()
+
+
+def _read(file: h5py.File) -> None:
+    """All that is in the file but its pixels: what HDF5 raises then is raised now."""
+    names: list[str] = []
+    file.visit(names.append)
+    for item in (file[name] for name in names):
+        dict(item.attrs)
+        if isinstance(item, h5py.Dataset) and not item.is_virtual and item.name not in (layout.DATA, layout.PREVIEW):
+            item[()]
+
+
+def _cut(file: h5py.File, committed: int, there: int) -> int:
+    """End the file as a writer does, with the frames that are committed and on the disk; how many these are."""
+    growing = (layout.DATA, layout.PREVIEW, *layout.GROWING)
+    frames = min(committed, *(_rows_within(file[name], there) for name in growing))
+    for name in growing:
         if len(file[name]) != frames:
             file[name].resize(frames, 0)
-    if not file[layout.FINISHED][()]:
-        if hdf5.text(file[layout.STATUS][()]) == "running":
-            file[layout.STATUS][()] = b"failed"
-        file[layout.FINISHED][()] = 1
-    for name in ("exchange", "implements"):  # where the writer died in these
-        with suppress(KeyError):
-            del file[name]
-    layout.settle(file)
-    add_exchange_view(file)
-    return Recovered(path, True, frames, max(0, written - frames), _views_missing(file))
+    if frames < committed or hdf5.text(file[layout.STATUS][()]) == "running":
+        file[layout.STATUS][()] = b"failed"
+    file[layout.COMMITTED][()], file[layout.FINISHED][()] = frames, 1
+    times = file[layout.TIME][()]
+    if layout.END_TIME in file and not file[layout.END_TIME][()] and np.isfinite(times).any():
+        file[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
+    layout.state_field_of_view(file, layout.view_angles(file), create=False)
+    return frames
+
+
+def _rows_within(item: h5py.Dataset, there: int) -> int:
+    """Rows before the first that is not within so many bytes of the file."""
+    if item.chunks is None:
+        return len(item)
+    chunks = set[int]()
+
+    def note(chunk: h5py.h5d.StoreInfo) -> None:
+        if chunk.byte_offset + chunk.size <= there:
+            chunks.add(chunk.chunk_offset[0] // item.chunks[0])
+
+    item.id.chunk_iter(note)
+    n = next(i for i in range(len(chunks) + 1) if i not in chunks)
+    return min(len(item), n * int(item.chunks[0]))
+
+
+def _damaged(file: h5py.File) -> tuple[int, ...]:
+    """Of the last frames, those that differ from their checksum."""
+    data, checksums = file[layout.DATA], file["/entry/digest/checksum"][()]
+    first = max(0, len(data) - COMPARED // max(1, data.id.get_storage_size() // max(1, len(data))))
+    image, found = np.empty((1, *data.shape[1:]), data.dtype), []
+    for row in range(first, len(data)):
+        try:
+            hdf5.read_frames(data, np.array([row]), slice(None), image)
+            whole = has_checksum(image[0], int(checksums[row]))
+        except DataError:
+            whole = False
+        if not whole:
+            found.append(row)
+    return tuple(found)
 
 
 def _views_missing(file: h5py.File) -> int | None:
     planned = views_planned(file)
     return None if planned is None else planned - len(views_in(file))
-
-
-def _write_head(path: Path, head: Superblock) -> None:
-    with path.open("r+b") as file:
-        file.write(head.head[:SIZE])

@@ -35,18 +35,23 @@ class Superblock:
     @property
     def missing(self) -> int:
         """Bytes that the file has less than its head says."""
-        return max(0, int.from_bytes(self.head[_END], "little") - self.size)
+        return max(0, self.end - self.size)
 
     @property
     def intact(self) -> bool:
         """Its checksum is right."""
         return self.head[_CHECKSUM] == _checksum(self.head[: _CHECKSUM.start])
 
-    def closed(self) -> Superblock:
-        """The head of the same file as if it had been closed; all its bytes belong to it."""
+    @property
+    def end(self) -> int:
+        """Bytes that the file has, as its head says."""
+        return int.from_bytes(self.head[_END], "little")
+
+    def closed(self, end: int) -> Superblock:
+        """The head of the same file as if it had been closed with so many bytes."""
         head = bytearray(self.head)
         head[_FLAGS] = 0
-        head[_END] = max(self.size, int.from_bytes(self.head[_END], "little")).to_bytes(8, "little")
+        head[_END] = end.to_bytes(8, "little")
         head[_CHECKSUM] = _checksum(bytes(head[: _CHECKSUM.start]))
         return replace(self, head=bytes(head))
 

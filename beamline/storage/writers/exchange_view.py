@@ -6,10 +6,17 @@ data", J. Synchrotron Rad. 21, 1224: data, data_white, data_dark [frame, row, co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.journal import Change, Changes
+from beamline.storage.overlay import Overlay
 from beamline.storage.writers import layout
 from drivers.frame import FrameKind
 
@@ -26,18 +33,10 @@ def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
 
 
 def add_exchange_view(file: h5py.File) -> None:
-    """Add /exchange for the rows that exist. Kinds without a frame get no dataset, and neither do invalid frames."""
-    source = file[layout.DATA]
-    kinds = file[layout.KIND][()]
-    angles = file[layout.ANGLE][()]
-    n = int(file[layout.COMMITTED][()])
-    file["implements"] = "exchange"
-    group = file.create_group("exchange")
+    """Fill /exchange with the rows that exist. Kinds without a frame get no dataset, and neither do invalid frames."""
+    source, angles, group = file[layout.DATA], file[layout.ANGLE][()], file.require_group(layout.EXCHANGE)
     units = file["/entry/record/quantity"].asstr()[()]
-    for kind, name in NAMES.items():
-        rows = np.flatnonzero(kinds[:n] == kind)
-        if rows.size == 0:
-            continue
+    for name, rows in _rows(file).items():
         virtual = h5py.VirtualLayout((rows.size, *source.shape[1:]), source.dtype)
         filled = 0
         for first, last in runs(rows):
@@ -48,3 +47,32 @@ def add_exchange_view(file: h5py.File) -> None:
         dataset.attrs["units"] = units
         theta = group.create_dataset(THETA[name], data=angles[rows])
         theta.attrs["units"] = "deg"
+
+
+def has_exchange_view(file: h5py.File) -> bool:
+    """Nothing is missing in /exchange."""
+    return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
+
+
+def with_exchange_view(path: Path, changes: Sequence[Change] = ()) -> Changes:
+    """What has to change in a closed file of a scan, beside other changes, for its /exchange view.
+
+    That is the group, which frames do not hang on, and the head; all else is added at the end.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        overlay = Overlay(path, changes)
+        with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:
+            add_exchange_view(file)
+        return overlay.changes()
+    except hdf5.ALTERED as error:
+        raise DataError(f"{path} does not take the view ({hdf5.reason(error)}). Nothing was changed.") from error
+
+
+def _rows(file: h5py.File) -> dict[str, NDArray[np.intp]]:
+    """Rows of each dataset of the view."""
+    kinds = file[layout.KIND][: int(file[layout.COMMITTED][()])]
+    rows = {name: np.flatnonzero(kinds == kind) for kind, name in NAMES.items()}
+    return {name: found for name, found in rows.items() if found.size}

@@ -13,7 +13,7 @@
       record/part_starts        of a scan in parts: the first row of each (see storage.parts)
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
       progress                  frames_committed, finished, status, missing_triggers
-    /exchange                   the same frames as Data Exchange (virtual datasets, added at the end)
+    /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
 image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind. image_key_control (a link to it),
 field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo, without which its
@@ -23,6 +23,7 @@ Float frames are no NXtomo (its data are NX_INT): they get the same paths under 
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -37,7 +38,6 @@ from numpy.typing import NDArray
 from beamline.core.version import version
 from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
-from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -65,6 +65,7 @@ FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 PART_STARTS = "/entry/record/part_starts"
+EXCHANGE = "/exchange"
 END_TIME = "/entry/end_time"
 BEAM = "/entry/record/beam"
 AXIS_COL = "/entry/record/axis_col"
@@ -73,6 +74,7 @@ SOURCE_DISTANCE = "/entry/record/source_distance"
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
+FULL = "Full"
 _TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
 
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
@@ -182,6 +184,8 @@ def create(
         ("/entry/progress", "NXcollection"),
     ):
         file.create_group(path).attrs["NX_class"] = kind
+    file.create_group(EXCHANGE)
+    file["implements"] = "exchange"
     file.attrs["default"] = "entry"
     file[ENTRY].attrs["default"] = "data"
 
@@ -189,7 +193,7 @@ def create(
     file["/entry/title"] = info.title or info.sample
     if start is not None:
         file["/entry/start_time"] = iso_time(start)
-        _rewritable_text(file, END_TIME, "", 40)
+        _rewritable_text(file, END_TIME, "", len(iso_time(start)))
     file["/entry/sample/name"] = info.sample
     file["/entry/instrument/source/probe"] = "x-ray"
     # NXsource counts distances along the beam, from the sample.
@@ -240,7 +244,11 @@ def create(
             file[f"{BEAM}/{name}"].attrs["units"] = unit
         file[f"{BEAM}/time"].attrs["description"] = "since 1970-01-01T00:00:00Z"
     _nxdata(file, rows, cols, info.pixel_size_mm)
-    _declare_for_esrf(file)
+    file[ENTRY].attrs["definition"], file[ENTRY].attrs["version"] = definition, ESRF_VERSION
+    file[IMAGE_KEY_CONTROL] = file[KIND]
+    field = _field_of_view(_planned_angles(info), frame_shape, info.axis_col)
+    if field or info.axis_col is not None:  # what is taken will say it; nothing can be created then
+        _rewritable_text(file, FIELD_OF_VIEW, field or FULL, len(FULL))
 
     file[COMMITTED] = np.int64(0)
     file[FINISHED] = np.int8(0)
@@ -322,53 +330,40 @@ class Rows:
             dataset.id.set_extent((n, *shape[1:]))
 
 
-def settle(file: h5py.File) -> None:
-    """Once SWMR writing is over: what strict validators want otherwise than a growing file can have it."""
-    if END_TIME in file:
-        end = _end_time(file)
-        del file[END_TIME]
-        file[END_TIME] = end
-    _declare_for_esrf(file)
-    field = _field_of_view(file)
-    if FIELD_OF_VIEW in file:
-        del file[FIELD_OF_VIEW]
-    if field:
-        file[FIELD_OF_VIEW] = field
+def state_field_of_view(file: h5py.File, angles: NDArray[np.float64], create: bool = True) -> None:
+    """Say whether a full turn sees half of the sample at a time, as far as angles (radians, of all views) tell.
+
+    Args:
+        create: also where `create` did not foresee it, which a growing file does not allow.
+    """
+    axis_col = float(file[AXIS_COL][()]) if AXIS_COL in file else None
+    field = _field_of_view(angles, file[DATA].shape[1:], axis_col)
+    if field and FIELD_OF_VIEW in file:
+        file[FIELD_OF_VIEW][()] = field.encode()
+    elif field and create:
+        _rewritable_text(file, FIELD_OF_VIEW, field, len(FULL))
 
 
-def _declare_for_esrf(file: h5py.File) -> None:
-    """What ESRF's programs know an NXtomo by, also in a file of an earlier version."""
-    entry = file[ENTRY]
-    entry.attrs["definition"] = hdf5.text(file["/entry/definition"][()])
-    entry.attrs["version"] = ESRF_VERSION
-    if IMAGE_KEY_CONTROL in file:
-        del file[IMAGE_KEY_CONTROL]
-    file[IMAGE_KEY_CONTROL] = file[KIND]
+def view_angles(file: h5py.File) -> NDArray[np.float64]:
+    """Of the projections, in radians."""
+    return np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
 
 
-def _field_of_view(file: h5py.File) -> str:
+def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
+    """Of the views that are planned, in radians; one that is not known where the plan does not say them."""
+    return np.radians(np.asarray(json.loads(info.plan).get("angles_deg", [np.nan]), np.float64))
+
+
+def _field_of_view(angles: NDArray[np.float64], frame_shape: tuple[int, ...], axis_col: float | None) -> str:
     """`Half` where a full turn sees half of the sample at a time; "" where angles or the axis are not known."""
-    angles = np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
     if not np.isfinite(angles).all():
         return ""
     if angles.size < 2 or np.ptp(angles) * angles.size / (angles.size - 1) < 2 * np.pi - _TURN_TOLERANCE:
-        return "Full"
-    if AXIS_COL not in file:
+        return FULL
+    if axis_col is None:
         return ""
-    geometry = Geometry.parallel(angles, file[DATA].shape[1:], axis_col=float(file[AXIS_COL][()]))
-    return "Half" if geometry.is_off_middle else "Full"
-
-
-def _end_time(file: h5py.File) -> str:
-    """As it was written; the time of the last frame where a writer died while `settle` wrote it anew."""
-    try:
-        end = str(file[END_TIME].asstr()[()])
-        if end:
-            datetime.fromisoformat(end)
-    except (ValueError, OSError, RuntimeError):
-        times = file[TIME][()]
-        return iso_time(float(times.max())) if times.size else ""
-    return end
+    geometry = Geometry.parallel(angles, (frame_shape[0], frame_shape[1]), axis_col=axis_col)
+    return "Half" if geometry.is_off_middle else FULL
 
 
 def _rewritable_text(file: h5py.File, path: str, value: str, width: int) -> None:

@@ -26,9 +26,9 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import mark_of
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
-from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.exchange_view import with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
-from beamline.storage.writers.to_disk import ToDisk, to_disk
+from beamline.storage.writers.to_disk import ToDisk
 from drivers.clock import Clock
 from drivers.frame import Frame
 from drivers.protocols import BeamReading
@@ -37,7 +37,6 @@ __all__ = ["NXtomoWriter", "ScanInfo"]
 
 STATUSES = ("complete", "stopped", "failed")
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
-VIEW_ROOM = 10_000_000  # bytes that must be free: more than the /exchange view ever takes
 
 
 class NXtomoWriter:
@@ -183,6 +182,7 @@ class NXtomoWriter:
                 self._let_go()
                 return
             self._finish(status, np.asarray(missing, np.int64), beam)
+            self._put_exchange_view()
         except FAILURES as error:
             if not self._broken:
                 self._broken = True
@@ -191,7 +191,6 @@ class NXtomoWriter:
             raise self._disk_error("be finished", error) from error
         finally:
             self._lock.release()
-        self._add_exchange_view()
 
     def __enter__(self) -> Self:
         return self
@@ -209,6 +208,7 @@ class NXtomoWriter:
             self._file[path].resize(values.size, 0)
             self._file[path][...] = values
         self._file[layout.END_TIME][()] = layout.iso_time(self._clock.now()).encode()
+        layout.state_field_of_view(self._file, layout.view_angles(self._file), create=False)
         self._file[layout.STATUS][()] = status.encode()
         self._file.flush()
         self._file[layout.FINISHED][()] = 1
@@ -244,29 +244,15 @@ class NXtomoWriter:
         free = shutil.disk_usage(self.path.parent).free
         return DataError(
             f"{self.path} could not {what} ({hdf5.reason(error)}); {size(free)} are free on its disk. "
-            f"The first {self.safe} frames are safe in it and can be read."
+            f"The first {self.safe} frames are safe in it: `beamline recover` makes an ordinary file of them."
         )
 
-    def _add_exchange_view(self) -> None:
-        # Groups cannot be made under SWMR, so this needs the file once more, and must not fail half-way: that would
-        # leave it marked as open for writing. A foreign reader may hold a lock on it; our own followers hold none.
-        free = shutil.disk_usage(self.path.parent).free
-        if free < VIEW_ROOM:
-            self._remark_no_view(f"only {size(free)} are free on its disk")
-            return
+    def _put_exchange_view(self) -> None:
+        """The only thing that SWMR writing cannot do, since it creates datasets: the frames do not hang on it."""
         try:
-            file = h5py.File(self.path, "r+", libver=layout.LIBVER)
-        except OSError as error:
-            held = "another program holds it open: " if isinstance(error, BlockingIOError | PermissionError) else ""
-            self._remark_no_view(held + hdf5.reason(error))
-            return
-        with file:
-            layout.settle(file)
-            add_exchange_view(file)
-            file.flush()
-            to_disk(file.id.get_vfd_handle())
-
-    def _remark_no_view(self, why: str) -> None:
-        self.remarks.append(
-            f"{self.path} has no /exchange view ({why}). Its {self._committed} frames are safe in /entry."
-        )
+            with_exchange_view(self.path).carry_out()
+        except DataError as error:
+            self.remarks.append(
+                f"{self.path} has no /exchange view: {error} Its {self._committed} frames are safe in /entry; "
+                "`beamline recover` adds the view."
+            )

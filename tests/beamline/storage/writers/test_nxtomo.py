@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import gc
+import json
+import re
 import shutil
 import subprocess
 import sys
@@ -175,27 +177,33 @@ def test_an_alignment_frame_is_a_projection_to_those_who_do_not_know_it(write: W
         assert source.image_key[14] == FrameKind.ALIGNMENT
 
 
+@pytest.mark.parametrize("planned", [True, False])
 @pytest.mark.parametrize(
     ("turn", "axis", "field"),
-    [(180.0, None, b"Full"), (360.0, 7.5, b"Full"), (360.0, 11.0, b"Half"), (360.0, None, None), (np.nan, 7.5, None)],
+    [(180.0, None, b"Full"), (360.0, 7.5, b"Full"), (360.0, 11.0, b"Half"), (360.0, None, None)],
 )
 def test_what_the_programs_of_esrf_know_an_nxtomo_by(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], turn: float, axis: float | None, field: bytes | None
-) -> None:
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], turn: float, axis: float | None, field: bytes | None,
+    planned: bool,
+) -> None:  # fmt: skip
+    """While the file grows, too. A plan without angles and an axis that is not known leave the field of view out."""
     path, views = tmp_path / "s.h5", frames[5:]
-    with NXtomoWriter(path, replace(INFO, axis_col=axis), SHAPE, clock=clock) as writer:
+    angles = turn * np.arange(len(views)) / len(views)
+    plan = json.dumps({"angles_deg": angles.tolist()} if planned else {})
+    with NXtomoWriter(path, replace(INFO, axis_col=axis, plan=plan), SHAPE, clock=clock) as writer:
         for i, frame in enumerate(views):
-            turned = replace(frame, index=i, angle=np.radians(turn) * i / len(views))
-            writer.append(turned, digest(frame.counts))
-        writer.flush()
-        assert h5py.File(path, "r", swmr=True)["entry"].attrs["definition"] == "NXtomo"  # while it grows, too
-    for _ in range(2):  # settled again, as `recover` does it, a file has the same
-        with h5py.File(path, "r+", libver=layout.LIBVER) as file:
-            detector, entry = file["entry/instrument/detector"], file["entry"]
-            assert (entry.attrs["definition"], entry.attrs["version"]) == ("NXtomo", 1.5)
-            assert detector["image_key_control"] == file["entry/frame_log/kind"]
-            assert (detector["field_of_view"][()] if "field_of_view" in detector else None) == field
-            layout.settle(file)
+            writer.append(replace(frame, index=i, angle=np.radians(angles[i])), digest(frame.counts))
+        for swmr in (True, False):
+            with h5py.File(path, "r", swmr=swmr) as file:
+                detector, entry = file["entry/instrument/detector"], file["entry"]
+                assert (entry.attrs["definition"], entry.attrs["version"]) == ("NXtomo", 1.5)
+                assert detector["image_key_control"] == file["entry/frame_log/kind"]
+                if planned or not swmr:
+                    known = planned or axis is not None
+                    assert (detector["field_of_view"][()] if "field_of_view" in detector else None) == (
+                        field if known else None
+                    )
+            writer.close()
 
 
 def test_an_exception_inside_leaves_a_failed_but_readable_file(
@@ -347,13 +355,39 @@ def test_no_view_is_begun_where_there_is_no_room_for_it(
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     writer.append(frames[0], digest(frames[0].counts))
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000))
     writer.close()
     assert len(writer.remarks) == 1
-    assert "no /exchange view (only 5 MB are free on its disk). Its 1 frames are safe" in writer.remarks[0]
+    assert "no /exchange view: " in writer.remarks[0]
+    assert re.search(r"needs \S+ kB on its disk to be changed, 5 kB are free.*1 frames are safe", writer.remarks[0])
     with h5py.File(tmp_path / "s.h5") as file:
-        assert "exchange" not in file
+        assert list(file["exchange"]) == []
         assert file[layout.STATUS][()] == b"complete"
+
+
+def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    """The /exchange view comes to an ordinary file: but for the head and the group, it only makes it longer."""
+    before, changed = [b""], tmp_path / "s.h5"
+    writer = NXtomoWriter(changed, INFO, SHAPE, clock=clock)
+    for frame in frames:
+        writer.append(frame, digest(frame.counts))
+    put = writer._put_exchange_view
+
+    def look_first() -> None:
+        with h5py.File(changed) as file:  # closed, in order, for any program
+            assert len(file[layout.DATA]) == len(frames)
+        before[0] = changed.read_bytes()
+        put()
+
+    writer._put_exchange_view = look_first  # type: ignore[method-assign]
+    writer.close()
+    after = changed.read_bytes()
+    with h5py.File(changed) as file:
+        group = h5py.h5o.get_info(file["exchange"].id).addr
+    differ = [i for i, (old, new) in enumerate(zip(before[0], after, strict=False)) if old != new]
+    assert differ and all(i < 48 or group <= i < group + 160 for i in differ)
 
 
 def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
@@ -386,7 +420,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
             writer.append(frame, digest(frame.counts))
             assert begun.wait(5.0)
     assert [rows for _, rows in calls[:14]] == list(range(1, 15))
-    assert calls[-2] == (handle, 14)  # before the file is closed, and then with the /exchange view
+    assert (handle, 14) in calls[14:]  # before the file is closed; then come the /exchange view and its journal
 
 
 def test_a_disk_that_did_not_take_what_was_flushed_is_told(

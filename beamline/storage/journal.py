@@ -1,0 +1,199 @@
+"""A journal: changes to a file in its place happen whole, whatever is killed or fails meanwhile.
+
+They are written beside the file first, then to it. Where a journal lies beside a file, its changes were begun: `finish`
+ends them, and readers see the file as it shall be. What makes the file longer is written before what changes in it, so
+that a disk without room is found out while the file is as it was; to write on bytes that are there takes no room.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beamline.core.errors import DataError
+from beamline.core.files import whole_file
+from beamline.core.text import size
+from beamline.storage.writers.to_disk import to_disk
+
+_FORMAT = "splatline journal 1"
+_BLOCK = 4096  # bytes, in which disks give room
+
+
+@dataclass(frozen=True)
+class Change:
+    """Bytes of a file from `at` on, old and new; where the file had less, `old` is shorter."""
+
+    at: int
+    old: bytes
+    new: bytes
+
+    def fits(self, now: bytes) -> bool:
+        """The file has the old bytes, the new ones, or was stopped between."""
+        return len(now) == len(self.old) and all(byte in pair for byte, *pair in zip(now, self.old, self.new))  # noqa: B905
+
+
+@dataclass(frozen=True)
+class Changes:
+    """All changes of a file, which has `length` bytes afterwards."""
+
+    path: Path
+    length: int
+    ranges: tuple[Change, ...]
+
+    @property
+    def room(self) -> int:
+        """Bytes that its disk must have free: for the journal, and for what makes the file longer."""
+        longer = max(0, self.length - self.path.stat().st_size)
+        return sum(-(-n // _BLOCK) * _BLOCK for n in (len(_journal(self)), longer))
+
+    def carry_out(self) -> None:
+        """Change the file, by a journal.
+
+        Raises:
+            DataError: its disk has no room or does not take it; it says whether the file is as it was.
+        """
+        if not self.ranges:
+            return
+        journal = journal_of(self.path)
+        try:
+            room, free = self.room, shutil.disk_usage(self.path.parent).free
+            if free < room:
+                raise DataError(
+                    f"{self.path} needs {size(room)} on its disk to be changed, {size(free)} are free. Nothing was "
+                    "changed."
+                )
+            with whole_file(journal, replace=True) as partial, partial.open("xb") as file:
+                file.write(_journal(self))
+                file.flush()
+                to_disk(file.fileno())
+            _folder_to_disk(journal.parent)
+        except OSError as error:
+            with suppress(OSError):
+                journal.unlink(missing_ok=True)
+            raise DataError(f"{journal} cannot be written ({_why(error)}). {self.path} is as it was.") from error
+        _apply(self, journal)
+
+
+def journal_of(path: Path) -> Path:
+    """Where the journal of a file lies while it is changed."""
+    path = path.resolve()
+    return path.with_name(f"{path.name}.journal")
+
+
+def pending(path: Path) -> Changes | None:
+    """The changes of a file that were begun and not ended; None: there are none.
+
+    Raises:
+        DataError: their journal is damaged, or of another file.
+    """
+    journal = journal_of(path)
+    try:
+        changes = _changes(path, journal.read_bytes())
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise DataError(f"{journal} cannot be read ({_why(error)}), and {path} is not whole without it.") from error
+    if changes is None or not all(change.fits(now) for change, now in _now(changes)):
+        raise DataError(
+            f"{journal} is damaged, or of another file than {path}. If that is so, move it away; else {path} is not "
+            "whole without it. Nothing was changed."
+        )
+    return changes
+
+
+def finish(path: Path) -> bool:
+    """End the changes of a file that were begun; whether there were any.
+
+    Raises:
+        DataError: their journal cannot be read, or the disk does not take them.
+    """
+    journal = journal_of(path)
+    if (changes := pending(path)) is not None:
+        _apply(changes, journal)
+    for left in journal.parent.glob(f".{journal.name}.*.partial"):  # of a program that was killed while it wrote it
+        with suppress(OSError):
+            left.unlink()
+    return changes is not None
+
+
+def _apply(changes: Changes, journal: Path) -> None:
+    path, longer = changes.path, False
+    try:
+        with path.open("r+b", buffering=0) as file:
+            for change in changes.ranges:
+                _put(file, change.at + len(change.old), change.new[len(change.old) :])
+            if path.stat().st_size < changes.length:
+                file.truncate(changes.length)
+            to_disk(file.fileno())
+            longer = True
+            for change in changes.ranges:
+                _put(file, change.at, change.new[: len(change.old)])
+            to_disk(file.fileno())
+    except OSError as error:
+        if longer or any(change.old != now for change, now in _now(changes)):
+            raise DataError(
+                f"{path} is changed in part only: its disk does not take the rest ({_why(error)}). {journal.name} "
+                "beside it keeps that, and what reads the file here sees it whole. Mend the disk or make room, then "
+                "run `beamline recover` on it again."
+            ) from error
+        with suppress(OSError):
+            journal.unlink()
+        raise DataError(f"{path} cannot be made longer ({_why(error)}). What was in it is as it was.") from error
+    with suppress(OSError):  # then it says what the file holds already
+        journal.unlink()
+
+
+def _now(changes: Changes) -> list[tuple[Change, bytes]]:
+    """What the file has in place of the old bytes."""
+    with changes.path.open("rb", buffering=0) as file:
+        return [(change, _get(file, change.at, len(change.old))) for change in changes.ranges]
+
+
+def _journal(changes: Changes) -> bytes:
+    ranges = [(change.at, len(change.old), len(change.new)) for change in changes.ranges]
+    head = json.dumps({"length": changes.length, "ranges": ranges}).encode()
+    content = b"".join((head, b"\n", *(change.old + change.new for change in changes.ranges)))
+    return f"{_FORMAT} {hashlib.sha256(content).hexdigest()}\n".encode() + content
+
+
+def _changes(path: Path, journal: bytes) -> Changes | None:
+    first, _, content = journal.partition(b"\n")
+    if first != f"{_FORMAT} {hashlib.sha256(content).hexdigest()}".encode():
+        return None
+    head, _, data = content.partition(b"\n")
+    said, ranges = json.loads(head), []
+    for at, n_old, n_new in said["ranges"]:
+        ranges.append(Change(at, data[:n_old], data[n_old : n_old + n_new]))
+        data = data[n_old + n_new :]
+    return Changes(path, said["length"], tuple(ranges))
+
+
+def _get(file: Any, at: int, n: int) -> bytes:
+    file.seek(at)
+    return bytes(file.read(n))
+
+
+def _put(file: Any, at: int, data: bytes) -> None:
+    file.seek(at)
+    while data:
+        data = data[file.write(data) :]
+
+
+def _folder_to_disk(folder: Path) -> None:
+    """The names in it; Windows has no such call."""
+    if os.name == "posix":
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            to_disk(handle)
+        finally:
+            os.close(handle)
+
+
+def _why(error: Exception) -> str:
+    return (isinstance(error, OSError) and error.strerror) or str(error)

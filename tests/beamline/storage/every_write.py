@@ -1,0 +1,230 @@
+"""A program for test_every_write.py: it writes and recovers scans, each time with another write that fails or kills.
+
+It is started under the library of tests/faulty_disk.py, forks once for each fault, and prints a JSON object a line.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import shutil
+import signal
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.monitor.digest import digest
+from beamline.storage import hdf5
+from beamline.storage.describe import describe
+from beamline.storage.parts import views_in
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recover import QUIET, recover
+from beamline.storage.rules.validate import validate
+from beamline.storage.writers import layout
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.clock import SystemClock
+from tests.beamline.storage.conftest import INFO, SHAPE, scan_frames
+
+LAST = 100
+FRAMES = scan_frames(np.random.default_rng(5), 2, 3, 15)
+DIGESTS = [digest(frame.counts) for frame in FRAMES]
+_DISK = ctypes.CDLL(os.environ["LD_PRELOAD"])
+_DISK.faulty_disk_count.restype = ctypes.c_long
+_DISK.faulty_disk_arm.argtypes = [ctypes.c_long] * 3 + [ctypes.c_int] * 2
+
+Fault = tuple[int, int, int, int, int]  # kill at, fail from, fail at, errno, torn
+NONE: Fault = (0, 0, 0, 0, 0)
+
+
+class Rig:
+    """A folder with the scan, and a child process for each thing that is done to it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.scan, self._note, self._said = folder / "w" / "scan.h5", folder / "note", folder / "said"
+
+    def fresh(self, *kept: Path) -> None:
+        """Nothing is there but these files, by their names."""
+        shutil.rmtree(self.scan.parent, ignore_errors=True)
+        self.scan.parent.mkdir()
+        for path in kept:
+            shutil.copy(path, self.scan.parent)
+
+    def do(
+        self, what: Callable[[], Any], fault: Fault = NONE, limit: int | None = None, fast: bool = False
+    ) -> dict[str, Any]:
+        """In a child: what it returned or raised, its exit, its messages, and how many writes it made."""
+        self._note.unlink(missing_ok=True)
+        child = os.fork()
+        if not child:
+            messages = os.open(self._said, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+            os.dup2(messages, 2)
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            _DISK.faulty_disk_arm(*fault)
+            try:
+                said = {"value": what()}
+            except DataError as error:
+                said = {"refused": str(error)}
+            except BaseException:
+                said = {"traceback": traceback.format_exc()}
+            said["writes"] = _DISK.faulty_disk_count()
+            self._note.write_text(json.dumps(said))
+            if fast:
+                os._exit(0)
+            sys.exit()  # as a program ends: HDF5 closes what is open
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        said = json.loads(self._note.read_text()) if self._note.exists() else {}
+        return {"value": None} | said | {"exit": code, "stderr": self._said.read_text()[-2000:]}
+
+    def aged(self) -> None:
+        """As if nothing had happened to the scan for a while."""
+        when = self.scan.stat().st_mtime - 2 * QUIET
+        os.utime(self.scan, (when, when))
+
+    def judged(self) -> dict[str, Any]:
+        """What each command makes of the scan: frames, or why it refuses."""
+        self.aged()
+        done = self.do(self.commands, fast=True)
+        left = sorted(path.name for path in self.scan.parent.iterdir())
+        return (done["value"] or {"info": _short(done), "resume": "", "recover": "", "after": "", "again": ""}) | {
+            "left": left
+        }
+
+    def commands(self) -> dict[str, Any]:
+        """What each gives, or why it refuses."""
+        found: dict[str, Any] = {}
+        for name, command in (
+            ("info", self.info),
+            ("resume", self.resume),
+            ("recover", lambda: recover(self.scan).frames),
+            ("after", self.after),
+            ("again", lambda: recover(self.scan).changed),
+        ):
+            try:
+                found[name] = command()
+            except DataError as error:
+                found[name] = str(error)
+            except Exception:
+                found[name] = traceback.format_exc()
+        return found
+
+    def info(self) -> int:
+        return int(describe(SourceOptions(self.scan))["frames"])
+
+    def resume(self) -> int:
+        with hdf5.open_hdf5(self.scan) as file:
+            views_in(file)
+            return int(file[layout.COMMITTED][()])
+
+    def after(self) -> list[int]:
+        """Frames of an ordinary file, all as they were given; views in its /exchange view."""
+        with h5py.File(self.scan) as file:
+            views = len(file["exchange/data"]) if "exchange/data" in file else 0
+        with open_scan(self.scan) as source:
+            n = int(source.image_key.size)
+            assert source.finished
+            assert all((source.read([i])[0] == FRAMES[i].counts).all() for i in range(n))
+            assert views in (0, sum(source.image_key == 0))
+        assert not [found for found in validate(self.scan) if found.severity == "error"]
+        return [n, views]
+
+    def write(self) -> list[int]:
+        """A whole scan: its writes before the end, and the remarks."""
+        writer = NXtomoWriter(self.scan, INFO, SHAPE, clock=SystemClock())
+        committed = self._note.with_name("committed")
+        with committed.open("w") as note:
+            for frame, about in zip(FRAMES, DIGESTS, strict=True):
+                try:
+                    writer.append(frame, about)
+                except DataError:
+                    writer.close("failed")
+                    raise
+                note.write(f"{writer.committed}\n")
+                note.flush()
+        before = _DISK.faulty_disk_count()
+        writer.close()
+        return [before, len(writer.remarks)]
+
+    def committed(self) -> int:
+        """Frames that the last `write` knew to be safe."""
+        said = self._note.with_name("committed").read_text().split()
+        return int(said[-1]) if said else 0
+
+    def died(self) -> Path:
+        """A scan whose writer was killed with rows that are not committed, to begin from."""
+        self.fresh()
+
+        def write() -> None:
+            writer = NXtomoWriter(self.scan, INFO, SHAPE, clock=SystemClock(), flush_every=10)
+            for frame, about in zip(FRAMES, DIGESTS, strict=True):
+                writer.append(frame, about)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        self.do(write)
+        kept = self._note.with_name("scan.h5")
+        shutil.copy(self.scan, kept)
+        return kept
+
+
+def _short(said: dict[str, Any]) -> Any:
+    """The value, or what went wrong in a line."""
+    if said["exit"]:
+        return f"exit {said['exit']}"
+    return said.get("refused") or said.get("traceback") or said["value"]
+
+
+def close(rig: Rig, fault: Callable[[int], Fault]) -> None:
+    rig.fresh()
+    whole = rig.do(rig.write)
+    total = whole["writes"]
+    for n in range(total - LAST + 1, total + 1):
+        rig.fresh()
+        done = rig.do(rig.write, fault(n))
+        said(n, total, done, rig.judged() | {"committed": rig.committed(), "closing": n > whole["value"][0]})
+
+
+def recovering(rig: Rig, fault: Callable[[int], Fault]) -> None:
+    kept = rig.died()
+    rig.aged()
+    total = rig.do(lambda: recover(rig.scan).frames)["writes"]
+    for n in range(1, total + 1):
+        rig.fresh(kept)
+        rig.aged()
+        done = rig.do(lambda: recover(rig.scan).frames, fault(n))
+        said(n, total, done, rig.judged() | {"committed": 10 * (len(FRAMES) // 10)})
+
+
+def cut(rig: Rig, fault: Callable[[int], Fault]) -> None:
+    """The file system takes no file longer than a limit; `recover` under the same limit, and without."""
+    del fault
+    rig.fresh()
+    rig.do(rig.write)
+    size = rig.scan.stat().st_size
+    for limit in range(40_000, size, (size - 40_000) // 40):
+        for bound in (limit, None):
+            rig.fresh()
+            done = rig.do(rig.write, limit=limit)
+            rig.aged()
+            again = rig.do(lambda: recover(rig.scan).frames, limit=bound)
+            said(limit, size, done, rig.judged() | {"under": _short(again), "committed": rig.committed()})
+
+
+def said(n: int, total: int, done: dict[str, Any], found: dict[str, Any]) -> None:
+    print(json.dumps({"n": n, "of": total, "done": _short(done), "stderr": done["stderr"]} | found), flush=True)
+
+
+if __name__ == "__main__":
+    _case, _kind, _number, _torn = sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
+    _place = {"kill": 0, "from": 1, "at": 2}[_kind]
+    {"close": close, "recover": recovering, "cut": cut}[_case](
+        Rig(Path(sys.argv[1])),
+        lambda n: (*(n if place == _place else 0 for place in range(3)), _number, _torn),  # type: ignore[arg-type]
+    )
