@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import to_disk
 from beamline.core.text import size
 from beamline.monitor.check import Flag
 from beamline.monitor.checks import bitmask
@@ -28,7 +29,7 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.layout import ScanInfo
-from beamline.storage.writers.to_disk import ToDisk, to_disk
+from beamline.storage.writers.to_disk import ToDisk
 from drivers.clock import Clock
 from drivers.frame import Frame
 from drivers.protocols import BeamReading
