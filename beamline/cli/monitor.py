@@ -19,7 +19,7 @@ from beamline.config.monitor import configured_checks
 from beamline.config.references import reference_limits
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Event, fan_out
-from beamline.core.files import refuse_existing, whole_file
+from beamline.core.files import refuse_existing, write_whole
 from beamline.core.text import spans
 from beamline.monitor.aside import Aside
 from beamline.monitor.check import Flag, Level
@@ -107,8 +107,7 @@ def monitor(
                 references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
             again = set(rows_replaced(source).tolist())
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags(found))):
-                with whole_file(sheet) as partial:
-                    partial.write_bytes(contact_sheet(worst))
+                write_whole(sheet, contact_sheet(worst))
         for fault in references:
             sink(Event("warning", clock.now(), {"message": fault}))
         flags = [flag for each in found for flag in each]

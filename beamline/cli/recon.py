@@ -30,7 +30,7 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import LogLines, Terminal, counting, results
 from beamline.core.errors import QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out, while_it_works
-from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.files import named_on_failure, refuse_existing, write_whole
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
 from drivers.clock import Clock, SystemClock
@@ -382,8 +382,7 @@ def _write_recipe(path: Path, text: str) -> None:
     if str(path) == "-":
         click.echo(text, nl=False)
         return
-    with whole_file(path) as partial, named_on_failure(path):
-        partial.write_text(text, encoding="utf-8")
+    write_whole(path, text)
 
 
 @contextmanager

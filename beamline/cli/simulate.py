@@ -16,7 +16,7 @@ from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, Sink, fan_out
-from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.files import refuse_existing, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.text import size
 from beamline.simulate.figure import sheet
@@ -108,8 +108,7 @@ def simulate(
             outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
         if picture and not (written and written.stopped):
             marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
-            with named_on_failure(picture), whole_file(picture) as partial:
-                partial.write_bytes(sheet(scan, marked))
+            write_whole(picture, sheet(scan, marked))
             outputs |= {"picture": picture}
             output("picture", str(picture))
         if written and written.stopped:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
+import sys
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +15,8 @@ from beamline.core.errors import DataError
 
 PART = "part-{}"
 """The folder of a later part of a scan that was resumed, in that of the run."""
+
+_NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
 
 
 def refuse_existing(path: Path) -> None:
@@ -37,32 +42,80 @@ def named_on_failure(path: Path) -> Iterator[None]:
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
 
 
+if sys.platform == "darwin":
+    import fcntl
+
+    def _fsync(handle: int) -> None:
+        os.fsync(handle)  # which does not wait for the cache in the disk
+        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
+
+else:
+
+    def _fsync(handle: int) -> None:
+        os.fsync(handle)
+
+
+def to_disk(handle: int) -> None:
+    """Wait until what was written to an open file is on the disk. OSError where the disk did not take it."""
+    try:
+        _fsync(handle)
+    except OSError as error:
+        if error.errno not in _NO_SUCH_CALL:
+            raise
+
+
+def bring_to_disk(path: Path) -> None:
+    """Wait until a file, or every file in a folder, is on the disk. OSError where the disk did not take it."""
+    for part in path.rglob("*") if path.is_dir() else (path,):
+        if part.is_file():
+            with part.open("r+b") as file:  # Windows wants a file that may be written
+                to_disk(file.fileno())
+
+
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A temporary name beside `path` to write to, a file or a folder. It becomes `path` at the end of the block; an
-    error removes it.
+    """A temporary name beside `path` to write to, a file or a folder. It becomes `path` at the end of the block, when
+    it is on the disk; an error removes it.
 
     Args:
         path: the file to write. Without `replace` it must not exist.
         replace: an existing file is replaced in one step; a reader sees either the old or the new file.
 
     Raises:
-        DataError: `path` exists, or the system does not allow to replace it.
+        DataError: `path` exists, the disk refuses, or the system does not allow to replace it.
     """
     if not replace:
         refuse_existing(path)
     partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         yield partial
+        bring_to_disk(partial)
         if not replace:
             refuse_existing(path)
         try:
             partial.replace(path)
         except OSError as error:  # Windows replaces no file that another program holds open
             raise DataError(f"{path} could not be put in place ({error}); what was there is untouched.") from error
+    except OSError as error:
+        left = "what was there is untouched" if replace else "nothing is left of it"
+        raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk; {left}.") from error
     finally:
         with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk
             remove(partial)
+
+
+def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
+    """Write a file that is in memory as `whole_file` does, and compare what is read back.
+
+    Raises:
+        DataError: as `whole_file`, or the disk holds something else.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    with whole_file(path, replace=replace) as partial:
+        partial.write_bytes(data)
+        bring_to_disk(partial)
+        if partial.read_bytes() != data:
+            raise OSError(errno.EIO, "what is read back is not what was written")
 
 
 def remove(path: Path) -> None:

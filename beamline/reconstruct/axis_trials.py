@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.files import refuse_existing, write_whole
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import check_axis, cone_of, geometry_of, rows_of
 from beamline.reconstruct.options import ReconOptions
@@ -81,8 +81,7 @@ def try_axes(
             trials.append(AxisTrial(col, score, image if i in kept else None))
             listen(i + 1, columns.size)
     picture = axis_sheet(trials, f"{source.path.name}, row {first}")
-    with whole_file(path) as partial, named_on_failure(path):
-        partial.write_bytes(picture)
+    write_whole(path, picture)
     best = min(trials, key=lambda trial: trial.score)
     if best in (trials[0], trials[-1]):
         Warnings(sink, clock)(f"The lowest score is at the end of the range, column {best.col:g}: try further.")

@@ -134,7 +134,7 @@ def _begin(folder: Path, recipe: bytes) -> None:
     if not folder.exists():
         if not folder.parent.is_dir():
             raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
-        with whole_file(folder) as partial, named_on_failure(folder):
+        with whole_file(folder) as partial:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)
             _write(partial, [])
@@ -230,11 +230,7 @@ def _row(record: Mapping[str, str]) -> Row:
 
 def _write(folder: Path, rows: Sequence[Row]) -> None:
     path = folder / TABLE
-    with (
-        whole_file(path, replace=True) as partial,
-        named_on_failure(path),
-        partial.open("w", encoding="utf-8", newline="") as file,
-    ):
+    with whole_file(path, replace=True) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, [column.name for column in fields(Row)])
         table.writeheader()
         table.writerows(asdict(row) for row in rows)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.files import named_on_failure, whole_file
+from beamline.core.files import write_whole
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.live_picture import LivePicture
 from beamline.storage.readers.base import ScanSource
@@ -69,5 +69,4 @@ class Snapshots:
             f"{self._clock.now() - self._begin:.0f} s after the first look"
         )
         picture = LivePicture(volume, *fit.newest_view(), title, self._unit)
-        with whole_file(self.picture_path, replace=True) as partial, named_on_failure(self.picture_path):
-            partial.write_bytes(picture.png())
+        write_whole(self.picture_path, picture.png(), replace=True)

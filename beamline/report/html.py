@@ -10,7 +10,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from beamline.core.files import whole_file
+from beamline.core.files import write_whole
 from beamline.core.version import version
 from beamline.report.metrics import METRICS, formatted
 
@@ -64,8 +64,7 @@ def write_report(path: Path, report: Report, *, replace: bool = False) -> None:
     Raises:
         DataError: if `path` exists and `replace` is not set.
     """
-    with whole_file(path, replace=replace) as partial:
-        partial.write_text(to_html(report), encoding="utf-8")
+    write_whole(path, to_html(report), replace=replace)
 
 
 def to_html(report: Report) -> str:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from numpy.typing import NDArray
 
-from beamline.core.files import whole_file
+from beamline.core.files import write_whole
 from beamline.core.version import version
 from beamline.report.figures import bright_centre, grey_window, planes
 from beamline.report.html import Report
@@ -64,8 +64,7 @@ def write_logbook(path: Path, report: Report, volume: Volume, unit: str, now: fl
     Raises:
         DataError: if `path` exists and `replace` is not set.
     """
-    with whole_file(path, replace=replace) as partial:
-        partial.write_bytes(as_pdf(logbook(report, volume, unit, now)))
+    write_whole(path, as_pdf(logbook(report, volume, unit, now)), replace=replace)
 
 
 def as_pdf(figure: Figure) -> bytes:

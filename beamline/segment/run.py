@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.files import refuse_existing, whole_file, write_whole
 from beamline.core.version import version
 from beamline.segment.picture import picture_of
 from beamline.storage import hdf5
@@ -103,21 +103,14 @@ def segment(options: SegmentOptions) -> Segmented:
         found = _segmented(volume, unit, options)
     except ValueError as error:
         raise DataError(f"{options.volume} cannot be segmented: {error}. Nothing was written.") from error
-    written = []
+    written = list[Path]()
     try:
-        for path, write in (
-            (options.output, lambda partial: _write_labels(partial, found, options)),
-            (options.table, lambda partial: partial.write_text(table_of(found), encoding="utf-8")),
-            (
-                options.picture,
-                lambda partial: partial.write_bytes(
-                    picture_of(found.volume, found.unit, found.labels, found.particles)
-                ),
-            ),
-        ):
-            with named_on_failure(path), whole_file(path) as partial:
-                write(partial)
-            written.append(path)
+        with whole_file(options.output) as partial:
+            _write_labels(partial, found, options)
+        written.append(options.output)
+        write_whole(options.table, table_of(found))
+        written.append(options.table)
+        write_whole(options.picture, picture_of(found.volume, found.unit, found.labels, found.particles))
     except BaseException:
         for path in written:
             path.unlink(missing_ok=True)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beamline.core.files import named_on_failure, whole_file
+from beamline.core.files import write_whole
 
 if TYPE_CHECKING:
     from simulators.effects.anomaly import Label
@@ -79,8 +79,7 @@ def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None
             for run in runs
         ],
     }
-    with named_on_failure(path), whole_file(path) as partial:
-        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    write_whole(path, json.dumps(content) + "\n")
 
 
 def read_labels(path: Path) -> tuple[LabelledRun, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.files import named_on_failure, whole_file
+from beamline.core.files import whole_file
 from beamline.storage import hdf5
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -98,7 +98,7 @@ def write_truth(path: Path, truth: Truth) -> None:
     Raises:
         DataError: `path` exists or cannot be written.
     """
-    with named_on_failure(path), whole_file(path) as partial, hdf5.created(partial) as file:
+    with whole_file(path) as partial, hdf5.created(partial) as file:
         file.attrs["default"] = "entry"
         entry = file.create_group("entry")
         entry.attrs["NX_class"], entry.attrs["default"] = "NXentry", "data"

@@ -36,7 +36,6 @@ from beamline.storage.parts import joined_file_of, other_parts
 from beamline.storage.readers.open import open_scan
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
-from beamline.storage.writers.to_disk import to_disk
 
 _SAMPLES = 4  # images that say how far a dataset can be compressed
 _ROOM = 1.1  # free space over the size expected
@@ -84,12 +83,10 @@ def archive(
         counter = ImageCounter(progress, 2 * sum(dataset.nbytes for dataset in datasets))
         try:
             with hdf5.created(partial, layout.LIBVER) as file:
-                copy = CompressedCopy(codec, counter)
+                copy = CompressedCopy(codec, counter, file.require_taken)
                 copy.group(raw["/"], file["/"])
                 if copy.damaged and not keep_damaged:
                     raise _damaged(scan, copy.damaged)
-                file.flush()
-                to_disk(file.id.get_vfd_handle())
         except OSError as error:
             raise DataError(f"{out} could not be written ({hdf5.reason(error)}). Nothing is left of it.") from error
         _drop_from_cache(partial)

@@ -47,13 +47,16 @@ class ImageCounter:
 class CompressedCopy:
     """Copies a file group by group.
 
+    Args:
+        require_taken: is asked after each image; it raises where the disk refuses.
+
     Attributes:
         checksums: CRC-32 of each image, by the path of its dataset.
         damaged: rows of our frames that differ from the checksum that the raw file has of them.
     """
 
-    def __init__(self, codec: str, counter: ImageCounter) -> None:
-        self._codec, self._counter = CODECS[codec], counter
+    def __init__(self, codec: str, counter: ImageCounter, require_taken: Callable[[], None]) -> None:
+        self._codec, self._counter, self._require_taken = CODECS[codec], counter, require_taken
         self._paths: dict[_Place, str] = {}
         self.checksums: dict[str, list[int]] = {}
         self.damaged = set[int]()
@@ -89,6 +92,7 @@ class CompressedCopy:
         checksums = self.checksums[source.name] = []
         for row, image in enumerate(images(source)):
             made[row] = image
+            self._require_taken()
             checksums.append(checksum_of(image))
             if said is not None and not has_checksum(image, int(said[row])):
                 self.damaged.add(row)

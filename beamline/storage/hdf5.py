@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import errno
 import re
+import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import hdf5plugin  # noqa: F401 - registers the compressors that archived scans use
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.text import printable
+from beamline.storage.disk_file import DiskFile
 from beamline.storage.journal import pending
 from beamline.storage.overlay import Overlay
 from beamline.storage.superblock import superblock
@@ -133,32 +135,64 @@ def never_close(file: h5py.File) -> None:
         item.locked = True  # each is a reference of its own to the object, which is now never given back
 
 
+class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
+    """A file that is made or changed by `created` and `changed`."""
+
+    def __init__(self, disk: DiskFile, mode: str, libver: str | tuple[str, str] | None = None) -> None:
+        super().__init__(disk, mode, libver=libver)
+        self.require_taken = disk.require_taken
+        """Raises OSError where the disk did not take something: ask it now and then while much is written."""
+
+
 @contextmanager
-def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[h5py.File]:
-    """A new file, closed at the end. OSError where the disk does not take it: then it is never closed, see above."""
-    with _closed(h5py.File(path, "x", libver=libver), path) as file:
+def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator[NewFile]:
+    """A new file. At the end of the block it is on the disk, and was read back and compared with what was written.
+
+    Raises:
+        OSError: the disk did not take it, or holds something else, whenever that was; the file is closed and stays.
+    """
+    with _written(path, "x", libver) as file:
         yield file
 
 
 @contextmanager
-def changed(path: Path) -> Iterator[h5py.File]:
-    """An existing file, open to be changed; closed as by `created`."""
-    with _closed(h5py.File(path, "r+", locking=False), path) as file:  # a reader of the old content does not matter
+def changed(path: Path) -> Iterator[NewFile]:
+    """An existing file, open to be changed, as by `created`; what is changed when the disk refuses stays half done."""
+    with _written(path, "r+", None) as file:
         yield file
 
 
 @contextmanager
-def _closed(file: h5py.File, path: Path) -> Iterator[h5py.File]:
+def _written(path: Path, mode: Literal["x", "r+"], libver: str | tuple[str, str] | None) -> Iterator[NewFile]:
+    with closing(DiskFile(path, mode)) as disk, _nothing_ignored(disk):
+        try:
+            with NewFile(disk, mode, libver) as file:
+                yield file
+            disk.finish()
+        except Exception as error:
+            disk.require_taken()  # the cause, where the disk is
+            if isinstance(error, OSError | RuntimeError):  # what h5py makes of HDF5's errors
+                number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
+                raise OSError(number, reason(error), str(path)) from error
+            raise
+
+
+@contextmanager
+def _nothing_ignored(disk: DiskFile) -> Iterator[None]:
+    """What h5py can only print, as Ctrl-C while an object goes, is kept."""
+    before = sys.unraisablehook
+
+    def keep(args: Any) -> None:
+        if "h5py" in str(args.object) and args.exc_value is not None:
+            disk.keep(args.exc_value)
+        else:
+            before(args)
+
+    sys.unraisablehook = keep
     try:
-        yield file
-        file.close()
-    except (OSError, RuntimeError) as error:  # what h5py makes of HDF5's errors
-        never_close(file)
-        number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
-        raise OSError(number, reason(error), str(path)) from error
-    except BaseException:
-        file.close()
-        raise
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def text(value: Any) -> str:

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError, ScanStopped
+from beamline.core.files import whole_file
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
@@ -65,10 +65,7 @@ def ingest(
         ScanStopped: should_stop said so. No half file is left.
     """
     out = Path(out)
-    if out.exists():
-        raise DataError(f"{out} exists. Nothing is ever overwritten: name a new file.")
-    part = out.with_name(out.name + ".part")
-    with open_scan(scan) as source:
+    with whole_file(out) as partial, open_scan(scan) as source:
         views = source.image_key == FrameKind.PROJECTION
         if not np.isfinite(source.angles[views]).all():
             raise DataError(
@@ -82,38 +79,18 @@ def ingest(
             energy_kev=energy_kev or source.energy_kev,
             axis_col=source.axis_col,
         )
-        try:
-            with hdf5.created(part, layout.LIBVER) as file:
-                invalid = _copy(source, file, info, no_data, progress, should_stop)
-        except FileExistsError as error:
-            raise DataError(f"{part} exists: another ingest is at work, or one was killed. Then remove it.") from error
-        except BaseException as error:
-            left = _remove(part)
-            if isinstance(error, OSError):
-                raise DataError(f"{out} could not be written ({hdf5.reason(error)}). {left}") from error
-            raise
-        if out.exists():
-            part.unlink()
-            raise DataError(f"{out} appeared while this ran; it is untouched, and nothing else is left.")
-        part.rename(out)
+        with hdf5.created(partial, layout.LIBVER) as file:
+            invalid = _copy(source, file, out, info, no_data, progress, should_stop)
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
         return Ingested(out, definition, frames, size, invalid)
 
 
-def _remove(part: Path) -> str:
-    """Remove the unfinished file; a sentence on what remains of it."""
-    try:
-        part.unlink(missing_ok=True)
-    except OSError:  # Windows removes no file that is open, as it is after a full disk
-        return f"Remove {part}."
-    return "Nothing is left of it."
-
-
 def _copy(
     source: ScanSource,
-    file: h5py.File,
+    file: hdf5.NewFile,
+    out: Path,
     info: layout.ScanInfo,
     no_data: float | None,
     progress: Callable[[int, int], None] | None,
@@ -131,15 +108,16 @@ def _copy(
     for i, (given, record) in enumerate(_frames(source)):
         image = given.astype(dtype, copy=False)
         if should_stop is not None and should_stop():
-            raise ScanStopped(f"Stopped after {i} of {n} frames; nothing is left of {file.filename}.")
+            raise ScanStopped(f"Stopped after {i} of {n} frames; nothing is left of {out}.")
         if i in source.damaged:
             raise DataError(
                 f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
-                f"good copy; `beamline validate --deep` looks at all frames. Nothing is left of {file.filename}."
+                f"good copy; `beamline validate --deep` looks at all frames. Nothing is left of {out}."
             )
         statistics = digest(image, saturation=saturation, no_data=no_data)
         invalid += statistics.invalid_fraction == 1.0
         rows.write(i, image, statistics, record)
+        file.require_taken()
         if progress is not None:
             progress(i + 1, n)
         if (i + 1) % PER_FLUSH == 0:

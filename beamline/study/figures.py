@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from beamline.core.files import named_on_failure, whole_file
+from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
@@ -50,8 +50,7 @@ def write_page(folder: Path, table: StudyTable, slices: Slices) -> None:
         picture = Picture(f"{by_name(method).label}, slice by slice", caption, slices.png(slices.labels(method)))
         pictures.append((f"slices_{method}.png", picture))
     for name, picture in pictures:
-        with named_on_failure(folder / name), whole_file(folder / name, replace=True) as partial:
-            partial.write_bytes(picture.png)
+        write_whole(folder / name, picture.png, replace=True)
     rows = [
         {
             "label": cell.row.label,

@@ -13,7 +13,7 @@ from textwrap import fill
 
 import numpy as np
 
-from beamline.core.files import named_on_failure, whole_file
+from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.version import version
 from beamline.study.studies import Row, Study
@@ -157,8 +157,7 @@ def write_table(folder: Path, table: StudyTable) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    with named_on_failure(path), whole_file(path, replace=True) as partial:
-        partial.write_text(content, encoding="utf-8")
+    write_whole(path, content, replace=True)
 
 
 def _record(cell: Cell) -> dict[str, str | float | None]:

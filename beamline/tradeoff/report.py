@@ -12,7 +12,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from beamline.core.files import named_on_failure, whole_file
+from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.version import version
 from beamline.report.html import Picture, render
@@ -183,8 +183,7 @@ def write_figures(folder: Path, table: TrialTable, slices: Slices) -> None:
         caption = "The same slice by each method with its usual settings, all in the grey window of the first."
         pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     for name, picture in pictures:
-        with named_on_failure(folder / name), whole_file(folder / name, replace=True) as partial:
-            partial.write_bytes(picture.png)
+        write_whole(folder / name, picture.png, replace=True)
     _write(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]))
 
 
@@ -263,5 +262,4 @@ def finite(value: Any) -> Any:
 
 
 def _write(path: Path, content: str) -> None:
-    with named_on_failure(path), whole_file(path, replace=True) as partial:
-        partial.write_text(content, encoding="utf-8")
+    write_whole(path, content, replace=True)

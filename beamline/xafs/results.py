@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from beamline.core.files import named_on_failure, refuse_existing, whole_file
+from beamline.core.files import refuse_existing, write_whole
 from beamline.report.figures import png
 from beamline.xafs.contrast import Curve
 from beamline.xafs.edge import Edge
@@ -155,7 +155,6 @@ def write(result: XafsResult, target: Path) -> None:
     """
     with ExitStack() as undo:
         for path, content in ((target, picture(result)), (table_beside(target), table(result.curve).encode())):
-            with named_on_failure(path), whole_file(path) as partial:
-                partial.write_bytes(content)
+            write_whole(path, content)
             undo.callback(path.unlink)
         undo.pop_all()

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
 from beamline.core.version import version
@@ -41,11 +42,13 @@ class Pixels:
 class Slices:
     """The slices of a volume as they are stored, one after another.
 
-    `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite.
+    `outside` counts the voxels, of those passed so far, that the window clipped or that are not finite; `checksums`
+    are those of the slices passed.
     """
 
     def __init__(self, volume: Volume, pixels: Pixels) -> None:
         self._data, self.pixels, self.shape, self.outside = volume.data, pixels, volume.grid.shape, 0
+        self.checksums = list[int]()
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         for z in range(self.shape[0]):
@@ -53,7 +56,9 @@ class Slices:
                 values = np.asarray(self._data[z : z + 1][0], np.float32)
             except OSError as error:
                 raise DataError(f"Slice {z} of the volume cannot be read ({error}).") from error
-            yield self._stored(values)
+            stored = self._stored(values)
+            self.checksums.append(checksum(stored))
+            yield stored
 
     def _stored(self, values: NDArray[np.float32]) -> NDArray[Any]:
         dtype, window = self.pixels.dtype, self.pixels.window
@@ -65,6 +70,11 @@ class Slices:
         greatest = np.iinfo(dtype).max
         grey = (np.nan_to_num(values, nan=low).astype(np.float64) - low) * (greatest / (high - low))
         return np.clip(np.rint(grey), 0, greatest).astype(dtype)
+
+
+def checksum(values: NDArray[Any]) -> int:
+    """CRC-32 of voxels in memory order."""
+    return int(zlib_ng.crc32(np.ascontiguousarray(values)))
 
 
 class VolumeFormat(Protocol):

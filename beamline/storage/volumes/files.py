@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
-from beamline.storage import hdf5
+from beamline.core.files import bring_to_disk, whole_file
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import SUFFIXES, read_volume
-from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record
+from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
 from beamline.storage.volumes.nxtomoproc import NXtomoproc
 from beamline.storage.volumes.ome_zarr import OmeZarr
 from beamline.storage.volumes.plain import Npy, Nrrd
@@ -42,6 +42,8 @@ def format_of(path: Path) -> VolumeFormat:
 def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, *, replace: bool = False) -> int:
     """Write a volume in the format that the suffix of `path` names, slice by slice: as a whole, or not at all.
 
+    Each slice is read back from the file and compared by its checksum; those of HDF5 as bytes, see `DiskFile`.
+
     Args:
         pixels: default: float32.
         replace: a file takes the place of an older one; a folder never does.
@@ -58,12 +60,13 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
         raise ValueError(f"{kind.name} holds the values themselves (float32); leave bits and window out.")
     slices = Slices(record.volume, pixels)
     with whole_file(path, replace=replace) as partial:
-        try:
-            kind.write(partial, record, slices)
-        except OSError as error:
-            raise DataError(
-                f"{path} could not be written ({hdf5.reason(error)}). Check the disk; nothing was left there."
-            ) from error
+        kind.write(partial, record, slices)
+        bring_to_disk(partial)
+        with kind.open(partial) as written:
+            for z, known in enumerate(slices.checksums):
+                if checksum(written.volume.data[z : z + 1]) != known:
+                    raise OSError(errno.EIO, f"slice {z} that is read back is not what was written")
+        del written  # Windows renames no file that is mapped
     return slices.outside
 
 

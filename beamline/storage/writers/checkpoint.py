@@ -42,17 +42,13 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         DataError: the disk refuses; an older checkpoint stays as it was.
     """
-    with whole_file(path, replace=True) as partial:
-        try:
-            with hdf5.created(partial) as file:
-                file.attrs["format"], file.attrs["version"] = _FORMAT, version()
-                file.attrs["steps"], file.attrs["digest"] = checkpoint.steps, _digest(checkpoint)
-                for group, values in (("state", checkpoint.state), ("made_from", checkpoint.made_from)):
-                    node = file.create_group(group)
-                    for name, value in values.items():
-                        node[name] = value
-        except OSError as error:
-            raise DataError(f"{path} could not be written ({hdf5.reason(error)}). Check the disk.") from error
+    with whole_file(path, replace=True) as partial, hdf5.created(partial) as file:
+        file.attrs["format"], file.attrs["version"] = _FORMAT, version()
+        file.attrs["steps"], file.attrs["digest"] = checkpoint.steps, _digest(checkpoint)
+        for group, values in (("state", checkpoint.state), ("made_from", checkpoint.made_from)):
+            node = file.create_group(group)
+            for name, value in values.items():
+                node[name] = value
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

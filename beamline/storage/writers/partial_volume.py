@@ -8,9 +8,9 @@ added by half is taken out again when the file is opened.
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, whole_file
+from beamline.core.files import bring_to_disk, refuse_existing, whole_file
 from beamline.storage import hdf5
 from beamline.storage.scratch import reserve
 from beamline.storage.writer_lock import WriterLock, held
@@ -109,23 +109,21 @@ def create_partial(
     """
     nz, *shape = record.volume.grid.shape
     with whole_file(path) as partial:
-        try:
-            write_record(partial, record, empty=True)
-            with h5py.File(partial, "r+") as file:
-                file.create_dataset(_PLACES["done_text"], (), "S40", data=f"0 of {nz} slices".encode())
-                file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
-                group = file[_SLABS]
-                group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
-                group["kept"] = json.dumps(kept, default=_plain)
-                for name, value in made_from.items():
-                    group[f"made_from/{name}"] = value
-                deepest = max(1, *(len(_shared(slab)) for slab in slabs))
-                shared = file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)
-                shared[-1, -1, -1] = 0  # which allocates it, at the end: HDF5 cuts it off when it goes
-            with partial.open("r+b") as whole:
-                reserve(whole.fileno(), partial.stat().st_size, path.parent)
-        except OSError as error:
-            raise DataError(f"{path} could not be written ({hdf5.reason(error)}). Check the disk.") from error
+        _structure_of(path).unlink(missing_ok=True)  # of one whose writer was killed when it had become its target
+        write_record(partial, record, empty=True)
+        with hdf5.changed(partial) as file:
+            file.create_dataset(_PLACES["done_text"], (), "S40", data=f"0 of {nz} slices".encode())
+            file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
+            group = file[_SLABS]
+            group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
+            group["kept"] = json.dumps(kept, default=_plain)
+            for name, value in made_from.items():
+                group[f"made_from/{name}"] = value
+            deepest = max(1, *(len(_shared(slab)) for slab in slabs))
+            shared = file.create_dataset(_PLACES["shared_before"], (deepest, *shape), np.float32)
+            shared[-1, -1, -1] = 0  # which allocates it, at the end: HDF5 cuts it off when it goes
+        with partial.open("r+b") as whole:
+            reserve(whole.fileno(), partial.stat().st_size, path.parent)
     return open_partial(path)
 
 
@@ -168,11 +166,11 @@ def complete(path: Path, record: ReconRecord, target: Path, *, replace: bool = F
     try:
         _save_structure(path)
         rewrite_facts(path, record)
-        _to_disk(path)
         path.replace(target)
         _structure_of(path).unlink()
-    except OSError as error:
-        _put_back(path)
+    except (OSError, DataError) as error:
+        with suppress(OSError):  # else the next call does it
+            _put_back(path)
         raise DataError(
             f"{target} could not be written ({hdf5.reason(error)}). Check the disk. {path} keeps all slabs: give "
             f"--resume {path}."
@@ -189,13 +187,11 @@ def _save_structure(path: Path) -> None:
     with hdf5.readable(path), h5py.File(path, "r", locking=False) as file:
         voxels = [file[_PLACES[name]].id for name in ("volume", "shared_before")]
         ends = [at for item in voxels for at in (item.get_offset(), item.get_offset() + item.get_storage_size())]
-    with whole_file(_structure_of(path), replace=True) as saved:
-        with path.open("rb") as source, saved.open("wb") as out:
-            out.write(b"".join(end.to_bytes(8, "little") for end in ends))
-            for first, end in zip((0, *ends[1::2]), (*ends[::2], path.stat().st_size), strict=True):
-                source.seek(first)
-                out.write(source.read(end - first))
-        _to_disk(saved)
+    with whole_file(_structure_of(path), replace=True) as saved, path.open("rb") as source, saved.open("wb") as out:
+        out.write(b"".join(end.to_bytes(8, "little") for end in ends))
+        for first, end in zip((0, *ends[1::2]), (*ends[::2], path.stat().st_size), strict=True):
+            source.seek(first)
+            out.write(source.read(end - first))
 
 
 def _put_back(path: Path) -> None:
@@ -211,14 +207,8 @@ def _put_back(path: Path) -> None:
         out.seek(ends[-1])
         out.write(source.read())
         out.truncate()
-    _to_disk(path)
+    bring_to_disk(path)
     saved.unlink()
-
-
-def _to_disk(path: Path) -> None:
-    """Return when the file would survive a loss of power."""
-    with path.open("r+b") as file:
-        os.fsync(file.fileno())
 
 
 def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:

@@ -59,12 +59,7 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
         DataError: if `path` exists and `replace` is not set, or the disk refuses; no partial file stays.
     """
     with whole_file(path, replace=replace) as partial:
-        try:
-            write_record(partial, record)
-        except OSError as error:
-            raise DataError(
-                f"{path} could not be written ({hdf5.reason(error)}). Check the disk; nothing was left there."
-            ) from error
+        write_record(partial, record)
 
 
 def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> None:
@@ -74,7 +69,7 @@ def write_record(path: Path, record: ReconRecord, *, empty: bool = False) -> Non
         empty: without the voxels, for which there is one place, of zeros.
     """
     with hdf5.created(path) as file:
-        _write_entry(_group(file, "entry", "NXentry"), record, empty)
+        _write_entry(file, record, empty)
         file.attrs["default"] = "entry"
 
 
@@ -87,7 +82,8 @@ def rewrite_facts(path: Path, record: ReconRecord) -> None:
         _write_facts(entry, record)
 
 
-def _write_entry(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
+def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
+    entry = _group(file, "entry", "NXentry")
     entry.attrs["default"] = "data"
     _write_facts(entry, record)
     data = _group(entry, "data", "NXdata")
@@ -100,6 +96,7 @@ def _write_entry(entry: h5py.Group, record: ReconRecord, empty: bool) -> None:
         stored[-1, -1, -1] = 0  # which allocates it
     for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
         stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
+        file.require_taken()
     data["data"].attrs["units"] = f"1/{record.length_unit}"
     data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):

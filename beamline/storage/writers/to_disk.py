@@ -3,38 +3,14 @@
 from __future__ import annotations
 
 import errno
-import os
-import sys
 import threading
 import time
+
+from beamline.core.files import to_disk
 
 SECONDS = 1.0  # between two calls, at least
 
 _PATIENCE = 60.0  # s that the last calls may take
-
-_NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
-
-
-if sys.platform == "darwin":
-    import fcntl
-
-    def _fsync(handle: int) -> None:
-        os.fsync(handle)  # which does not wait for the cache in the disk
-        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
-
-else:
-
-    def _fsync(handle: int) -> None:
-        os.fsync(handle)
-
-
-def to_disk(handle: int) -> None:
-    """Wait until what was written to an open file is on the disk. OSError where the disk did not take it."""
-    try:
-        _fsync(handle)
-    except OSError as error:
-        if error.errno not in _NO_SUCH_CALL:
-            raise
 
 
 class ToDisk:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -411,7 +412,7 @@ def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
         calls.append((handle, writer.rows))
         begun.set()
 
-    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(to_disk, "SECONDS", 0.0)
     with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
         handle = writer._file.id.get_vfd_handle()
@@ -433,7 +434,7 @@ def test_a_disk_that_did_not_take_what_was_flushed_is_told(
         if len(calls) == 4:
             raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(to_disk, "SECONDS", 0.0)
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     with pytest.raises(DataError, match=r"take the frame .*Input/output error.* The first 3 frames are safe"):
@@ -455,7 +456,7 @@ def test_a_disk_that_hangs_does_not_hold_the_writer(
         calls.append(handle)
         hangs.wait(10.0)
 
-    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", fsync)
     monkeypatch.setattr(to_disk, "SECONDS", 0.0)
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
     for frame in frames:
@@ -470,7 +471,7 @@ def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.Monke
     def fsync(handle: int) -> None:
         raise OSError(errno.EINVAL, "Invalid argument")
 
-    monkeypatch.setattr(to_disk.os, "fsync", fsync)
+    monkeypatch.setattr(os, "fsync", fsync)
     to_disk.to_disk(0)
 
 

@@ -1,0 +1,139 @@
+"""DiskFile: the file under HDF5. It keeps what failed, which HDF5 may lose, and checksums of what was written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+from io import SEEK_CUR, SEEK_END, SEEK_SET, FileIO
+from pathlib import Path
+from typing import Any, Literal
+
+from zlib_ng import zlib_ng
+
+from beamline.core.files import to_disk
+
+_KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
+_BLOCK = 2**24  # bytes that are read back at once
+
+
+class DiskFile:
+    """A file that h5py writes to by its driver `fileobj`.
+
+    HDF5 holds chunks and metadata back and writes them when an object goes, where h5py cannot raise; and it may crash
+    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, nothing more
+    is written, and HDF5 reads what it wrote since then from memory, until it has closed the file.
+    """
+
+    def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:
+        self._path, self._file = path, FileIO(path, "x+" if mode == "x" else "r+")
+        self._at, self._size = 0, os.fstat(self._file.fileno()).st_size
+        self._error: BaseException | None = None
+        self._since: list[tuple[int, bytes]] = []
+        self._sums: list[tuple[int, int, int]] = []  # first byte, bytes, CRC-32 of each write
+
+    def __repr__(self) -> str:  # which is the name of the file for HDF5
+        return str(self._path)
+
+    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
+        self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        """Zeros where nothing was written yet."""
+        view, got = memoryview(buffer).cast("B"), 0
+        try:
+            self._file.seek(self._at)
+            while got < len(view) and (n := self._file.readinto(view[got:])):
+                got += n
+        except BaseException as error:
+            self.keep(error)
+        view[got:] = bytes(len(view) - got)
+        for at, data in self._since:
+            first, end = max(at, self._at), min(at + len(data), self._at + len(view))
+            if first < end:
+                view[first - self._at : end - self._at] = data[first - at : end - at]
+        return len(view)
+
+    read = readinto  # h5py asks whether it is there, and calls the other
+
+    def write(self, buffer: Any) -> int:
+        data, put = memoryview(buffer).cast("B"), 0
+        self._size = max(self._size, self._at + len(data))
+        try:
+            if self._error is None:
+                self._sums.append((self._at, len(data), zlib_ng.crc32(data)))
+                self._file.seek(self._at)
+                while put < len(data):
+                    put += self._file.write(data[put:])
+        except BaseException as error:  # also a signal: HDF5 cannot pass it on
+            self.keep(error)
+        if self._error is not None and len(data) <= _KEPT:
+            self._since.append((self._at, bytes(data)))
+        return len(data)
+
+    def truncate(self, size: int) -> int:
+        self._size = size
+        self._sums = [(at, n, checksum) for at, n, checksum in self._sums if at + n <= size]
+        try:
+            if self._error is None:
+                self._file.truncate(size)
+        except BaseException as error:
+            self.keep(error)
+        return size
+
+    def flush(self) -> None:
+        """Nothing is held back here."""
+
+    def keep(self, error: BaseException) -> None:
+        """Have it raised by `require_taken`, unless there was one before it."""
+        self._error = self._error or error
+
+    def require_taken(self) -> None:
+        """Raise what went wrong so far: OSError where the disk refused."""
+        if isinstance(self._error, OSError):
+            self._error.filename = str(self._path)
+        if self._error is not None:
+            raise self._error
+
+    def finish(self) -> None:
+        """Bring all of it to the disk, read it back, and compare. The memory is that of a block.
+
+        A write that a later one changed in part is not compared: these are metadata.
+
+        Raises:
+            OSError: the disk did not take it, or holds something else.
+        """
+        self.require_taken()
+        to_disk(self._file.fileno())
+        if (size := os.fstat(self._file.fileno()).st_size) != self._size:
+            raise OSError(errno.EIO, f"it has {size} bytes of {self._size}", str(self._path))
+        for at, n, checksum in self._unchanged():
+            if self._checksum(at, n) != checksum:
+                raise OSError(errno.EIO, f"{n} bytes at {at} are not those that were written", str(self._path))
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _unchanged(self) -> Iterator[tuple[int, int, int]]:
+        """Writes of which nothing was written again."""
+        begins, ends = list[int](), list[int]()  # of what later writes cover: apart, in order
+        for at, n, checksum in reversed(self._sums):
+            first, end = bisect_left(ends, at), bisect_right(begins, at + n)  # those that it overlaps or touches
+            if not any(begins[i] < at + n and ends[i] > at for i in range(first, end)):
+                yield at, n, checksum
+            begins[first:end], ends[first:end] = (
+                [min([at, *begins[first:end]])],
+                [max([at + n, *ends[first:end]])],
+            )
+
+    def _checksum(self, at: int, n: int) -> int:
+        block, checksum = memoryview(bytearray(min(n, _BLOCK))), 0
+        self._file.seek(at)
+        while n > 0 and (got := self._file.readinto(block[: min(n, _BLOCK)])):
+            checksum, n = zlib_ng.crc32(block[:got], checksum), n - got
+        return checksum
