@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from beamline.core.errors import DataError
 from beamline.core.text import count
 from beamline.storage import hdf5
 from beamline.storage.parts import views_in, views_planned
+from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import held
 from beamline.storage.writers import layout
@@ -65,6 +68,7 @@ def recover(path: Path) -> Recovered:
     _write_head(path, head.closed())
     try:
         with h5py.File(path, "r") as file:
+            require_harmless(file)
             _require_ours(path, file)
             for name in layout.GROWING:
                 file[name][:]
@@ -93,12 +97,19 @@ def _checked(path: Path) -> Superblock:
             f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
             "Nothing was changed."
         )
-    if head.open_for_writing and (age := time.time() - path.stat().st_mtime) < QUIET:
+    if head.open_for_writing and abs(age := _now_beside(path) - path.stat().st_mtime) < QUIET:
         raise DataError(
             f"{path} changed {max(age, 0):.0f} s ago and is marked as being written. If its writer is dead, try again "
             f"in {QUIET:.0f} s. Nothing was changed."
         )
     return head
+
+
+def _now_beside(path: Path) -> float:
+    """The time of the disk's own clock, which that of a network may have: it has dated the file."""
+    with suppress(OSError), tempfile.TemporaryFile(dir=path.parent) as file:
+        return os.fstat(file.fileno()).st_mtime
+    return time.time()
 
 
 def _require_ours(path: Path, file: h5py.File) -> None:
