@@ -1,7 +1,7 @@
 """The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes.
 
-Exit codes: 0 done; 1 defect (its traceback is left in a file); 2 usage or configuration; 3 device; 4 stopped with reduced data;
-5 data or disk; 6 a quality limit failed; 7 scan complete, but with alarms of the monitor; 130 interrupted.
+Exit codes: 0 done; 1 defect (its traceback is left in a file); 2 usage or configuration; 3 device; 4 stopped with
+reduced data; 5 data or disk; 6 a quality limit failed; 7 scan complete, but the monitor raised alarms; 130 interrupted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files as others may leave them, and as we do: read only where regular, written whole or not at all; folders of parts."""
+"""Files: read only where regular, written whole or not at all, never over another one unless asked; parts' folders."""
 
 from __future__ import annotations
 

@@ -47,7 +47,8 @@ class NotReadyError(DataError):
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
-    Raises DataError where it is no readable HDF5 file, or draws on what is no file (see storage.structure), NotReadyError where it may become one (`follow`).
+    Raises DataError where it is no readable HDF5 file, or draws on what is no file (see storage.structure),
+    NotReadyError where it may become one (`follow`).
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")

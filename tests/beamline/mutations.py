@@ -1,4 +1,4 @@
-"""Damaged, altered and malicious inputs, made at random from good ones: files by bytes and by HDF5, YAML by its values."""
+"""Damaged, altered and malicious inputs, made at random from good ones: scan files, and YAML by its values."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ import yaml
 Rng = np.random.Generator
 NUMBERS = (-1, 0, 1, 2, 3, 20, 63, 64, 2**31, -(2**31), 2**62, np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324)
 ARRAYS: tuple[Any, ...] = (
-    np.float64(np.nan), np.int64(-5), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((3, 3)), np.arange(7), np.full(40, 1e308),
+    np.float64(np.nan), np.int64(-5), np.zeros(0), np.zeros((0, 4, 4)), np.zeros((3, 3)), np.arange(7),
+    np.full(40, 1e308),
     np.full(40, np.inf), b"text", "ä" * 300, b"\xff\xfe", np.zeros(4, bool), np.zeros(4, complex),
     np.zeros(4, [("a", "i4"), ("b", "f8")]), np.array([b"a", b"b"]), h5py.Empty("f8"), np.full(30, 2**63, np.uint64),
     np.float32(1e38), np.full((30, 2, 2), 7, np.int8),
 )  # fmt: skip
 SCALARS = (
-    "!!bool x", "!!timestamp x", "!!int x", "!!float x", "!!binary x", "!!null x", "!!set {a}", "!!omap [a]", "!!pairs [a]",
-    "!!merge x", "!!python/object:os.system x", "!!str [a]", "!!seq x", "!!map x", "!x y", "!<tag:yaml.org,2002:int> ''",
+    "!!bool x", "!!timestamp x", "!!int x", "!!float x", "!!binary x", "!!null x", "!!set {a}",
+    "!!omap [a]", "!!pairs [a]", "!!merge x", "!!python/object:os.system x", "!!str [a]", "!!seq x", "!!map x", "!x y",
+    "!<tag:yaml.org,2002:int> ''",
     "1e308", "-1e308", "1e-308", ".nan", ".inf", "-.inf", "0", "-1", "''", "[]", "{}", "~", "2024-01-01", "2024-13-45",
     "1:30", "0x10", "0b2", "yes", "&a [*a]", "{<<: {a: 1}}", "{<<: x}", "{? [a] : b}", "{? {a: b} : c}", "9" * 400,
     "1e999", "/dev/zero", ".", "/", "../..", "'a\\0b'", "|2\n  a", "*nobody", "[[[[[[1]]]]]]", "{x: !!bool y}",
@@ -116,7 +118,8 @@ def change_link(path: Path, rng: Rng) -> str:
         name, other = _some(rng, names), _some(rng, ["/", *names])
         links = (
             None, h5py.SoftLink(f"/{name}"), h5py.SoftLink(f"/{other}"), h5py.SoftLink("/nowhere"),
-            h5py.ExternalLink("pipe", "/a"), h5py.ExternalLink("/dev/zero", "/a"), h5py.ExternalLink("missing.h5", "/a"),
+            h5py.ExternalLink("pipe", "/a"), h5py.ExternalLink("/dev/zero", "/a"),
+            h5py.ExternalLink("missing.h5", "/a"),
             h5py.ExternalLink(path.name, f"/{other}"), h5py.ExternalLink(".", "/"), "hard",
         )  # fmt: skip
         link = _some(rng, links)

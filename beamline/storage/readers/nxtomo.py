@@ -96,8 +96,6 @@ class NXtomoSource(ScanReader):
                 for item in (places.data, key, places.angle):
                     if item is not None:
                         item.refresh()
-                rows = layout.altered_rows(self._file, self.n, n)
-                self._altered |= {self.n + row for row in rows.tolist()}
         else:
             n = int(places.data.shape[0])
         angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
@@ -107,6 +105,9 @@ class NXtomoSource(ScanReader):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
+        if self._ours and n > self.n:
+            rows = layout.altered_rows(self._file, self.n, n)
+            self._altered |= {self.n + row for row in rows.tolist()}
         known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
         self.image_key[[*self._altered]] = FrameKind.INVALID

@@ -115,11 +115,12 @@ def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Fin
 
 
 def altered_said(source: ScanSource) -> str:
-    """A sentence on the rows of a scan whose record is not what was written."""
+    """Sentences on the rows of a scan whose record is not what was written."""
     rows = sorted(source.altered)
     return (
-        f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger, ...) differs from its "
-        f"checksum: {spans(rows)}. {'It is' if len(rows) == 1 else 'They are'} left out. Look for a good copy."
+        f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger) differs from the "
+        f"checksum written with it: {spans(rows)}. Nothing uses {'it' if len(rows) == 1 else 'them'}. Look for a good "
+        "copy."
     )
 
 

@@ -6,7 +6,7 @@
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; the checksum of these,
+      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
                                 of its angle, image key and count_time (record_checksums); its flags,
                                 flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
