@@ -1,7 +1,7 @@
 """The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes.
 
-Exit codes: 0 done; 1 defect (with a traceback); 2 usage or configuration; 3 device; 4 stopped with reduced data;
-5 data or disk; 6 a quality limit failed; 7 scan complete, but with alarms of the monitor; 130 interrupted.
+Exit codes: 0 done; 1 defect (its traceback is left in a file); 2 usage or configuration; 3 device; 4 stopped with
+reduced data; 5 data or disk; 6 a quality limit failed; 7 scan complete, but the monitor raised alarms; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -10,27 +10,42 @@ import os
 import sys
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
 import click
+from click.exceptions import Abort, ClickException, Exit
 
-from beamline.core.errors import BeamlineError, exit_code, user_message
+from beamline.cli.lasting import Outputs
+from beamline.core.errors import (
+    BeamlineError,
+    DataError,
+    exit_code,
+    is_defect,
+    leave_traceback,
+    user_message,
+)
 from beamline.core.text import printable
 from beamline.core.version import version
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """The module of a command and its help line, which `beamline --help` prints without importing it (and torch)."""
+    """The module of a command and its help line, which `beamline --help` prints without importing it (and torch).
+
+    Attributes:
+        files: its results are files, or what moved; what it prints is a summary.
+    """
 
     module: str
     help: str
+    files: bool = True
 
 
 _COMMANDS = {
     "demo": _Entry("demo", "Run a simulated scan with live reconstruction; writes a volume and a report."),
-    "check": _Entry("check", "Validate a configuration. Nothing moves."),
-    "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves."),
+    "check": _Entry("check", "Validate a configuration. Nothing moves.", files=False),
+    "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves.", files=False),
     "home": _Entry("home", "Search the stage's reference position. The stage turns."),
     "tune": _Entry("tune", "Take a few frames and say which exposure to take."),
     "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
@@ -46,16 +61,16 @@ _COMMANDS = {
     "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
     "segment": _Entry("segment", "Segment the particles of a volume: labels, sizes, places."),
     "bench": _Entry("bench", "Measure this machine: kernels, fits, quality against time, and acquisition."),
-    "info": _Entry("files", "Describe a scan file or a volume."),
-    "validate": _Entry("files", "Check a scan file or a volume against the rules of its format."),
+    "info": _Entry("files", "Describe a scan file or a volume.", files=False),
+    "validate": _Entry("files", "Check a scan file or a volume against the rules of its format.", files=False),
     "recover": _Entry("files", "Make an ordinary scan file of one whose writer died."),
     "archive": _Entry("files", "Write a compressed copy of a scan file, compared with it frame by frame."),
-    "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor."),
+    "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor.", files=False),
     "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
     "export": _Entry(
         "export", "Copy a volume to another format: TIFF, npy, NRRD, OME-Zarr, with grey values if wanted."
     ),
-    "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema."),
+    "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 
 
@@ -79,17 +94,24 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         try:
             return super().invoke(ctx)
+        except (Exit, Abort, ClickException):
+            raise
         except (Exception, KeyboardInterrupt) as error:
-            code = exit_code(error)
-            if code == BeamlineError.exit_code and not isinstance(error, BeamlineError):
-                raise  # a defect, or click's own
-            click.echo(f"beamline: {printable(user_message(error))}", err=True)
-            ctx.exit(code)
+            said = user_message(error)
+            if is_defect(error):
+                if ctx.params.get("debug"):
+                    raise
+                left = leave_traceback(error, Path())
+                said += f"; the traceback is in {left}" if left else "; --debug shows where"
+                said += ". Please report it. What was written before is as it was written."
+            click.echo(f"beamline: {printable(said)}", err=True)
+            ctx.exit(exit_code(error))
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(version(), prog_name="beamline")
-def main() -> None:
+@click.option("--debug", is_flag=True, envvar="BEAMLINE_DEBUG", help="End with the traceback of a defect.")
+def main(debug: bool) -> None:
     """X-ray micro-tomography from trigger to volume: acquire, monitor, reconstruct.
 
     Results go to stdout, messages and progress to stderr.
@@ -99,17 +121,22 @@ def main() -> None:
 def run() -> NoReturn:
     """Run the command as a process that always ends with its own exit code.
 
-    HDF5 crashes at exit where a file could not be closed, as on a full disk: the code would be -11 instead of 5.
+    HDF5 crashes at exit where a file could not be closed, as on a full disk: the code would be -11 instead of 5. A
+    terminal that is closed, or a disk that takes no output, ends no command: what is left to be printed is lost.
     """
+    outputs, code = Outputs(), 0
     try:
         main(prog_name="beamline")
     except SystemExit as end:
-        if end.code and _holds_hdf5_files():
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(end.code if isinstance(end.code, int) else BeamlineError.exit_code)
-        raise
-    sys.exit(0)
+        code = end.code if isinstance(end.code, int) else BeamlineError.exit_code if end.code else 0
+    if lost := outputs.lost():
+        click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
+        entry = _COMMANDS.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))
+        if code == 0 and (entry is None or not entry.files):
+            code = DataError.exit_code
+    if code and _holds_hdf5_files():
+        os._exit(code)
+    sys.exit(code)
 
 
 def _holds_hdf5_files() -> bool:

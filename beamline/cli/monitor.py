@@ -32,6 +32,7 @@ from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import rows_replaced
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.references import reference_groups
+from beamline.storage.rules.validate import altered_said
 from drivers.clock import SystemClock
 
 UNITS = {check.name: check.unit for check in CHECKS}
@@ -106,9 +107,10 @@ def monitor(
             if source.quantity == "counts":
                 references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
             again = set(rows_replaced(source).tolist())
+            altered = [altered_said(source)] if source.altered else []
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags(found))):
                 write_whole(sheet, contact_sheet(worst))
-        for fault in references:
+        for fault in [*references, *altered]:
             sink(Event("warning", clock.now(), {"message": fault}))
         flags = [flag for each in found for flag in each]
         kinds = by_kind(flags)
@@ -125,7 +127,7 @@ def monitor(
         end = f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"
         end += f"; {len(again)} views were taken again: frames {spans(sorted(again))} do not count" if again else ""
         left_out = [f"Not looked at: {'; '.join(aside.said())}."] if aside.said() else []
-        click.echo("\n".join([*table(kinds), *references, *left_out, end]))
+        click.echo("\n".join([*table(kinds), *references, *altered, *left_out, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

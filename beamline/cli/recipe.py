@@ -15,6 +15,8 @@ import click
 import yaml
 from click.core import ParameterSource
 
+from beamline.core.files import SETTINGS, require_regular, text_in
+
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
     "output", "as_json", "report", "pdf", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
@@ -151,9 +153,10 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 
 def _text(path: Path) -> str:
+    require_regular(path)
     with path.open("rb") as file:
         if file.read(4) != b"\x89HDF":
-            return path.read_text(encoding="utf-8")
+            return text_in(path, SETTINGS)
     from beamline.storage.writers.recon_file import opened_reconstruction
 
     with opened_reconstruction(path) as record:

@@ -34,7 +34,11 @@ from drivers.clock import SystemClock
 from recon.base.choices import AUTO
 from recon.methods import streams
 
-_ENDING = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")
+_ENDING = (
+    "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
+    "SIGPWR",
+)  # fmt: skip
+"""What would end the process, on any system: a batch system's warning, a time limit, a failing mains."""
 _SAID_WITHIN = 0.2  # s
 
 
@@ -153,8 +157,8 @@ def _commands(config: Config, no_live: bool, series: ResumableRun | None) -> _Co
 def stop_signals(stop: StopRequest) -> Iterator[None]:
     """Within the context the first Ctrl-C requests a stop, the second an abort.
 
-    SIGTERM, SIGQUIT, a closed terminal (SIGHUP, unless `nohup` has it ignored) and a closed console of Windows
-    (SIGBREAK) request a stop.
+    SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
+    other signals that would end the process request a stop.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:

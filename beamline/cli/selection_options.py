@@ -13,6 +13,7 @@ import click
 
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
+from beamline.core.files import text_in
 from recon.base.choices import FEW_PHOTONS, FlatFields, Noise, Rings
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def distortion_of(ctx: click.Context, param: click.Parameter, value: Path | None
     from recon.prep.resample import Distortion
 
     try:
-        return Distortion.parse(value.read_text(encoding="utf-8"))
+        return Distortion.parse(text_in(value))
     except (OSError, ValueError) as error:
         raise click.BadParameter(f"{value}: {error}") from error
 

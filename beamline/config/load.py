@@ -26,6 +26,7 @@ from beamline.config.models import (
 )
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
+from beamline.core.files import SETTINGS, text_in
 from beamline.core.version import version
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, ScanPlan
@@ -53,7 +54,7 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = text_in(path, SETTINGS)
     except FileNotFoundError:
         raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
     except OSError as error:
@@ -128,7 +129,7 @@ def scene_mapping(config: Config) -> dict[str, Any]:
         return scene
     path = config_folder() / scene  # an absolute path stays itself
     try:
-        text = path.read_text(encoding="utf-8")
+        text = text_in(path, SETTINGS)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
     return read(text, str(path)).data
@@ -139,7 +140,7 @@ def _angles(plan: Any) -> NDArray[np.float64]:
         case SectorAngles():
             return angles.sector(plan.views, math.radians(plan.first_deg), math.radians(plan.last_deg))
         case FileAngles():
-            return angles.from_text(Path(plan.path).read_text(encoding="utf-8"))
+            return angles.from_text(text_in(Path(plan.path)))
     start, span = math.radians(plan.start_deg), math.radians(plan.span_deg)
     match plan:
         case RandomAngles():

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from beamline.core.errors import ConfigError
+from beamline.core.files import YAML_FAULTS
 
 KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
@@ -60,8 +61,8 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
         where = f"{name}:{mark.line + 1}" if mark and "\n" in text else name
         what = ", ".join(part for part in (error.context, error.problem) if part)
         raise ConfigError(f"{where}: this is not YAML ({what}). Nothing was started.") from None
-    except (yaml.YAMLError, ValueError, ArithmeticError) as error:  # such as a 13th month, or a number of 5000 digits
-        what = " ".join(str(error).split())
+    except (yaml.YAMLError, *YAML_FAULTS) as error:
+        what = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{name}: this is not YAML ({what}). Nothing was started.") from None
     except RecursionError:
         raise ConfigError(f"{name}: a value holds itself, or is nested beyond reason. Nothing was started.") from None

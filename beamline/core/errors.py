@@ -1,9 +1,16 @@
-"""Errors with exit codes: each class says which part failed and whether the data are safe."""
+"""Errors with exit codes: each class says which part failed and whether the data are safe; what a defect leaves."""
 
 from __future__ import annotations
 
 import errno
+import os
+import sys
+import tempfile
+import traceback
+from contextlib import suppress
+from pathlib import Path
 
+from beamline.core.version import version
 from drivers.errors import DeviceError
 
 
@@ -59,7 +66,7 @@ INTERRUPTED = 130
 
 
 def exit_code(error: BaseException) -> int:
-    """The exit code of a command that ends with `error`; 1 is a defect, which is shown with its traceback."""
+    """The exit code of a command that ends with `error`; 1 is a defect."""
     if isinstance(error, BeamlineError):
         return error.exit_code
     if isinstance(error, DeviceError):
@@ -68,8 +75,7 @@ def exit_code(error: BaseException) -> int:
         return INTERRUPTED
     if isinstance(error, MemoryError) or damaged(error):
         return DataError.exit_code
-    # click handles a closed pipe (`beamline info x | head`); an OSError without a number is a defect.
-    if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
+    if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):  # one without a number is a defect
         return DataError.exit_code
     return BeamlineError.exit_code
 
@@ -78,6 +84,11 @@ def damaged(error: BaseException) -> bool:
     """HDF5 could not read or follow what a file holds; h5py has no class of its own for that."""
     said = str(error)
     return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in said and "exist" not in said
+
+
+def is_defect(error: BaseException) -> bool:
+    """Nobody foresaw it: the program is wrong, whatever the input was."""
+    return exit_code(error) == BeamlineError.exit_code and not isinstance(error, BeamlineError)
 
 
 def user_message(error: BaseException) -> str:
@@ -92,4 +103,25 @@ def user_message(error: BaseException) -> str:
         )
     if damaged(error):
         return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
-    return str(error) or ("interrupted" if isinstance(error, KeyboardInterrupt) else repr(error))
+    if isinstance(error, KeyboardInterrupt):
+        return str(error) or "interrupted"
+    if is_defect(error):
+        what = " ".join(str(error).split()) or "nothing more is known"
+        return f"a defect in this program: {type(error).__name__}: {what}"
+    return str(error) or repr(error)
+
+
+def leave_traceback(error: BaseException, folder: Path) -> Path | None:
+    """The new file that has the traceback of a defect: in `folder`, else in that of temporary files; None where
+    neither can be written to. Of an error that has one already, that one."""
+    if (left := getattr(error, "traceback_file", None)) is not None:
+        return Path(left)
+    text = "".join(traceback.format_exception(error))
+    for place in (folder, Path(tempfile.gettempdir())):
+        with suppress(OSError):
+            number, name = tempfile.mkstemp(".log", "beamline-traceback-", place)
+            with os.fdopen(number, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(f"splatline {version()}, {sys.version}, {sys.platform}\n{sys.argv}\n{text}")
+            error.traceback_file = name  # type: ignore[attr-defined]
+            return Path(name)
+    return None

@@ -1,10 +1,12 @@
-"""Atomic files: written completely or not at all, and never over an existing one unless asked; folders of parts."""
+"""Files: read only where regular, written whole or not at all, never over another one unless asked; parts' folders."""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import shutil
+import stat
 import sys
 import uuid
 from collections.abc import Iterator
@@ -17,6 +19,40 @@ PART = "part-{}"
 """The folder of a later part of a scan that was resumed, in that of the run."""
 
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
+
+
+YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
+"""What PyYAML stumbles over itself, beside its YAMLError: a 13th month, a number of 5000 digits, `!!bool x`."""
+TEXT = 2**26
+"""Bytes that a text file has at most which a user names: angles of a million views take 20 MB."""
+SETTINGS = 2**20
+"""Bytes that a text file of settings has at most: YAML of 1 MB takes seconds to read."""
+
+
+def require_regular(path: Path, largest: float = math.inf) -> None:
+    """Raise OSError where `path` is there and is no regular file, or has more bytes than `largest`.
+
+    A pipe makes whoever opens it wait for ever, and a device may never end.
+    """
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISREG(found.st_mode):
+        what = "It is a folder" if stat.S_ISDIR(found.st_mode) else "It is a device or a pipe"
+        raise OSError(errno.EINVAL, f"{what}, and a regular file is expected", str(path))
+    if found.st_size > largest:
+        raise OSError(errno.EFBIG, f"It has {found.st_size} bytes, and at most {largest:.0f} are read", str(path))
+
+
+def text_in(path: Path, largest: int = TEXT, encoding: str = "utf-8") -> str:
+    """The content of a text file of so many bytes at most.
+
+    Raises:
+        OSError: as `require_regular`, or it cannot be read. UnicodeDecodeError: it is no such text.
+    """
+    require_regular(path, largest)
+    return path.read_text(encoding=encoding)
 
 
 def refuse_existing(path: Path) -> None:

@@ -45,7 +45,7 @@ class Timing:
             return Look(state)
         after = TimingState(frame.trigger, frame.framestamp, frame.time)
         steps = frame.trigger - state.trigger
-        lost = steps - 1 - sum(view in context.stored for view in range(state.trigger + 1, frame.trigger))
+        lost = steps - 1 - sum(state.trigger < view < frame.trigger for view in context.stored)
         if lost > 0:
             advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
             return Look(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))

@@ -25,6 +25,7 @@ from beamline.projections.read import (
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
+from beamline.storage.rules.validate import altered_said
 from drivers.frame import FrameKind
 from recon.prep.correct import Correction, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
@@ -59,6 +60,8 @@ class ScanCorrection:
                 raise ConfigError(f"{what} neighbouring pixels, so that --noise counts has no likelihood for them.")
             selection = replace(selection, noise="log")
         self._source, self._selection, self._warn = source, selection, warn
+        if source.altered:
+            warn(altered_said(source))
         self._current_factor = current_scale(source) if selection.use_current else None  # [frame], by the ring current
         wide, _ = self._widened(None)
         self._n_references = _count_references(source)

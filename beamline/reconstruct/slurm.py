@@ -16,6 +16,7 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt, Validat
 
 from beamline.config.section import Section
 from beamline.core.errors import ConfigError
+from beamline.core.files import SETTINGS, YAML_FAULTS, text_in
 
 _NAME = "slurm"
 
@@ -70,8 +71,8 @@ def slurm_jobs(spec: str) -> SlurmJobs:
         raise ConfigError(f"--cluster {spec}: there is no sbatch here. Call from a machine that submits Slurm jobs.")
     name = spec.removeprefix(_NAME).removeprefix(":")
     try:
-        tree = (yaml.safe_load(Path(name).read_text(encoding="utf-8")) if name else None) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        tree = (yaml.safe_load(text_in(Path(name), SETTINGS)) if name else None) or {}
+    except (OSError, yaml.YAMLError, RecursionError, *YAML_FAULTS) as error:
         raise ConfigError(f"--cluster {spec}: {name} cannot be read: {' '.join(str(error).split())}.") from error
     try:
         return SlurmJobs.model_validate(tree)

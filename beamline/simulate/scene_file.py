@@ -13,6 +13,7 @@ import yaml
 from beamline.config.load import config_folder
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
+from beamline.core.files import SETTINGS, text_in
 from beamline.core.text import size
 from beamline.storage.volume_file import read_volume
 from simulators.frame.mapping import SceneError
@@ -74,7 +75,7 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
             )
         path = shipped[name]
     try:
-        text = path.read_text(encoding="utf-8")
+        text = text_in(path, SETTINGS)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read ({error}). Nothing was simulated.") from error
     try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import source_findings
+from beamline.storage.rules.validate import altered_said, source_findings
 from beamline.storage.volumes.files import volume_format
 from beamline.storage.writers.recon_file import ReconRecord
 from drivers.frame import FrameKind
@@ -79,7 +79,8 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
     return {
         **facts,
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
-        "findings": [finding.message for finding in findings if finding.severity != "info"],
+        "findings": [finding.message for finding in findings if finding.severity != "info"]
+        + ([altered_said(source)] if source.altered else []),
     }
 
 

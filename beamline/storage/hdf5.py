@@ -20,6 +20,7 @@ from beamline.core.text import printable
 from beamline.storage.disk_file import DiskFile
 from beamline.storage.journal import pending
 from beamline.storage.overlay import Overlay
+from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import superblock
 
 DEGREE = np.pi / 180
@@ -50,7 +51,8 @@ class NotReadyError(DataError):
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
-    Raises DataError where it is no readable HDF5 file, NotReadyError where it may become one (`follow`).
+    Raises DataError where it is no readable HDF5 file, or draws on what is no file (see storage.structure),
+    NotReadyError where it may become one (`follow`).
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
@@ -67,9 +69,16 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
         if swmr and (missing or not (follow or being_written)):
             continue  # HDF5 would wait for ever for a writer that mends what is missing or damaged
         try:
-            return h5py.File(path, "r", swmr=swmr, locking=locking)
+            file = h5py.File(path, "r", swmr=swmr, locking=locking)
         except (OSError, ValueError) as error:
             problems.append(str(error))
+            continue
+        try:
+            require_harmless(file)
+        except BaseException:
+            file.close()
+            raise
+        return file
     if follow:
         raise NotReadyError(f"{path} cannot be followed yet ({problems[0]}).")
     if missing:

@@ -22,6 +22,7 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.validate import altered_said
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
 from drivers.frame import FrameKind
@@ -72,6 +73,8 @@ def ingest(
                 f"{source.path} does not say the angles of its {views.sum()} projections: give --angles FILE "
                 "(degrees, one a line). Nothing was written."
             )
+        if source.altered:
+            raise DataError(f"{altered_said(source)} Nothing was written.")
         info = layout.ScanInfo(
             sample=sample or str(source.attributes.get("sample", source.path.stem)),
             title=f"ingested from {source.path.name}",

@@ -32,11 +32,19 @@ _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_in(file: h5py.File) -> frozenset[int]:
-    """The views of the plan that a file holds, counted from 0: not those whose frame became invalid."""
+    """The views of the plan that a file holds, counted from 0: not those whose frame became invalid, or whose record
+    is not what was written.
+
+    Raises:
+        ValueError: a row is said to replace one after it.
+    """
     n = int(file[layout.COMMITTED][()])
-    triggers, replaces = (file[path][:n] for path in (layout.TRIGGER, layout.REPLACES))
+    triggers, replaces, kinds = (file[path][:n] for path in (layout.TRIGGER, layout.REPLACES, layout.KIND))
+    altered = layout.altered_rows(file, 0, n)
+    replaces[altered], kinds[altered] = -1, FrameKind.INVALID
+    layout.require_earlier(replaces)
     views = set()
-    for row in np.flatnonzero(file[layout.KIND][:n] == FrameKind.PROJECTION):
+    for row in np.flatnonzero(kinds == FrameKind.PROJECTION):
         while replaces[row] >= 0:  # a view that was taken again has the number of the first one
             row = replaces[row]
         views.add(int(triggers[row]))
@@ -74,6 +82,9 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
         for path in (layout.KIND, layout.TRIGGER)
     )
     views = np.flatnonzero(kinds == FrameKind.PROJECTION)
+    firsts = np.cumsum([0, *rows])
+    for file, first, n in zip(files, firsts, rows, strict=False):
+        kinds[first + layout.altered_rows(file, 0, n)] = FrameKind.INVALID
     after = np.arange(kinds.size) > (views[-1] if views.size else kinds.size)
     return {kind: set(triggers[after & (kinds == kind)].tolist()) for kind in (FrameKind.FLAT, FrameKind.DARK)}
 
@@ -125,8 +136,11 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     rows = [int(file[layout.COMMITTED][()]) for file in files]
     firsts = np.cumsum([0, *rows])
     values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in layout.GROWING}
-    for column, first in zip(values[layout.REPLACES], firsts[:-1], strict=True):
-        column[column >= 0] += first
+    for i, (file, n, first) in enumerate(zip(files, rows, firsts[:-1], strict=True)):
+        record = {path: values[path][i] for path in layout.RECORDED}
+        again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), layout.altered_rows(file, 0, n))
+        record[layout.REPLACES][again] += first
+        values[layout.RECORD_CHECKSUM][i][again] = layout.record_checksums(record)[again]
     values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
     _copy(files[0]["/"], joined, {path: np.concatenate(parts) for path, parts in values.items()})
     for path in _VIRTUAL:

@@ -6,7 +6,9 @@ whatever stops it, it can be run again.
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -23,6 +25,7 @@ from beamline.storage import hdf5, journal
 from beamline.storage.journal import Changes
 from beamline.storage.overlay import Overlay
 from beamline.storage.parts import views_in, views_planned
+from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
@@ -105,7 +108,7 @@ def _checked(path: Path) -> Superblock:
     head = superblock(path)
     if head is None or not head.intact:
         raise DataError(f"{path} is no HDF5 file that this program wrote. Nothing was changed.")
-    if head.open_for_writing and (age := time.time() - path.stat().st_mtime) < QUIET:
+    if head.open_for_writing and abs(age := _now_beside(path) - path.stat().st_mtime) < QUIET:
         raise DataError(
             f"{path} changed {max(age, 0):.0f} s ago and is marked as being written. If its writer is dead, try again "
             f"in {QUIET:.0f} s. Nothing was changed."
@@ -149,6 +152,13 @@ def _announce(changes: Changes, say: Callable[[str], None]) -> None:
         say(f"{changes.path}: to recover it takes {size(changes.room)} on its disk, {size(free)} are free.")
 
 
+def _now_beside(path: Path) -> float:
+    """The time of the disk's own clock, which that of a network may have: it has dated the file."""
+    with suppress(OSError), tempfile.TemporaryFile(dir=path.parent) as file:
+        return os.fstat(file.fileno()).st_mtime
+    return time.time()
+
+
 def _require_ours(path: Path, file: h5py.File) -> None:
     if layout.COMMITTED not in file:
         raise DataError(f"{path} is no scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
@@ -161,6 +171,7 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, Changes]:
     overlay.put(0, head.closed(end).head)
     try:
         with h5py.File(overlay, "r") as file:
+            require_harmless(file)
             _require_ours(path, file)
             _read(file)
         with h5py.File(overlay, "r+", libver=layout.LIBVER) as file:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import text_in
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.xafs.contrast import Curve, Regions
@@ -47,7 +48,7 @@ def read_table(path: Path, unit: str | None) -> AbsorptionTable:
         DataError: it does not exist, or is not such a table.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = text_in(path, encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read ({error}).") from error
     rows = []

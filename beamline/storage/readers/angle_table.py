@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.files import text_in
 from beamline.plan.angles import from_text
 from beamline.storage import hdf5
 from drivers.frame import FrameKind
@@ -22,7 +23,7 @@ def load_angles(angles: Angles) -> NDArray[np.float64]:
     if isinstance(angles, Path | str):
         path = Path(angles)
         try:
-            return parse_angles(path.read_text(), str(path))
+            return parse_angles(text_in(path), str(path))
         except (OSError, UnicodeDecodeError) as error:
             raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
     return np.atleast_1d(np.asarray(angles, np.float64))

@@ -46,6 +46,8 @@ class ScanSource(Protocol):
         part_starts: int64 [part], ascending, the first row of each part: between two parts the scan was interrupted,
             so that beam and camera may have changed. [0] where it was not.
         checksummed: the file holds a checksum of every frame.
+        altered: rows of which the file says something else than what was written, by the checksum of their record:
+            they are INVALID, for nothing is known of them.
         damaged: rows read so far whose pixels are not those that were written, by these checksums; frames of
             which less than half is read are not compared.
         plan: what the operator asked for, as our files record it; empty where it is not known.
@@ -88,6 +90,8 @@ class ScanSource(Protocol):
     def part_starts(self) -> NDArray[np.int64]: ...
     @property
     def checksummed(self) -> bool: ...
+    @property
+    def altered(self) -> frozenset[int]: ...
     @property
     def damaged(self) -> frozenset[int]: ...
     @property
@@ -190,6 +194,10 @@ class ScanReader(ABC):
     @property
     def checksummed(self) -> bool:
         return False
+
+    @property
+    def altered(self) -> frozenset[int]:
+        return frozenset()
 
     @property
     def damaged(self) -> frozenset[int]:

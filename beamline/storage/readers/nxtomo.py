@@ -51,6 +51,7 @@ class NXtomoSource(ScanReader):
             self.cone = self._cone()
             self.n = 0
             self._damaged: set[int] = set()
+            self._altered: set[int] = set()
             self._own_angles = own_angles
             self.refresh()
         except BaseException:
@@ -104,8 +105,12 @@ class NXtomoSource(ScanReader):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
+        if self._ours and n > self.n:
+            rows = layout.altered_rows(self._file, self.n, n)
+            self._altered |= {self.n + row for row in rows.tolist()}
         known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
+        self.image_key[[*self._altered]] = FrameKind.INVALID
         self.n, self.angles = n, angles[:n]
         self._checksums = self._column("digest/checksum", np.empty(0))[:n] if self._ours else np.empty(0)
         seconds = self._seconds(places.detector, "count_time")
@@ -171,8 +176,16 @@ class NXtomoSource(ScanReader):
     @property
     def replaces(self) -> NDArray[np.int64] | None:
         with hdf5.readable(self.path):
-            rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n] if self._ours else np.full(0, -1)
+            if not self._ours:
+                return None
+            rows = self._replaces()
             return rows if (rows >= 0).any() else None
+
+    def _replaces(self) -> NDArray[np.int64]:
+        rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n].astype(np.int64)
+        rows[[*self._altered]] = -1
+        layout.require_earlier(rows)
+        return rows
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
@@ -217,6 +230,10 @@ class NXtomoSource(ScanReader):
         return frozenset(self._damaged)
 
     @property
+    def altered(self) -> frozenset[int]:
+        return frozenset(self._altered)
+
+    @property
     def plan(self) -> Mapping[str, Any]:
         try:
             plan = json.loads(hdf5.text(_value(self._file, "/entry/record/plan")) or "{}") if self._ours else {}
@@ -231,7 +248,10 @@ class NXtomoSource(ScanReader):
             time = self._seconds(self._places.entry, "frame_log/time")
             trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
             framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
-            replaces = self._column("frame_log/replaces", np.full(self.n, -1))
+            replaces = self._replaces() if self._ours else np.full(self.n, -1)
+            for column in (trigger, framestamp):
+                column[[*self._altered]] = -1
+            time[[*self._altered]] = np.nan
         for i in range(first, self.n):
             yield Frame(
                 counts=self.read([i])[0],

@@ -108,6 +108,10 @@ class Overlay(ScanReader):
         return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
 
     @property
+    def altered(self) -> frozenset[int]:
+        return frozenset(row + len(self._front) for row in self._base.altered)
+
+    @property
     def damaged(self) -> frozenset[int]:
         return frozenset(row + len(self._front) for row in self._base.damaged)
 

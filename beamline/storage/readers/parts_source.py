@@ -75,6 +75,11 @@ class PartsSource(ScanReader):
         return all(source.checksummed for source in self._sources)
 
     @property
+    def altered(self) -> frozenset[int]:
+        pairs = zip(self._sources, self._firsts[:-1], strict=True)
+        return frozenset(int(row + first) for source, first in pairs for row in source.altered)
+
+    @property
     def damaged(self) -> frozenset[int]:
         pairs = zip(self._sources, self._firsts[:-1], strict=True)
         return frozenset(int(row + first) for source, first in pairs for row in source.damaged)

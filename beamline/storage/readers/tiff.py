@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import zipfile
 import zlib
 from pathlib import Path
@@ -86,6 +87,15 @@ def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
         raise DataError(
             f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
         )
+
+
+def appended(tif: tifffile.TiffFile) -> bool:
+    """Pages that tifffile appended one at a time, as the first of them says, which is a grey image."""
+    first = tif.pages.first
+    if not tif.is_shaped or first.ndim != 2:
+        return False
+    said = re.search(r'"shape": \[([\d, ]*)\]', first.description)
+    return said is not None and [int(n) for n in said[1].split(",") if n.strip()] == [*first.shape]
 
 
 def pages_one_by_one(tif: tifffile.TiffFile) -> bool:

@@ -27,6 +27,7 @@ from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refu
 from drivers.frame import FrameKind
 
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
+MOST_FILES = 100_000
 COUNTED = 100  # numbers between the first and the last file, over their number, from which they count no frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
@@ -90,7 +91,12 @@ class TiffSeries(ScanReader):
     def _names(self) -> list[str]:
         if self._zip is not None:
             return [name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name]
-        return [item.relative_to(self.path).as_posix() for item in self.path.rglob("*") if item.is_file()]
+        names = []
+        for n, item in enumerate(self.path.rglob("*")):
+            _refuse_more(self.path, n)
+            if item.is_file():
+                names.append(item.relative_to(self.path).as_posix())
+        return names
 
     def _bytes(self, name: str) -> bytes:
         try:
@@ -120,9 +126,28 @@ def kind_of(name: str) -> FrameKind:
 
 def _open_zip(path: Path) -> zipfile.ZipFile:
     try:
+        _refuse_more(path, _entries(path))
         return zipfile.ZipFile(path)
     except UNREADABLE as error:
         raise DataError(f"{path} cannot be read as a zip file ({hdf5.reason(error)}).") from error
+
+
+def _refuse_more(path: Path, n: int) -> None:
+    if n > MOST_FILES:
+        raise DataError(f"{path} holds more than {MOST_FILES} files: it is no scan. Give the folder of its images.")
+
+
+def _entries(path: Path) -> int:
+    """How many files a .zip says at its end that it holds (APPNOTE 4.3.14 and 4.3.16); to read its list takes long."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 2**16 - 42))
+        tail = file.read()
+        end = tail.rfind(b"PK\5\6")
+        n = 0 if end < 0 else int.from_bytes(tail[end + 10 : end + 12], "little")
+        if n == 0xFFFF and tail[end - 20 : end - 16] == b"PK\6\7":
+            file.seek(int.from_bytes(tail[end - 12 : end - 4], "little"))
+            n = int.from_bytes(file.read(56)[32:40], "little")
+    return n
 
 
 def _prefix(name: str) -> str:

@@ -13,8 +13,10 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, pages_one_by_one, refuse_volume
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, appended, pages_one_by_one, refuse_volume
 from drivers.frame import FrameKind
+
+_MANY = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
 
 
 class TiffStack(ScanReader):
@@ -51,6 +53,12 @@ class TiffStack(ScanReader):
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""
         refuse_volume(self.path, self._tif)
+        if len(self._tif.pages) > _MANY and appended(self._tif):
+            first = self._tif.pages.first
+            self.shape, self.dtype = (int(first.imagelength), int(first.imagewidth)), np.dtype(first.dtype)
+            self._offset = None
+            require_real(self.dtype, str(self.path))
+            return len(self._tif.pages)
         series = self._tif.series[0]
         one_by_one = pages_one_by_one(self._tif)
         if len(series.shape) not in (2, 3) or (len(self._tif.series) != 1 and not one_by_one):
@@ -81,7 +89,10 @@ class TiffStack(ScanReader):
 
     def _fill(self, out: NDArray[Any], page: int, rows: slice) -> None:
         if self._offset is None:
-            out[...] = self._tif.pages[page].asarray()[rows]
+            image = self._tif.pages[page].asarray()
+            if (image.shape, image.dtype) != (self.shape, self.dtype):
+                raise ValueError(f"it is {image.dtype} {image.shape}, the first {self.dtype} {self.shape}")
+            out[...] = image[rows]
         elif rows.step not in (None, 1):
             whole = np.empty(self.shape, self.dtype)
             self._fill(whole, page, WHOLE)

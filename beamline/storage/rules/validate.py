@@ -89,6 +89,8 @@ def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Fin
         told: how many of how many frames were read; None: only those that other rules have read are judged.
     """
     n, unreadable, why = int(source.image_key.size), list[int](), ""
+    if source.altered:
+        yield Finding("error", "records", altered_said(source))
     for row in range(n) if told is not None else ():
         try:
             source.read([row])
@@ -110,6 +112,16 @@ def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Fin
         )
     elif told and not source.checksummed:
         yield Finding("info", "checksums", "The file holds no checksums: it is only known that its frames can be read.")
+
+
+def altered_said(source: ScanSource) -> str:
+    """Sentences on the rows of a scan whose record is not what was written."""
+    rows = sorted(source.altered)
+    return (
+        f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger) differs from the "
+        f"checksum written with it: {spans(rows)}. Nothing uses {'it' if len(rows) == 1 else 'them'}. Look for a good "
+        "copy."
+    )
 
 
 def enough_views(source: ScanSource) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.version import version
 from beamline.storage import hdf5
+from beamline.storage.structure import require_harmless
 from beamline.storage.writers.recon_file import Value, value_of
 
 _FORMAT = "splatline checkpoint 1"
@@ -62,6 +63,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
         raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
     try:
         with h5py.File(path, "r") as file:
+            require_harmless(file)
             said = file.attrs.get("format")
             if said != _FORMAT:
                 raise KeyError(f"its format is {said!r}, expected {_FORMAT!r}")

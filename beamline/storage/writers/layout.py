@@ -6,7 +6,8 @@
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; its flags,
+      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
+                                of its angle, image key and count_time (record_checksums); its flags,
                                 flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
@@ -25,6 +26,7 @@ from __future__ import annotations
 
 import json
 import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -58,9 +60,12 @@ ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
 PREVIEW = "/entry/digest/preview"
 COMMITTED = "/entry/progress/frames_committed"
+COUNT_TIME = f"{DETECTOR}/count_time"
 TRIGGER = "/entry/frame_log/trigger"
+FRAMESTAMP = "/entry/frame_log/framestamp"
 TIME = "/entry/frame_log/time"
 REPLACES = "/entry/frame_log/replaces"
+RECORD_CHECKSUM = "/entry/frame_log/checksum"
 FINISHED = "/entry/progress/finished"
 STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
@@ -80,11 +85,11 @@ _TURN_TOLERANCE = np.radians(1.0)  # by which a full turn may be short
 COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {  # path: (type, unit)
         IMAGE_KEY: ("<i4", ""),
-        f"{DETECTOR}/count_time": ("<f8", "s"),
+        COUNT_TIME: ("<f8", "s"),
         ANGLE: ("<f8", "degree"),
         KIND: ("<i4", ""),
         TRIGGER: ("<i8", ""),
-        "/entry/frame_log/framestamp": ("<i8", ""),
+        FRAMESTAMP: ("<i8", ""),
         TIME: ("<f8", "s"),
         REPLACES: ("<i8", ""),
         FLAGS: ("<u8", ""),
@@ -97,11 +102,18 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "/entry/digest/saturated_fraction": ("<f8", ""),
         "/entry/digest/entropy": ("<f8", "bit"),
         "/entry/digest/checksum": ("<u4", ""),
+        RECORD_CHECKSUM: ("<u4", ""),
     }
 )
 
 GROWING = (*COLUMNS, VALID, SCORES, REGIONS)
 """What has a row for each frame, beside the pixels and their preview."""
+
+RECORDED = (
+    IMAGE_KEY, COUNT_TIME, ANGLE, KIND, TRIGGER, FRAMESTAMP, TIME, REPLACES,
+)  # fmt: skip
+"""What is said about a frame once and for all: RECORD_CHECKSUM is over these columns, in this order."""
+_RECORD = np.dtype([(path, COLUMNS[path][0]) for path in RECORDED])  # 56 bytes, little-endian, without gaps
 
 Description = Mapping[str, str | int | float]
 
@@ -149,6 +161,52 @@ class Record:
     time: float = np.nan
     mark: Mark = UNMARKED
     replaces: int = -1
+
+
+def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
+    """CRC-32 [row] of what RECORDED columns [row], by their paths, say of each frame.
+
+    The row of a view that is taken again becomes that of an invalid frame: its checksum stays that of the view.
+    """
+    table = np.empty(len(columns[KIND]), _RECORD)
+    for path in RECORDED:
+        table[path] = columns[path]
+    rows, size = table.tobytes(), _RECORD.itemsize
+    return np.array([zlib.crc32(rows[i : i + size]) for i in range(0, len(rows), size)], np.uint32)
+
+
+def rows_as_written(columns: Mapping[str, NDArray[Any]], checksums: NDArray[Any]) -> NDArray[np.bool_]:
+    """Rows [row] whose record, in columns as above, has the checksum that was written with it."""
+    good = np.asarray(record_checksums(columns) == checksums)
+    marked = ~good & ((columns[KIND] == FrameKind.INVALID) | (columns[IMAGE_KEY] == FrameKind.INVALID))
+    if marked.any():
+        views = {path: np.zeros_like(columns[path]) for path in (IMAGE_KEY, KIND)}  # FrameKind.PROJECTION
+        good[marked] = (record_checksums({**columns, **views}) == checksums)[marked]
+    return good
+
+
+def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
+    """Rows from `first` on, counted from it, whose record is not what was written with its checksum.
+
+    Raises:
+        ValueError: a column is not as `create` made it.
+    """
+    columns = {}
+    for path in (*RECORDED, RECORD_CHECKSUM):
+        column = file[path]
+        column.refresh()
+        columns[path] = column[first:end]
+        if columns[path].shape != (end - first,) or column.dtype != COLUMNS[path][0]:
+            raise ValueError(f"{path} is {column.dtype} {column.shape}, expected {COLUMNS[path][0]} of {end} rows")
+    return np.flatnonzero(~rows_as_written(columns, columns[RECORD_CHECKSUM]))
+
+
+def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
+    """ValueError where a row [row] is said to replace one that does not come before it, as in a circle; -1: none."""
+    wrong = np.flatnonzero(replaces >= np.arange(replaces.size))
+    if wrong.size:
+        row = int(wrong[0])
+        raise ValueError(f"row {row} is said to replace row {replaces[row]}, and only one before it can be replaced")
 
 
 def iso_time(seconds: float) -> str:
@@ -266,8 +324,8 @@ class Rows:
     def __init__(self, file: h5py.File) -> None:
         self._data: h5py.Dataset = file[DATA]
         self._preview: h5py.Dataset = file[PREVIEW]
-        self._columns: dict[str, h5py.Dataset] = {path.rsplit("/", 1)[1]: file[path] for path in GROWING}
-        self._types = {name: column.dtype for name, column in self._columns.items()}
+        self._columns: dict[str, h5py.Dataset] = {path: file[path] for path in GROWING}
+        self._types = {path: column.dtype for path, column in self._columns.items()}
         self._first, self._said = 0, list[dict[str, Any]]()
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
@@ -279,35 +337,41 @@ class Rows:
             self.flush()
             self._first = row
         said = {
-            "image_key": 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
-            "kind": int(record.kind),
-            "count_time": record.exposure,
-            "rotation_angle": math.degrees(record.angle),
-            "trigger": record.trigger,
-            "framestamp": record.framestamp,
-            "time": record.time,
-            "replaces": record.replaces,
-            "flags": record.mark.bits,
-            "frame_valid": record.mark.valid,
-            "flag_scores": record.mark.scores,
-            "flag_regions": record.mark.regions,
-        }
+            IMAGE_KEY: 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
+            KIND: int(record.kind),
+            COUNT_TIME: record.exposure,
+            ANGLE: math.degrees(record.angle),
+            TRIGGER: record.trigger,
+            FRAMESTAMP: record.framestamp,
+            TIME: record.time,
+            REPLACES: record.replaces,
+            FLAGS: record.mark.bits,
+            VALID: record.mark.valid,
+            SCORES: record.mark.scores,
+            REGIONS: record.mark.regions,
+            RECORD_CHECKSUM: 0,  # worked out where the rows are written
+        } | {f"/entry/digest/{name}": value for name, value in vars(digest).items()}
         for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
-        self._said.append({name: said[name] if name in said else vars(digest)[name] for name in self._columns})
+        self._said.append({path: said[path] for path in self._columns})
         if record.replaces >= 0:
             self.flush()
-            for name in ("image_key", "kind"):
-                self._columns[name][record.replaces] = int(FrameKind.INVALID)
+            for path in (IMAGE_KEY, KIND):
+                self._columns[path][record.replaces] = int(FrameKind.INVALID)
 
     def flush(self) -> None:
         """Write what is said about the rows since the last call. The file's own flush comes after it."""
         if not self._said:
             return
-        n = len(self._said)
-        for name, column in self._columns.items():
-            values = np.array([said[name] for said in self._said], self._types[name])
+        n, record = len(self._said), dict[str, NDArray[Any]]()
+        for path, column in self._columns.items():  # the checksum of the others is the last
+            if path == RECORD_CHECKSUM:
+                values = record_checksums(record)
+            else:
+                values = np.array([said[path] for said in self._said], self._types[path])
+            if path in RECORDED:
+                record[path] = values
             self._grow(column, self._first + n)
             place = column.id.get_space()  # a quarter of the time of h5py's own way, for twenty columns
             place.select_hyperslab((self._first, *(0,) * (values.ndim - 1)), values.shape)
@@ -317,11 +381,11 @@ class Rows:
     def add_flags(self, rows: range, bits: int) -> None:
         """Mark rows that exist: a check that has seen later frames found something in them."""
         self.flush()
-        flags = self._columns["flags"][rows.start : rows.stop]
+        flags = self._columns[FLAGS][rows.start : rows.stop]
         marked = flags | np.uint64(bits)
         if (marked != flags).any():
-            self._columns["flags"][rows.start : rows.stop] = marked
-            self._columns["frame_valid"][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
+            self._columns[FLAGS][rows.start : rows.stop] = marked
+            self._columns[VALID][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
 
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:

@@ -18,6 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.version import version
 from beamline.storage import hdf5
+from beamline.storage.structure import require_harmless
 from recon.base.volume import Grid, Volume
 
 DEFINITION = "NXtomoproc"
@@ -152,6 +153,7 @@ def opened_reconstruction(path: Path) -> Iterator[ReconRecord]:
     with ExitStack() as stack:
         try:
             file = stack.enter_context(h5py.File(path, "r"))
+            require_harmless(file)
             record = _read_entry(file["entry"])
         except hdf5.ALTERED as error:
             raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error

@@ -26,6 +26,12 @@ def terminal() -> Iterator[None]:
 
 
 @pytest.fixture
+def no_debug(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A defect ends as its user sees it."""
+    monkeypatch.delenv("BEAMLINE_DEBUG", raising=False)
+
+
+@pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current directory, with a good scan in it."""
     monkeypatch.chdir(tmp_path)

@@ -17,7 +17,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
-from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
+from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
 
@@ -96,6 +96,7 @@ def test_validate_passes_what_we_write(folder: Path) -> None:
 def test_validate_names_each_fault(folder: Path) -> None:
     with h5py.File("scan.h5", "r+") as file:
         file["entry/sample/rotation_angle"][7] = np.nan
+        seal(file)
     result = _beamline("validate", "scan.h5")
     assert result.exit_code == 5
     assert "error    angles" in result.stdout

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
+import tempfile
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ from click.testing import CliRunner
 
 from beamline.cli import main as module
 from beamline.core import errors
-from beamline.core.errors import user_message
+from beamline.core.errors import leave_traceback, user_message
 from drivers.errors import DeviceError, DeviceTimeout
 
 
@@ -65,9 +66,37 @@ def test_each_failure_has_its_code_and_one_sentence(
         assert "Errno" not in result.stderr
 
 
-def test_a_defect_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    result = _run(monkeypatch, ZeroDivisionError("defect"))
-    assert result.exit_code == 1
+@pytest.mark.usefixtures("no_debug")
+def test_a_defect_is_one_sentence_and_a_file_with_its_traceback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = _run(monkeypatch, ZeroDivisionError("who divides"))
+    (log,) = tmp_path.iterdir()
+    assert (result.exit_code, result.stdout) == (1, "")
+    said = f"beamline: a defect in this program: ZeroDivisionError: who divides; the traceback is in {log}."
+    assert result.stderr.startswith(said)
+    assert "Traceback" not in result.stderr
+    assert "in command\n    raise error" in log.read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("no_debug")
+def test_a_defect_in_a_folder_that_takes_no_file_leaves_its_traceback_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    left = leave_traceback(TypeError("x"), tmp_path / "nowhere")
+    assert left is not None
+    assert left.parent == tmp_path
+
+
+@pytest.mark.parametrize(("arguments", "environment"), [(["--debug"], {}), ([], {"BEAMLINE_DEBUG": "1"})])
+def test_a_developer_sees_the_defect_itself(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], environment: dict[str, str]
+) -> None:
+    fake = SimpleNamespace(demo=click.command("demo")(_raiser(ZeroDivisionError())))
+    monkeypatch.setattr(module, "import_module", lambda name: fake)
+    result = CliRunner().invoke(module.main, [*arguments, "demo"], env=environment)
     assert isinstance(result.exception, ZeroDivisionError)
 
 

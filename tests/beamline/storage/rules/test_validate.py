@@ -24,7 +24,7 @@ from beamline.storage.recover import recover
 from beamline.storage.rules.validate import reconstruction_blockers, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
-from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.beamline.scans import TwoCylinders, seal, write_exchange
 from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
 
 Write = Callable[[list[Frame]], Path]
@@ -243,6 +243,7 @@ def test_each_rule_finds_what_it_is_for(
     path = write(frames)
     with h5py.File(path, "r+") as file:
         spoil(file)
+        seal(file)
     hits = [finding for finding in validate(path) if finding.rule == rule]
     assert hits, f"found only {found(path)}"
     assert hits[0].severity == severity

@@ -1,0 +1,103 @@
+"""Structure: the objects of an HDF5 file and the other files that it draws on, looked at before any of them is opened.
+
+HDF5 opens whatever a link names: it waits for ever for a pipe, and for names of deeply nested groups.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from beamline.core.errors import DataError
+from beamline.core.files import require_regular
+
+MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
+_DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
+
+
+def require_harmless(file: h5py.File) -> None:
+    """DataError for a file with more objects, or deeper groups, than any scan, or that draws on what is no file.
+
+    Files that it draws on are looked at, too, and those that they draw on.
+    """
+    path = Path(file.filename)
+    seen, waiting = {path.resolve()}, _looked_at(file, path)
+    while waiting:
+        path = waiting.pop()
+        if path.resolve() in seen:
+            continue
+        seen.add(path.resolve())
+        if len(seen) > FILES:
+            raise DataError(f"{file.filename} draws on more than {FILES} files, one by another. Nothing was read.")
+        with suppress(*_DAMAGED), h5py.File(path, "r", locking=False) as other:
+            waiting += _looked_at(other, path)
+
+
+def _looked_at(file: h5py.File, path: Path) -> list[Path]:
+    """The regular files that a file draws on; DataError where one is something else."""
+    found = dict[Path, None]()
+    for name in dict.fromkeys(_names(file, path)):
+        # Where HDF5 looks for a file: as it is named, beside this one, and by its last part beside this one.
+        for place in (Path(name), path.parent / name, path.parent / Path(name).name):
+            with suppress(ValueError):  # a name that no file can have
+                if place.is_dir() or not os.path.lexists(place):
+                    continue
+                try:
+                    require_regular(place)
+                except OSError as error:
+                    raise DataError(
+                        f"{path} draws on {name}, which no scan does ({error.strerror}). Nothing was read."
+                    ) from error
+                found[place] = None
+    return [*found]
+
+
+def _names(file: h5py.File, path: Path) -> Iterator[str]:
+    """The other files that links and datasets name."""
+    groups, known = [(h5py.h5g.open(file.id, b"/"), 0)], set[tuple[int, int]]()
+    while groups:
+        group, depth = groups.pop()
+        links: list[tuple[bytes, int]] = []
+        with suppress(*_DAMAGED):
+            _list(group, links)
+        if len(known) + len(links) > MOST_OBJECTS or depth > DEEPEST:
+            raise DataError(
+                f"{path} has more than {MOST_OBJECTS} objects, or groups more than {DEEPEST} deep: it is no scan or "
+                "volume. Nothing was read."
+            )
+        for name, kind in links:
+            with suppress(*_DAMAGED):
+                if kind == h5py.h5l.TYPE_EXTERNAL:
+                    yield os.fsdecode(group.links.get_val(name)[0])
+                elif kind == h5py.h5l.TYPE_HARD:
+                    info = h5py.h5o.get_info(group, name)
+                    if (info.fileno, info.addr) in known:
+                        continue
+                    known.add((info.fileno, info.addr))
+                    if info.type == h5py.h5o.TYPE_GROUP:
+                        groups.append((h5py.h5g.open(group, name), depth + 1))
+                    elif info.type == h5py.h5o.TYPE_DATASET:
+                        yield from _drawn_on(h5py.h5d.open(group, name))
+
+
+def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
+    def take(name: bytes, info: Any) -> bool | None:
+        links.append((name, info.type))
+        return True if len(links) > MOST_OBJECTS else None
+
+    group.links.iterate(take, info=True)
+
+
+def _drawn_on(dataset: Any) -> Iterator[str]:
+    made = dataset.get_create_plist()
+    if made.get_layout() == h5py.h5d.VIRTUAL:
+        for i in range(min(made.get_virtual_count(), MOST_OBJECTS)):
+            if (name := made.get_virtual_filename(i)) != ".":
+                yield name
+    for i in range(made.get_external_count()):
+        yield os.fsdecode(made.get_external(i)[0])
