@@ -17,6 +17,7 @@ from beamline.config.monitor import policies
 from beamline.config.references import reference_limits
 from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
+from beamline.core.files import EVENTS
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
@@ -34,7 +35,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.scan.resume import ResumableRun
-from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
+from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, Supervision
 from beamline.scan.watchdog import watched
