@@ -193,7 +193,7 @@ def _digest(part: h5py.File) -> str:
     """SHA-256 of what the file says of its frames: kind, angle, time, ..., and the checksum of their pixels."""
     n, found = int(part[layout.COMMITTED][()]), hashlib.sha256()
     for path in layout.COLUMNS:
-        found.update(np.ascontiguousarray(part[path][:n]))
+        found.update(part[path][:n].tobytes())
     return found.hexdigest()
 
 
