@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from beamline.monitor.digest import FrameDigest
 from beamline.core.text import spans
+from beamline.monitor.digest import FrameDigest
 from beamline.monitor.references import Reference, ReferenceLimits, judge, photons
 from beamline.plan.plan import Block
 from drivers.frame import Frame, FrameKind
@@ -75,7 +75,7 @@ class ReferenceLog:
             return None
         return (
             f"Too little light: in the views a pixel of the open beam has {found:.3g} photons, by mean and variance of "
-            f"the flats {spans([flat.row for flat in flats])}; {FEW_PHOTONS} or more are expected, else noise rules the "
-            f"volume. Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, with a scan.period_s that "
-            "leaves the time), or bin the camera's pixels (devices.camera.binning). `beamline tune` measures it."
+            f"the flats {spans([flat.row for flat in flats])}; expected {FEW_PHOTONS} or more, else noise rules the "
+            f"volume. Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s to "
+            "match), or bin the camera's pixels (devices.camera.binning). `beamline tune` measures it."
         )
