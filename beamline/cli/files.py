@@ -17,11 +17,13 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, printable, size, spans
+from beamline.scan.run_folder import SCAN
 from beamline.storage.archive import archive as archive_scan
 from beamline.storage.compressed_copy import CODECS
 from beamline.storage.describe import describe
 from beamline.storage.flag_legend import counted
 from beamline.storage.ingest import ingest as ingest_scan
+from beamline.storage.parts import JOINED
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.recover import recover as recover_scan
 from beamline.storage.rules.validate import validate as findings_of
@@ -111,7 +113,8 @@ def recover(file: Path, as_json: bool) -> None:
         click.echo(what, err=True)
 
     with terminated_like_interrupted(), json_events(as_json) as sinks:
-        found, left_out = recover_run(file, say) if file.is_dir() else ([recover_scan(file, say)], [])
+        run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
+        found, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
         for said in left_out:
             click.echo(f"Warning: {said}", err=True)
         for sink in sinks:

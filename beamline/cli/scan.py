@@ -26,7 +26,7 @@ from beamline.instrument.connect import describe
 from beamline.instrument.operator import ask_operator
 from beamline.scan.live_process import LiveCommand, finished_command, follow_command, live_plan
 from beamline.scan.preflight import dry_run, refuse_violations
-from beamline.scan.resume import ResumableRun, open_for_resume
+from beamline.scan.resume import NotJoined, ResumableRun, open_for_resume, recover_run
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import RECON
 from beamline.storage.flag_legend import counted
@@ -87,7 +87,13 @@ def scan(
         raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
     with json_events(as_json) as json_sinks, ExitStack() as held:
         config = None if file is None else load(file, overrides)
-        series = None if run is None else held.enter_context(open_for_resume(run, config))
+        try:
+            series = None if run is None else held.enter_context(open_for_resume(run, config))
+        except NotJoined:
+            if dry or run is None:
+                raise
+            _join(run, json_sinks)
+            return
         config = series.config if series else config
         assert config is not None
         for said in series.left_out if series else ():
@@ -106,6 +112,18 @@ def scan(
         click.echo(_results(result))
     if faults := _faults(result):
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
+    """Do what a run lacks that has all its frames, and say it as `beamline recover` does."""
+    found, left_out = recover_run(run)
+    for said in left_out:
+        click.echo(f"Warning: {said}", err=True)
+    for done in found:
+        for sink in json_sinks:
+            sink(Event("done", SystemClock().now(), vars(done)))
+        if not json_sinks:
+            click.echo(done.said())
 
 
 def _faults(result: RunResult) -> list[str]:

@@ -17,6 +17,26 @@ from beamline.core.errors import DataError
 
 PART = "part-{}"
 """The folder of a later part of a scan that was resumed, in that of the run."""
+EVENTS = "events.jsonl"
+"""What happened in a run, or in a later part of it, in its folder."""
+
+
+def parts_of(run: Path) -> list[Path]:
+    """The folders of a run's parts, in order: its own, and one for each time that it was resumed."""
+    return [run, *(part for _, part in sorted(_numbered(run).items()))]
+
+
+def create_part(run: Path) -> Path:
+    """The folder of a new part, after the others."""
+    folder = run / PART.format(max(_numbered(run), default=1) + 1)
+    folder.mkdir()
+    return folder
+
+
+def _numbered(run: Path) -> dict[int, Path]:
+    found = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*"))}
+    return {int(number): part for number, part in found.items() if number.isdecimal()}
+
 
 _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
 

@@ -58,6 +58,10 @@ class Profile:
     jump: float = 0.0
     flagged: int = 0
 
+    def apart(self) -> Profile:
+        """Before a frame that is no neighbour of the last one: two frames more give velocities first."""
+        return Profile((), self.change, min(self.seen, CALIBRATION - 3))
+
 
 @dataclass(frozen=True, eq=False)
 class BandsState:
@@ -111,6 +115,8 @@ class Bands:
         """Rows, then columns: the profiles after the frame, and the finding."""
         dark = np.zeros((1, 1), np.float32) if context.dark is None else context.dark
         dark = np.broadcast_to(dark, digest.preview.shape)
+        if not context.follows:
+            profiles = profiles[0].apart(), profiles[1].apart()
         rows, row_band = self._compare(profiles[0], lines[0], digest.preview, dark)
         cols, col_band = self._compare(profiles[1], lines[1], digest.preview.T, dark.T)
         if row_band is None and col_band is None:
@@ -140,6 +146,9 @@ class Bands:
         """Compare the lines of a frame with those before: the profile after it, and (first, after, loss, limit)."""
         lines = np.log(np.maximum(means.astype(np.float64), LEAST_LIGHT))
         if not profile.last or profile.last[-1].shape != lines.shape:
+            known = profile.change is not None and profile.change.shape == lines.shape
+            if known:
+                return Profile((lines,), profile.change, profile.seen + 1, blocks), None
             return Profile((lines,), np.zeros_like(lines), 1, blocks), None
         if profile.flagged:
             first, after, darker = profile.first, profile.after, profile.jump < 0

@@ -82,6 +82,8 @@ class Blur:
             return Look(_with_reference(state, frame))
         if context.view is None:
             return Look(state)
+        if not context.follows:  # a sample may be less sharp from there
+            state = replace(state, across=Scatter(), down=Scatter(), blurred=0)
         across, down = sharpness(_lines(frame), state.dark, state.flat)
         after = replace(state, kind=frame.kind, across=_updated(state.across, across), down=_updated(state.down, down))
         if not after.across.ready:

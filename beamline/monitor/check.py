@@ -78,6 +78,8 @@ class ScanContext:
         saturation: the count from which a pixel is saturated.
         pixels: of a frame.
         period: s between the triggers of a fly scan; None where frames come when the stage is ready (step scan).
+        step: rad from a view to the next, as planned: the median, with its sign; NaN: not known, or they do not turn
+            one way.
         stored: views that are in an earlier file of the scan.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
@@ -87,6 +89,9 @@ class ScanContext:
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
         spots: bright pixels that the frame before had not, of views and flats.
+        follows: the view before it in the file is its neighbour in angle, or there is none. Not so where views are
+            taken again, at a new pass, or after views of another file: checks that compare neighbours begin anew there.
+            True where `step` is not known.
         light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
             projection.
         view: the frame on this grid; None where it is no projection, or has no light.
@@ -98,6 +103,7 @@ class ScanContext:
     saturation: float
     pixels: int
     period: float | None = None
+    step: float = math.nan
     stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None
@@ -107,6 +113,7 @@ class ScanContext:
     flat_exposure: float = math.nan
     grid: Grid | None = None
     spots: Spots = NO_SPOTS
+    follows: bool = True
     light_left: float = 1.0
     view: View | None = None
     truncated: bool = False

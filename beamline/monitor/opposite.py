@@ -109,9 +109,9 @@ class Opposite:
             why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
             advice = f"Views from opposite sides are not compared: {why}."
             return Look(replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice))
-        kept = state.kept
+        kept = tuple(one for one in state.kept if one.view.index != frame.replaces)  # what it replaces had an alarm
         if kept and kept[-1].after is None:
-            kept = (*kept[:-1], replace(kept[-1], after=view))
+            kept = (*kept[:-1], replace(kept[-1], after=view)) if context.follows else kept[:-1]
         elif len(kept) < MOST and all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept):
             kept = (*kept, Kept(view))
         state = replace(state, kept=kept)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.change import SPAN, change_of
+from beamline.monitor.change import MOST_STEPS, SPAN, change_of
 from beamline.monitor.check import Check, Flag, Look, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
@@ -21,6 +21,9 @@ from drivers.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
 FORGET = 0.99  # a view: what was at the edge a quarter of a turn ago may come back
+NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # steps as planned that a view is beyond the one before, as its neighbour
+ONE_WAY = 0.75  # of the steps, which golden angles have not: 0.62
+EVERY, MOST = math.radians(5), 72  # between the views that are kept for others near them that come later; number
 DARK = 0.5  # light left of the view before: less is no view, see the check `lost`
 
 
@@ -34,7 +37,8 @@ class Monitor:
         states: of the checks, in their order.
         kind, counted: of the latest group of frames: their kind, and how many there are.
         before: digest of the frame before; None before any.
-        recent: the last projections with light, oldest first.
+        recent: the last projections with light, oldest first, each a neighbour of the one before in angle.
+        kept: a projection with light every few degrees.
         cut: usual line integral at the worse edge of the field, over the views so far.
     """
 
@@ -45,7 +49,17 @@ class Monitor:
     counted: int = 0
     before: FrameDigest | None = None
     recent: tuple[View, ...] = ()
+    kept: tuple[View, ...] = ()
     cut: float = 0.0
+
+
+def usual_step(angles: NDArray[np.float64]) -> float:
+    """Median step from one of these angles, in the order of their views, to the next; NaN where they do not turn one
+    way (golden or random angles), so that no view has its neighbour beside it."""
+    steps = np.diff(angles)
+    steps = steps[np.isfinite(steps) & (steps != 0)]
+    share = float((steps > 0).mean()) if steps.size else 0.5
+    return float(np.median(steps)) if max(share, 1 - share) > ONE_WAY else math.nan
 
 
 def start(context: ScanContext, checks: Sequence[Check] = CHECKS) -> Monitor:
@@ -94,7 +108,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     """The monitor with what all checks need of a projection."""
     context = monitor.context
     spots = spots_of(frame, digest, monitor.before, context.dark, context.saturation)
-    context = replace(context, view=None, change=None, light_left=1.0, spots=spots)
+    context = replace(context, view=None, change=None, light_left=1.0, spots=spots, follows=True)
     if frame.kind is not FrameKind.PROJECTION:
         return replace(monitor, context=context)
     grid = context.grid
@@ -103,17 +117,32 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
         grid = grid_of(digest.preview.shape, block, context.dark, context.flat)
     longer = more_light(context, frame.exposure) if grid.flats else 1.0
     view = view_of(digest.preview, grid, frame.index, frame.angle, longer)
-    left = light_left(view, monitor.recent[-1] if monitor.recent else None, grid)
-    context = replace(context, grid=grid, light_left=left)
+    recent, last = monitor.recent, monitor.recent[-1] if monitor.recent else None
+    steps = math.nan if last is None else math.remainder(view.angle - last.angle, 2 * math.pi) / context.step
+    follows = math.isnan(steps) or NEAREST < steps < FARTHEST
+    if not follows:  # what it is compared with must be its neighbour in angle
+        recent, last = (), _nearest(view.angle, monitor.kept)
+        context = replace(context, spots=spots._replace(n=0))
+    left = light_left(view, last, grid)
+    context = replace(context, grid=grid, light_left=left, follows=follows)
     if left < DARK:
         return replace(monitor, context=context)
-    change = change_of(view, monitor.recent, grid)
+    change = change_of(view, recent, grid)
     view = replace(view, brighter=0.0 if change is None else math.log1p(change.gain))
-    recent = (*monitor.recent, view)[-SPAN:]
+    recent = (*recent, view)[-SPAN:]
+    kept = monitor.kept
+    if len(kept) < MOST and math.isfinite(view.angle) and _nearest(view.angle, kept) is None:
+        kept = (*kept, view)
     cut = max(max(view.edges), FORGET * monitor.cut)
     wider = not grid.flats or cut > AIR
     context = replace(context, view=view, change=change, truncated=wider)
-    return replace(monitor, context=context, recent=recent, cut=cut)
+    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut)
+
+
+def _nearest(angle: float, kept: Sequence[View]) -> View | None:
+    """The view that is nearest in angle, within EVERY; None where none is."""
+    apart = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in kept]
+    return kept[int(np.argmin(apart))] if apart and min(apart) < EVERY else None
 
 
 def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:

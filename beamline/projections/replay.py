@@ -15,7 +15,7 @@ from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import digest
 from beamline.monitor.references import full_scale
-from beamline.monitor.watch import look, start
+from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from drivers.clock import Clock
@@ -147,12 +147,20 @@ def context_of(source: ScanSource) -> ScanContext:
     fly = source.plan.get("mode") == "fly"
     period = (float(source.attributes.get("period_s", 0)) or None) if fly else None
     context = ScanContext(
-        _saturation(source), rows * cols, period, cone=source.cone is not None, axis_col=source.axis_col
+        _saturation(source), rows * cols, period, _step(source), cone=source.cone is not None, axis_col=source.axis_col
     )
     if source.quantity != "line_integrals":
         return context
     preview = digest(np.zeros(source.shape, np.uint16), preview_bin=PREVIEW_BIN).preview
     return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0)
+
+
+def _step(source: ScanSource) -> float:
+    """Radians from a view to the next, as the plan of our own scans has them, or as the file has its views."""
+    planned = source.plan.get("angles_deg")
+    if isinstance(planned, list) and all(isinstance(angle, int | float) for angle in planned):
+        return usual_step(np.radians(planned))
+    return usual_step(source.angles[source.image_key == FrameKind.PROJECTION])
 
 
 def _saturation(source: ScanSource) -> float:

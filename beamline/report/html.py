@@ -38,7 +38,7 @@ class Report:
         settings: of the reconstruction.
         metrics: by method, then by name of the metric (see METRICS); a method may lack some.
         frames: frames in the file of those triggered, e.g. "90/90".
-        flags: warnings of the monitor and of the reconstruction.
+        flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
         pictures: in order.
         command: that repeats the reconstruction.
         recipe: its options that hold for other scans; empty: none are shown.

@@ -101,7 +101,7 @@ def logbook(report: Report, volume: Volume, unit: str, now: float) -> Figure:
     room = max(int((page.y - _MARGIN - below - _HEADING) / _line(_SIZE) + 1e-6), 1)
     if len(flags) > room:
         flags = [*flags[: room - 1], f"... and more, {len(flags) - room + 1} lines of {len(flags)}: see the report."]
-    page.heading("Flags and warnings")
+    page.heading("Remarks")
     page.raw(flags, _SIZE)
     page.heading("To repeat")
     page.raw(command, _SMALL, family="monospace")

@@ -15,8 +15,9 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import EVENTS, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
-from beamline.scan.run_folder import CONTROL, EVENTS, SCAN, parts_of
+from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 

@@ -21,7 +21,7 @@ from beamline.instrument import connect
 from beamline.instrument.connect import Instrument, camera_settings
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
-from beamline.monitor.watch import Monitor
+from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
@@ -201,6 +201,7 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
         saturation=2**timing.bits - 1,
         pixels=math.prod(timing.shape),
         period=timeline.views.period if plan.mode is Mode.FLY else None,
+        step=usual_step(plan.angles),
         stored=plan.stored,
         cone=info.source_distance_mm is not None,
         axis_col=info.axis_col,

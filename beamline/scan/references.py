@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.references import Reference, ReferenceLimits, judge
+from beamline.monitor.references import Reference, ReferenceLimits, judge, photons
 from beamline.plan.plan import Block
 from drivers.frame import Frame, FrameKind
+from recon.base.choices import FEW_PHOTONS
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
 VIEWS = 4  # enough for a median
@@ -53,3 +55,27 @@ class ReferenceLog:
         }
         judged = judge(self._groups, limits, self._views)
         return missing | {group.name: group.described() for group in judged if group.faults}
+
+    def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
+        """A sentence or more where noise would rule the views: a pixel of the open beam has few photons. Else None.
+
+        Args:
+            exposure: s, of the views.
+        """
+        judged = judge(self._groups, limits, self._views)
+        good = [group for group, found in zip(self._groups, judged, strict=True) if not found.faults]
+        flats, darks = (
+            next((group for group in good if group[0].kind is kind), None) for kind in (FrameKind.FLAT, FrameKind.DARK)
+        )
+        found = photons(flats, darks) if flats and darks else None
+        if not flats or found is None:
+            return None
+        found *= exposure / flats[0].exposure if flats[0].exposure > 0 else 1.0
+        if not found < FEW_PHOTONS:
+            return None
+        return (
+            f"Too little light: in the views a pixel of the open beam has {found:.3g} photons, by mean and variance of "
+            f"the flats {spans([flat.row for flat in flats])}; expected {FEW_PHOTONS} or more, else noise rules the "
+            f"volume. Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s to "
+            "match), or bin the camera's pixels (devices.camera.binning). `beamline tune` measures it."
+        )

@@ -8,7 +8,7 @@ file joins them all.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,20 @@ import h5py
 
 from beamline.config.load import Config, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import EVENTS, create_part, parts_of
 from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
-from beamline.scan.run_folder import CONFIG, EVENTS, SCAN, create_part, parts_of
+from beamline.scan.run_folder import CONFIG, SCAN
 from beamline.storage import hdf5
-from beamline.storage.parts import JOINED, end_references_missing, join, views_in, views_planned
+from beamline.storage.parts import (
+    JOINED,
+    end_references_missing,
+    is_joined,
+    join,
+    may_hold_frames,
+    views_in,
+    views_planned,
+)
 from beamline.storage.recover import Recovered, recover
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
@@ -72,22 +81,28 @@ class ResumableRun:
         return replace(plan, stored=self.views, end_references=self.end_references)
 
     def begin(self, ready: ReadyScan) -> Path:
-        """Make ordinary files of the parts whose writer died, and the folder of the new part.
+        """Make ordinary files of the parts whose writer died, join them, and make the folder of the new part.
 
         Raises:
             ConfigError: plan, frames or devices are not what they were; nothing was changed.
-            DataError: a part cannot be recovered.
+            DataError: a part cannot be recovered, or the parts cannot be joined.
         """
         with hdf5.open_hdf5(self.parts[0]) as first, hdf5.readable(self.parts[0]):
             _require_same_instrument(self.run, first, ready)
         for part in self.parts:
             recover(part)
+        if len(self.parts) > 1 and not is_joined(self.run / JOINED):  # for the case that the new part takes no frame
+            join(self.parts, self.run / JOINED)
         return create_part(self.run)
 
     def join(self, part: Path) -> tuple[Path, int]:
         """Join the parts with the new one: the file that has them all, and its frames."""
         joined = self.run / JOINED
         return joined, join([*self.parts, part], joined)
+
+
+class NotJoined(ConfigError):  # noqa: N818 - an outcome, not a defect
+    """A run lacks no frame, but a file of it was not closed, or its parts are not joined: `recover_run` does both."""
 
 
 @contextmanager
@@ -98,7 +113,8 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         given: a configuration that must be the run's.
 
     Raises:
-        ConfigError: it is no run, it goes on already, its configuration differs, or nothing is missing.
+        ConfigError: it is no run, it goes on already, its configuration differs, or nothing is missing; NotJoined where
+            `recover_run` is all that it lacks.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if not (run / SCAN).is_file() or not (run / CONFIG).is_file():
@@ -122,7 +138,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
         if held(part):
             raise ConfigError(f"{part} is open in another process: a scan that still runs, or a reader. {_UNTOUCHED}")
     config = load(run / CONFIG, environment={})
-    views, planned, last_frame_time, parts = set[int](), 0, 0.0, list[Path]()
+    views, planned, last_frame_time, parts, closed = set[int](), 0, 0.0, list[Path](), True
     for part in found:
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             if layout.COMMITTED not in file:
@@ -135,6 +151,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
             planned = angles
             if file[layout.COMMITTED][()]:
                 parts.append(part)
+                closed = closed and bool(file[layout.FINISHED][()])
                 views |= views_in(file)
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
@@ -144,7 +161,11 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
         with ExitStack() as opened:
             end_references = end_references_missing([opened.enter_context(hdf5.open_hdf5(part)) for part in parts])
         if not end_references:
-            raise ConfigError(f"{run} has all {planned} views and its references: nothing is missing. {_UNTOUCHED}")
+            whole = f"{run} has all {planned} views and its references"
+            if not closed or (len(parts) > 1 and not is_joined(run / JOINED)):
+                what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
+                raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
+            raise ConfigError(f"{whole}: nothing is missing. {_UNTOUCHED}")
     return ResumableRun(
         run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
     )
@@ -157,21 +178,11 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
     for part in parts_of(run):
         if not (part / SCAN).is_file():
             continue
-        if part == run or _took_frames(part):
+        if part == run or may_hold_frames(part / SCAN):
             files.append(part / SCAN)
         else:
             left_out.append(f"{part / SCAN} is left out: no frame can be read in it, and its {EVENTS} names none.")
     return files, left_out
-
-
-def _took_frames(part: Path) -> bool:
-    """Whether a part may hold frames: its file has one, or its events (which may lack the last ones) name one."""
-    with suppress(DataError), hdf5.open_hdf5(part / SCAN) as file, hdf5.readable(part / SCAN):
-        if file[layout.COMMITTED][()]:
-            return True
-    with suppress(OSError):
-        return '"event": "frame"' in (part / EVENTS).read_text(encoding="utf-8", errors="replace")
-    return True
 
 
 def _require_same_config(run: Path, stored: str, other: str) -> None:
@@ -223,7 +234,10 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
         raise DataError(f"{run} is no folder of a run: it has no {SCAN}. {_UNTOUCHED}")
     done = [recover(part, say) for part in found]
     if len(parts := [one.path for one in done if one.frames]) > 1:
-        frames = join(parts, run / JOINED)
+        changed = not is_joined(run / JOINED)
+        if changed:
+            join(parts, run / JOINED)
         with hdf5.open_hdf5(run / JOINED) as file:
-            done.append(Recovered(run / JOINED, True, frames, 0, (views_planned(file) or 0) - len(views_in(file))))
+            frames, missing = int(file[layout.COMMITTED][()]), (views_planned(file) or 0) - len(views_in(file))
+            done.append(Recovered(run / JOINED, changed, frames, 0, missing))
     return done, left_out

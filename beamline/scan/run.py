@@ -17,6 +17,7 @@ from beamline.config.monitor import policies
 from beamline.config.references import reference_limits
 from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
+from beamline.core.files import EVENTS
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
@@ -34,7 +35,7 @@ from beamline.scan.live_process import LiveCommand, LiveReconstruction
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.scan.resume import ResumableRun
-from beamline.scan.run_folder import CONFIG, EVENTS, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
+from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, Supervision
 from beamline.scan.watchdog import watched
@@ -52,6 +53,8 @@ is there within 10: what the scan takes to end counts."""
 
 READY_WITHIN = 300.0
 """Real s that a scan waits for its live reconstruction before the first frame: it compiles, once on a machine."""
+
+_LITTLE_LIGHT = "little light"
 
 UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
@@ -185,7 +188,7 @@ class _Run:
     series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
     told: set[str] = field(default_factory=set)
-    """Groups of references whose faults were told."""
+    """Groups of references whose faults were told, and `_LITTLE_LIGHT` where that was."""
 
     @cached_property
     def states(self) -> StateMachine:
@@ -260,6 +263,7 @@ class _Run:
         disk = _failure_of(recorder.finish)
         error = self._worse(error, disk)
         faults = self._reference_faults(recorder)
+        self._tell_little_light(recorder)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
         missing = acquisition.missing
         # A write that does not return holds HDF5's lock: closing the file would wait for it.
@@ -368,6 +372,7 @@ class _Run:
     def _refusal(self, recorder: Recorder) -> str | None:
         """Why no projection should be taken after these darks and flats; None where none, or the operator wants it."""
         recorder.wait()
+        self._tell_little_light(recorder)
         blocks = self.ready.timeline.blocks
         faults = self._reference_faults(recorder, blocks[: blocks.index(self.ready.timeline.views)])
         if not faults or self.config.references.on_fault == "log":
@@ -407,6 +412,13 @@ class _Run:
             self.told.add(group)
             self.emit("warning", {"message": faults[group]})
         return faults
+
+    def _tell_little_light(self, recorder: Recorder) -> None:
+        """Once a scan, as soon as there are flats: before the views, where the plan has flats before them."""
+        said = recorder.references.too_little_light(reference_limits(self.config.references), self.ready.plan.exposure)
+        if said is not None and _LITTLE_LIGHT not in self.told:
+            self.told.add(_LITTLE_LIGHT)
+            self.emit("warning", {"message": said})
 
     def _beam_log(self) -> BeamLog:
         chosen = self.config.devices.beam_monitor

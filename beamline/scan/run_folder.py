@@ -9,10 +9,8 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO
 
-from beamline.core.files import PART
-
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
-EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
+USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
 
 
@@ -26,23 +24,6 @@ def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
             folder.mkdir()
             break
     return folder
-
-
-def parts_of(run: Path) -> list[Path]:
-    """The folders of a run's parts, in order: its own, and one for each time that it was resumed."""
-    return [run, *(part for _, part in sorted(_numbered(run).items()))]
-
-
-def create_part(run: Path) -> Path:
-    """The folder of a new part, after the others."""
-    folder = run / PART.format(max(_numbered(run), default=1) + 1)
-    folder.mkdir()
-    return folder
-
-
-def _numbered(run: Path) -> dict[int, Path]:
-    found = {part.name.rpartition("-")[2]: part for part in run.glob(PART.format("*"))}
-    return {int(number): part for number, part in found.items() if number.isdecimal()}
 
 
 @contextmanager

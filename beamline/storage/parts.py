@@ -1,15 +1,18 @@
 """Parts: a scan that was resumed lies in several files; the views that each holds, and one file that joins them.
 
 The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view): it
-holds no frame itself, so that it can be made again at any time, and the files that do are never written again.
+holds no frame itself, so that it can be made again at any time, and the files that do are never written again. It
+records name, number of frames and digest of each part, so that a reader finds out whether these are its parts still,
+and all of them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import PART, whole_file
+from beamline.core.files import EVENTS, parts_of, whole_file
 from beamline.storage import hdf5
+from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.to_disk import to_disk
 from drivers.frame import FrameKind
 
 JOINED = "joined.h5"
@@ -96,23 +101,45 @@ def join(parts: Sequence[Path], joined: Path) -> int:
         parts: closed files of one scan, each with a frame at least. They are only read.
 
     Raises:
-        DataError: one cannot be read, or the disk does not take the file: what was there stays.
+        DataError: one cannot be read or was not closed, or the disk does not take the file: what was there stays.
     """
+    for part in parts:  # HDF5 draws nothing from a file that is marked as being written
+        if (head := superblock(part)) is not None and head.open_for_writing:
+            raise DataError(f"{joined} could not be made: {part} was not closed. The parts are untouched.")
     with whole_file(joined, replace=True) as partial, ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         try:
             with hdf5.created(partial, layout.LIBVER) as file:
-                return _join(files, [os.path.relpath(part, joined.parent) for part in parts], file)
+                names = [Path(os.path.relpath(part, joined.parent)).as_posix() for part in parts]
+                frames = _join(files, names, file)
+                file.flush()
+                to_disk(file.id.get_vfd_handle())
+                return frames
         except hdf5.ALTERED as error:
             raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
 
 
 def other_parts(part: Path) -> list[Path]:
-    """The files of the other parts of its run, joined or not."""
+    """The files of the other parts of its run that may hold frames, joined or not."""
     part = part.resolve()
-    run = part.parent.parent if part.parent.match(PART.format("*")) else part.parent
-    files = (run / part.name, *sorted(run.glob(f"{PART.format('*')}/{part.name}")))
-    return [file for file in files if file.is_file() and file != part]
+    run = part.parent.parent if part.parent in parts_of(part.parent.parent) else part.parent
+    files = (folder / part.name for folder in parts_of(run))
+    return [file for file in files if file != part and may_hold_frames(file)]
+
+
+def may_hold_frames(part: Path) -> bool:
+    """Whether the file of a part has a frame, or cannot be read and its events (which may lack the last ones) name one.
+
+    A part that ended before its first frame is none.
+    """
+    if not part.is_file():
+        return False
+    with suppress(DataError), hdf5.open_hdf5(part) as file, hdf5.readable(part):
+        if file[layout.COMMITTED][()]:
+            return True
+    with suppress(OSError):
+        return '"event": "frame"' in part.with_name(EVENTS).read_text(encoding="utf-8", errors="replace")
+    return True
 
 
 def joined_file_of(part: Path) -> tuple[Path, int] | None:
@@ -132,6 +159,55 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
     return None
 
 
+def require_joined(file: h5py.File) -> None:
+    """DataError where a joined file draws frames from parts that are not those it was made of, or lacks one of them.
+
+    Nothing is asked of a file that holds its frames itself, such as an archived one.
+    """
+    if layout.PART_STARTS not in file or not file[layout.DATA].is_virtual:
+        return
+    joined = Path(file.filename)
+    if why := _disagreement(file, joined.parent):
+        raise DataError(
+            f"{joined} does not have the frames of its scan: {why}. `beamline recover {joined.parent}` joins the parts "
+            "that are there; where parts are elsewhere, copy the folder of the run as a whole. Nothing was changed."
+        )
+
+
+def is_joined(joined: Path) -> bool:
+    """Whether this file is there and has the frames of all parts of its scan."""
+    try:
+        with hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
+            require_joined(file)
+    except DataError:
+        return False
+    return True
+
+
+def _disagreement(joined: h5py.File, folder: Path) -> str:
+    if layout.PARTS not in joined:
+        return "it does not say what its parts are"
+    names, frames, digests = (joined[f"{layout.PARTS}/{column}"][()] for column in ("name", "frames", "digest"))
+    parts = [folder / hdf5.text(name) for name in names]
+    for part, n, digest in zip(parts, frames, digests, strict=True):
+        if not part.is_file():
+            return f"its part {part} is not there"
+        with hdf5.open_hdf5(part) as file, hdf5.readable(part):
+            found = int(file[layout.COMMITTED][()])
+            if found != n or _digest(file) != hdf5.text(digest):
+                return f"its part {part} has {found} frames that are not the {n} which it was made of"
+    others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
+    return f"it lacks those of {others[0]}" if others else ""
+
+
+def _digest(part: h5py.File) -> str:
+    """SHA-256 of what the file says of its frames: kind, angle, time, ..., and the checksum of their pixels."""
+    n, found = int(part[layout.COMMITTED][()]), hashlib.sha256()
+    for path in layout.COLUMNS:
+        found.update(part[path][:n].tobytes())
+    return found.hexdigest()
+
+
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:
     rows = [int(file[layout.COMMITTED][()]) for file in files]
     firsts = np.cumsum([0, *rows])
@@ -147,7 +223,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         item = files[0][path]
         virtual = h5py.VirtualLayout((firsts[-1], *item.shape[1:]), item.dtype)
         for file, name, first, n in zip(files, names, firsts[:-1], rows, strict=True):
-            virtual[first : first + n] = h5py.VirtualSource(Path(name).as_posix(), path, file[path].shape)[:n]
+            virtual[first : first + n] = h5py.VirtualSource(name, path, file[path].shape)[:n]
         hdf5.copy_attributes(item, joined.create_virtual_dataset(path, virtual))
     for path, item in _links(files[0]):
         joined[path] = joined[item]
@@ -155,12 +231,22 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
         del joined[path]
         files[-1].copy(path, joined, path)
     joined[layout.PART_STARTS] = firsts[:-1].astype(np.int64)
+    _name_parts(files, names, rows, joined)
     joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
     _name_missing(files, joined)
     joined[layout.IMAGE_KEY_CONTROL] = joined[layout.KIND]
     layout.state_field_of_view(joined, layout.view_angles(joined))
     add_exchange_view(joined)
     return int(firsts[-1])
+
+
+def _name_parts(files: Sequence[h5py.File], names: Sequence[str], rows: Sequence[int], joined: h5py.File) -> None:
+    group = joined.create_group(layout.PARTS)
+    group.attrs["NX_class"] = "NXcollection"
+    text = h5py.string_dtype("utf-8")
+    group.create_dataset("name", data=list(names), dtype=text)
+    group.create_dataset("frames", data=np.array(rows, np.int64))
+    group.create_dataset("digest", data=[_digest(file) for file in files], dtype=text)
 
 
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:

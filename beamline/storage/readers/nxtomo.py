@@ -19,6 +19,7 @@ from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.hdf5 import require_real
+from beamline.storage.parts import require_joined
 from beamline.storage.readers.base import WHOLE, Format, Opening, Quantity, ScanReader, count_in_blocks, frame_indices
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
@@ -69,6 +70,8 @@ class NXtomoSource(ScanReader):
             if item is not None:
                 require_real(item.dtype, f"{item.name} in {self.path}")
         hdf5.require_possible(self._places.data)
+        if self._ours:
+            require_joined(self._file)
         lost = hdf5.missing_links(self._places.data)
         if lost:
             raise DataError(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
-from beamline.storage.parts import joined_file_of
+from beamline.storage.parts import is_joined, joined_file_of, other_parts
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
@@ -279,9 +279,14 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
 
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """A part of a scan that was resumed is not all of it."""
-    if source.part_starts.size == 1 and (found := joined_file_of(source.path)) is not None:
+    if source.part_starts.size > 1:
+        return
+    if (found := joined_file_of(source.path)) is not None and is_joined(found[0]):
         joined, n = found
         yield Finding("warning", "parts", f"This file is one of {n} parts of a scan: {joined} has the frames of all.")
+    elif others := other_parts(source.path):
+        said = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
+        yield Finding("warning", "parts", f"{said}: `beamline recover RUN` joins them.")
 
 
 SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (

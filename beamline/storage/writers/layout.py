@@ -12,6 +12,7 @@
       digest                    statistics of each frame, and preview f32 [frame, row, col]
       record/beam               NXlog: time, value of the beam monitor, where there is one (written at the end)
       record/part_starts        of a scan in parts: the first row of each (see storage.parts)
+      record/parts              of joined.h5: name, frames and digest of each file that it draws from
       record                    plan (JSON), config (YAML), period, axis_col, quantity, program, source_distance
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
@@ -71,6 +72,7 @@ STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 PART_STARTS = "/entry/record/part_starts"
 EXCHANGE = "/exchange"
+PARTS = "/entry/record/parts"
 END_TIME = "/entry/end_time"
 BEAM = "/entry/record/beam"
 AXIS_COL = "/entry/record/axis_col"

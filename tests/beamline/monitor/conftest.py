@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,6 +74,14 @@ class FakeScan:
             for i in range(first, first + n)
         ]
 
+    def again(
+        self, views: Iterable[int], first: int, light: float = 1.0, discs: Iterable[tuple[float, ...]] = DISCS
+    ) -> list[Frame]:
+        """Views that are taken again after the last one; view 0 is row `first`."""
+        discs = tuple(discs)
+        taken = [self.frame(FrameKind.PROJECTION, light * self.expected(i * STEP, discs), i * STEP) for i in views]
+        return [replace(frame, replaces=first + i) for frame, i in zip(taken, views, strict=True)]
+
     def references(self) -> list[Frame]:
         return self.darks() + self.flats()
 
@@ -82,9 +91,11 @@ class FakeScan:
         period: float | None = PERIOD,
         checks: Sequence[Check] = CHECKS,
         stored: frozenset[int] = frozenset(),
+        step: float = np.nan,
     ) -> list[Flag]:
         """All flags of a fresh monitor that sees `frames`."""
-        state = scan.start(ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period, stored=stored), checks)
+        context = ScanContext(saturation=SATURATION, pixels=ROWS * COLS, period=period, step=step, stored=stored)
+        state = scan.start(context, checks)
         flags: list[Flag] = []
         for frame in frames:
             state, found = scan.look(state, frame, digest(frame.counts, SATURATION, 4))

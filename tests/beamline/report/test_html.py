@@ -68,11 +68,19 @@ def test_metrics_stand_in_their_method_column() -> None:
     assert "NRMSE" not in page
 
 
-def test_flags_are_counted_and_listed() -> None:
+def test_remarks_are_counted_and_listed() -> None:
     text = "".join(parsed_page(to_html(_report(flags=["axis <not> confident", "beam low"]))).text)
-    assert "2 flags" in text
+    assert "2 remarks" in text
     assert "axis <not> confident" in text
-    assert "No flags" in "".join(parsed_page(to_html(_report())).text)
+    assert "No remarks" in "".join(parsed_page(to_html(_report())).text)
+
+
+def test_a_fact_that_marks_no_frame_is_no_flag() -> None:
+    """The table beside it says how many frames the monitor flagged: none."""
+    fact = "Info (field, frame 24): The sample goes on beyond the left edge of the field"
+    said = "".join(parsed_page(to_html(_report(flags=[fact], scan={"flagged by the monitor": "none"}))).text)
+    assert "1 remark of the monitor and the reconstruction" in said and fact in said
+    assert "1 flag" not in said and "none" in said
 
 
 def test_a_template_without_one_of_its_values_is_no_page() -> None:

@@ -136,3 +136,59 @@ def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:
     assert log.faults(ReferenceLimits()) != {}
     add(6, FrameKind.FLAT, 20000, replaces=4)
     assert log.faults(ReferenceLimits()) == {}
+
+
+def _log(photons: float, exposure: float = 0.1, *, moving: float = 0.0, n_flats: int = 10) -> ReferenceLog:
+    """Darks and flats with so many photons a pixel in the middle of a round beam, which moves from flat to flat."""
+    rng, log, place = np.random.default_rng(5), ReferenceLog(4), np.linspace(-1, 1, 128)
+    for i in range(10 + n_flats):
+        beam = np.exp(-0.5 * (place + moving * rng.normal()) ** 2) * np.ones((96, 1)) * (i >= 10)
+        counts = 120 + 4.0 * rng.poisson(photons / np.median(np.exp(-0.5 * place**2)) * beam)
+        image = (counts + rng.normal(0, 3, counts.shape)).round().astype(np.uint16)
+        kind = FrameKind.FLAT if i >= 10 else FrameKind.DARK
+        frame = Frame(image, kind, i, i, i, np.nan, float(i), exposure)
+        log.add(frame, digest(image, 65535, 4))
+    return log
+
+
+@pytest.mark.parametrize(("photons", "moving"), [(5.0, 0.0), (14.5, 0.0), (60.0, 0.0), (60.0, 0.01)])
+def test_too_little_light_is_told_with_its_photons(photons: float, moving: float) -> None:
+    said = _log(photons, moving=moving).too_little_light(ReferenceLimits(), 0.1)
+    assert said is not None
+    found = float(said.split("has ")[1].split(" photons")[0])
+    assert found == pytest.approx(photons, rel=0.1)
+    assert float(said.split("scan.exposure_s=")[1].split(",")[0]) == pytest.approx(0.1 * 100 / photons, rel=0.15)
+
+
+@pytest.mark.parametrize(("photons", "moving"), [(150.0, 0.0), (5000.0, 0.0), (5000.0, 0.03)])
+def test_enough_light_is_not_told_for_too_little(photons: float, moving: float) -> None:
+    assert _log(photons, moving=moving).too_little_light(ReferenceLimits(), 0.1) is None
+
+
+def test_the_views_exposure_counts_and_one_flat_tells_nothing() -> None:
+    assert _log(60.0, exposure=0.1).too_little_light(ReferenceLimits(), 0.3) is None
+    assert _log(200.0, exposure=0.1).too_little_light(ReferenceLimits(), 0.025) is not None
+    assert _log(14.5, n_flats=1).too_little_light(ReferenceLimits(), 0.1) is None
+
+
+def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text((config_folder() / "scenes" / "low_dose.yaml").read_text().replace("s: 300.0", "s: 290.0"))
+    events: list[Event] = []
+    config = load(
+        config_folder() / "simulated.yaml",
+        [
+            f"simulation.scene={scene}",
+            "scan.angles.views=4",
+            "scan.mode=step",
+            "recon.live=false",
+            "scan.exposure_s=0.05",
+        ],
+        environment={},
+    )
+    run_scan(config, tmp_path / "runs", [events.append])
+    told = [i for i, event in enumerate(events) if "Too little light" in str(event.data.get("message"))]
+    views = [i for i, e in enumerate(events) if e.event == "block_started" and e.data["kind"] == "projection"]
+    assert len(told) == 1 and told[0] < views[0]
+    found = float(events[told[0]].data["message"].split("has ")[1].split(" photons")[0])
+    assert found == pytest.approx(14.5, rel=0.1)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import BeamlineError, ConfigError
+from beamline.core.files import parts_of
 from beamline.core.stop import StopRequest
 from beamline.projections.prepare import checked_views, prepare_projections
 from beamline.projections.selection import Selection
@@ -21,7 +22,6 @@ from beamline.scan import control
 from beamline.scan.control import Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
 from beamline.scan.run import RunResult, run_scan
-from beamline.scan.run_folder import parts_of
 from beamline.scan.states import State
 from beamline.storage.describe import describe
 from beamline.storage.hdf5 import open_hdf5
