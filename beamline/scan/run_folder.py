@@ -15,6 +15,9 @@ SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 EVENTS, USER_LOG, RECON_LOG = "events.jsonl", "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
 
+OURS = 0o755
+"""Mode of a folder in which nobody else may put one file in the place of another, whatever the umask."""
+
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
     """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
@@ -23,7 +26,7 @@ def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
     for number in count(1):
         folder = runs / (stem if number == 1 else f"{stem}-{number}")
         with suppress(FileExistsError):
-            folder.mkdir()
+            folder.mkdir(mode=OURS)
             break
     return folder
 
@@ -36,7 +39,7 @@ def parts_of(run: Path) -> list[Path]:
 def create_part(run: Path) -> Path:
     """The folder of a new part, after the others."""
     folder = run / PART.format(max(_numbered(run), default=1) + 1)
-    folder.mkdir()
+    folder.mkdir(mode=OURS)
     return folder
 
 
