@@ -17,6 +17,8 @@ from beamline.core.errors import DataError
 
 PART = "part-{}"
 """The folder of a later part of a scan that was resumed, in that of the run."""
+OURS = 0o755
+"""Mode of a run's folder: nobody else may put one file in the place of another there, whatever the umask."""
 EVENTS = "events.jsonl"
 """What happened in a run, or in a later part of it, in its folder."""
 
@@ -29,7 +31,7 @@ def parts_of(run: Path) -> list[Path]:
 def create_part(run: Path) -> Path:
     """The folder of a new part, after the others."""
     folder = run / PART.format(max(_numbered(run), default=1) + 1)
-    folder.mkdir()
+    folder.mkdir(mode=OURS)
     return folder
 
 

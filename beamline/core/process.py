@@ -20,6 +20,8 @@ import psutil
 
 _POLL = 0.2  # real s between two questions whether the process should stop
 _BEHIND: int = getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", 10)  # which only Windows has
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+"""A Python with this in its environment, and those that it starts, import nothing from the working folder."""
 _LAST_LINES = 5.0  # real s to read what a killed process has left; a child of its own may hold the pipe open
 
 
@@ -36,7 +38,7 @@ class ChildProcess:
     """A running command. Each line that it writes to stdout is passed to `on_line`, in a thread of its own.
 
     Ctrl-C at the terminal does not reach it: the caller decides when it ends. Use it as a context manager, which kills
-    a process that still runs.
+    a process that still runs. A Python imports nothing from the working folder, whose recon.py is the user's.
 
     Args:
         command: program and arguments.
@@ -72,7 +74,7 @@ class ChildProcess:
             text=True,
             encoding="utf-8",
             errors="replace",
-            env=environment,
+            env={**(os.environ if environment is None else environment), **SAFE_PATH},
             start_new_session=True,  # POSIX
             # Windows; without a window of its own a child ends with the console that is closed.
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
@@ -172,7 +174,10 @@ class ChildProcess:
 
 def with_our_path() -> dict[str, str]:
     """Our environment, for a child process that imports what we import."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    # The working folder stands there where we were started by `python -m`.
+    path = [folder for folder in sys.path if folder and (folder != str(Path.cwd()) or folder in given)]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
 def last_line(log: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import BeamlineError, ConfigError
+from beamline.core.process import SAFE_PATH
 from beamline.reconstruct.slurm import is_slurm, require_accepted, slurm_jobs, submitted
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
@@ -161,6 +163,7 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
         jobs = slurm_jobs(spec) if is_slurm(spec) else None
         try:
             if n := local_workers(spec):
+                os.environ.update(SAFE_PATH)  # in ours, since multiprocessing starts a helper of its own with it
                 # Without a page on a port, and without a limit of its own: --memory is that of a slab.
                 address = LocalCluster(
                     n_workers=n, threads_per_worker=1, dashboard_address=None, memory_limit=0,

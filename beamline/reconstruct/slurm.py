@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PositiveInt, Validat
 from beamline.config.section import Section
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, YAML_FAULTS, text_in
+from beamline.core.process import SAFE_PATH
 
 _NAME = "slurm"
 
@@ -95,7 +96,7 @@ def _cluster(jobs: SlurmJobs) -> Any:
         account=jobs.account,
         interface=jobs.interface,
         job_extra_directives=list(jobs.directives),
-        job_script_prologue=list(jobs.prologue),
+        job_script_prologue=[*(f"export {name}={value}" for name, value in SAFE_PATH.items()), *jobs.prologue],
         worker_extra_args=["--memory-limit", "0", "--no-dashboard"],
         scheduler_options={"dashboard": False},
     )

@@ -318,8 +318,14 @@ def _describe(done: TakenBlock) -> str:
             )
         if taken.ignored:
             text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
-    if taken.extra:
-        text += f" {taken.extra} frames came without a trigger and are kept as invalid rows."
+    if untriggered := taken.extra - taken.unconfirmed:
+        text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
+    if taken.unconfirmed:
+        text += (
+            f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
+            "where it stands confirm: noise on the trigger line, or another deceleration than the stage's. They are "
+            "kept as invalid rows."
+        )
     if taken.shift:
         text += (
             f" The angles of a pass may all be wrong by up to {taken.shift} steps: it is not known at which of its "

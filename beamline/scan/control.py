@@ -1,12 +1,15 @@
 """Control: verbs to a running scan from another terminal.
 
 A verb is an empty file of that name in the folder `control` of the run, which only its owner can write to; the scan
-takes it away and does it. So it works on every system and file system, no port is open, and nothing is parsed.
+takes it away and does it. So it works on every system and file system, no port is open, and nothing is parsed. Where
+there are owners and modes, they are looked at on every use, and a folder put in its place is not looked into.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -15,12 +18,14 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Emit
 from beamline.core.files import EVENTS, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 
+POSIX = os.name == "posix"  # a folder has an owner and a mode, and can be held open
 _POLL = 0.1  # real s between looks
 _ANSWER = 5.0  # real s within which a scan takes a verb away
 _EFFECT = 20.0  # real s within which most verbs have been done: a stage has braked, a frame is exposed
@@ -35,28 +40,94 @@ class Verb(StrEnum):
     RESUME = "resume"
 
 
+class _Requests:
+    """The folder of requests, made here and held open: one that is put in its place is another.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(mode=0o700)
+        self._folder, self._held = folder, -1
+        if POSIX:
+            self._held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            os.fchmod(self._held, 0o700)
+
+    def fault(self) -> str:
+        """Why no request can be trusted, or none arrives; "" where all is well."""
+        if self._held < 0:
+            return ""
+        try:
+            ours = os.fstat(self._held)
+            same = os.path.samestat(os.lstat(self._folder), ours)
+        except OSError:
+            same = False
+        return _not_private(ours) if same else "it is gone, or another was put in its place"
+
+    def taken(self, verb: Verb) -> bool:
+        """Take a request away; False where there is none that its owner, or root, made."""
+        if self._held < 0:
+            return _taken(self._folder / verb)
+        try:
+            made = os.stat(verb, dir_fd=self._held, follow_symlinks=False)
+            os.unlink(verb, dir_fd=self._held)
+        except OSError:
+            return False
+        return stat.S_ISREG(made.st_mode) and made.st_uid in (os.geteuid(), 0)
+
+    def close(self) -> None:
+        """Take what is left away, and the folder."""
+        for verb in Verb:
+            self.taken(verb)
+        if self._held >= 0:
+            os.close(self._held)
+        with suppress(OSError):
+            self._folder.rmdir()
+
+
+def _not_private(folder: os.stat_result) -> str:
+    """Why somebody else may have made requests there; "" where only we can."""
+    if not stat.S_ISDIR(folder.st_mode):
+        return "it is no folder of its own"
+    if os.geteuid() not in (folder.st_uid, 0):
+        return f"it belongs to the user {folder.st_uid}"
+    if folder.st_mode & 0o022:
+        return f"others may write to it (mode {stat.S_IMODE(folder.st_mode):03o})"
+    return ""
+
+
 @contextmanager
-def verbs_taken(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
-    """While the context lasts, verbs for the run in this folder are taken and done.
+def verbs_taken(
+    folder: Path, stop: StopRequest, pause: PauseRequest, emit: Emit = lambda event, data: None
+) -> Iterator[None]:
+    """While the context lasts, verbs for the run in this folder are taken and done; a warning where they cannot be.
 
     Raises:
         DataError: the disk does not take the folder for them.
     """
-    requests, over = folder / CONTROL, threading.Event()
+    place, over = folder / CONTROL, threading.Event()
     actions: Mapping[Verb, Callable[[], None]] = {
         Verb.ABORT: stop.abort, Verb.STOP: stop.stop, Verb.PAUSE: pause.pause, Verb.RESUME: pause.resume,
     }  # fmt: skip
 
     def take_verbs() -> None:
+        told = False
         while not over.wait(_POLL):
+            if fault := requests.fault():
+                if not told:
+                    message = f"No verb from another terminal is done: {place}: {fault}. Ctrl-C here stops the scan."
+                    emit("warning", {"message": message})
+                told = True
+                continue
             for verb, action in actions.items():
-                if _taken(requests / verb):
+                if requests.taken(verb):
                     action()
 
     try:
-        requests.mkdir(mode=0o700)
+        requests = _Requests(place)
     except OSError as error:
-        raise DataError(f"{requests} cannot be made ({error.strerror}). Nothing has moved or was acquired.") from error
+        raise DataError(f"{place} cannot be made ({error.strerror}). Nothing has moved or was acquired.") from error
     thread = threading.Thread(target=take_verbs, name="control", daemon=True)
     thread.start()
     try:
@@ -64,10 +135,7 @@ def verbs_taken(folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterato
     finally:
         over.set()
         thread.join(_ANSWER)
-        with suppress(OSError):
-            for verb in Verb:
-                _taken(requests / verb)
-            requests.rmdir()
+        requests.close()
 
 
 def _taken(request: Path) -> bool:
@@ -89,15 +157,22 @@ def tell(run: Path, verb: Verb) -> State:
     """Tell a running scan, and wait until it has done it, or for 20 s; the state that it is in then.
 
     Raises:
-        ConfigError: no scan runs there, or none that answers within 5 s; the request is withdrawn.
+        ConfigError: no scan runs there, or somebody else's, or none that answers within 5 s; the request is withdrawn.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
     request = part / CONTROL / verb
-    if not request.parent.is_dir():
-        raise ConfigError(f"no scan runs in {run}. Nothing was changed.")
     try:
-        request.touch(mode=0o600)
+        folder = os.lstat(request.parent)
+    except OSError:
+        raise ConfigError(f"no scan runs in {run}. Nothing was changed.") from None
+    if POSIX and (fault := _not_private(folder)):
+        raise ConfigError(
+            f"{request.parent}: {fault}. Only who started a scan can tell it something. Nothing was changed."
+        )
+    try:
+        with suppress(FileExistsError):
+            os.close(os.open(request, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
     except OSError as error:
         raise DataError(
             f"{run} cannot be told to {verb}: {error.strerror}. Ctrl-C at its terminal stops a scan."

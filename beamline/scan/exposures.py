@@ -14,6 +14,7 @@ from beamline.core.events import Emit
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
+from beamline.scan.braking import Braking, booked, by_nothing, placing
 from beamline.scan.ledger import EXTRA, Account, Exposed, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
@@ -28,6 +29,7 @@ PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a 
 PATIENCE_PERIODS = 10  # so many trigger periods
 RAMP_TOLERANCE = 0.1  # of what the acceleration adds to the time of the first pulse
 SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera is taken for silent
+NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 
 
 @dataclass
@@ -40,6 +42,7 @@ class Taken:
         missing: triggers, counted within the block, that gave no frame though one was waited for.
         lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
         extra: frames that no trigger exposed.
+        unconfirmed: of the extra ones, those exposed while the stage braked.
         shift: triggers by which the angles of a pass may be wrong (see ledger.Account).
         off: steps by which the angle of a frame may be wrong (likewise).
     """
@@ -50,6 +53,7 @@ class Taken:
     lost: int = 0
     ignored: int = 0
     extra: int = 0
+    unconfirmed: int = 0
     shift: int = 0
     off: float = 0.0
 
@@ -63,33 +67,33 @@ class Taken:
         self.lost += account.lost
         self.ignored += account.ignored
         self.extra += len(account.extra)
+        self.unconfirmed += account.unconfirmed
         self.shift = max(self.shift, account.shift)
         self.off = max(self.off, account.off)
 
 
 @dataclass
 class _Pass:
-    """A pulse train under way: its ledger, its first trigger within the block, and the seconds its move takes.
+    """A pulse train under way: its ledger, its counts, its first trigger within the block, the seconds its move takes.
 
-    `braked`: time at which the stage was ordered to stop during the pass. `paused`: for a pause, after which the
-    triggers that come after the last frame stored are exposed anew. `waiting`: frames whose trigger is told by those
-    that follow.
+    `told`: time at which the stage was told to stop during the pass. `paused`: for a pause, after which the triggers
+    that come after the last frame stored are exposed anew. `braking`: for a stop, once the stage stands. `waiting`:
+    frames whose trigger is told by those that follow.
     """
 
     ledger: Ledger
+    train: TriggerTrain
     first: int
     seconds: float
-    braked: float = math.inf
+    told: float = math.inf
     paused: bool = False
+    braking: Braking | None = None
     waiting: list[CameraFrame] = field(default_factory=list)
 
     @property
     def so_far(self) -> Ledger:
         """The ledger as if no further frame came."""
-        ledger, waiting = self.ledger, [self._exposed(frame) for frame in self.waiting]
-        while waiting and (entered := enter(ledger, waiting, last=True)):
-            ledger, waiting = entered[0], waiting[1:]
-        return ledger
+        return booked(self.ledger, self._braking, self._exposed, by_nothing)
 
     @property
     def last_due(self) -> float:
@@ -106,16 +110,24 @@ class _Pass:
             last: no further frame will come: none waits.
         """
         self.waiting += frames
+        if self.braking is not None and not last:
+            return
+        way = by_nothing if self.braking is None else placing(self.ledger, self.braking, self._exposed)
         while self.waiting:
-            entered = enter(self.ledger, [self._exposed(frame) for frame in self.waiting], last)
-            if entered is None:
+            exposed = [way(self.ledger, self._braking, frame) for frame in self._exposed]
+            if (entered := enter(self.ledger, exposed, last)) is None:
                 return
             self.ledger, entry = entered
             trigger = EXTRA if entry.trigger == EXTRA else self.first + entry.trigger
             yield self.waiting.pop(0), trigger, entry.angle
 
-    def _exposed(self, frame: CameraFrame) -> Exposed:
-        return Exposed(frame.framestamp, frame.time, frame.time < self.braked)
+    @property
+    def _exposed(self) -> list[Exposed]:
+        return [Exposed(frame.framestamp, frame.time) for frame in self.waiting]
+
+    @property
+    def _braking(self) -> Braking:
+        return self.braking or NOT_BRAKING
 
 
 class Exposures:
@@ -227,7 +239,7 @@ class Exposures:
         self._supervision.states.enter(State.ACQUIRING)
         seconds = move_seconds(end - start, block.speed, self._stage.limits.acceleration)
         angles = block.angles[first : first + train.n]
-        flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), first, seconds)
+        flight = _Pass(Ledger(self._expected(block, angles, before, self._clock.now())), train, first, seconds)
         cut_short = True
         try:
             try:
@@ -235,7 +247,8 @@ class Exposures:
             except (BeamlineError, DeviceError):
                 yield from flight.enter(last=True)
                 raise
-            yield from flight.enter(last=True)
+            if not flight.paused:  # else the triggers of those that wait come again
+                yield from flight.enter(last=True)
             cut_short = self._stop.stopping or flight.paused
         finally:
             taken.enter(settle(flight.ledger, cut_short), first)
@@ -259,7 +272,7 @@ class Exposures:
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
-        """Frames while the stage turns; after a stop, the frames that are still being transferred. After a pause only
+        """Frames while the stage turns; after a stop, once it stands, those exposed until then. After a pause only
         those exposed before the stage was told to stand: they look as if the scan had gone on.
 
         Waits for frames, not for the stage, so that a camera without frames is noticed at once.
@@ -268,34 +281,43 @@ class Exposures:
         patience = max(PATIENCE, PATIENCE_PERIODS * block.period) + tail
         first_pulse = flight.ledger.train.first or 0.0
         wait = patience + max(0.0, first_pulse - self._clock.now())
-        silent_at, braking = self._clock.now() + wait, False
+        silent_at, stands = self._clock.now() + wait, False
         while not flight.so_far.complete:
-            if self._interrupted and not braking:
-                flight.braked, flight.paused = self._clock.now(), not self._stop.stopping
-                self._stage.stop()
-                braking = True
-            frame = self._next_frame(tail + 2 * block.period if braking else wait, until_stop=not braking)
+            if self._interrupted and not stands:
+                self._brake(flight)
+                stands = True
+            frame = self._next_frame(tail if stands else wait, until_stop=not stands)
             if frame is not None:
                 wait, silent_at = patience, self._clock.now() + patience
-                if not flight.paused or frame.time + tail <= flight.braked:
+                if not flight.paused or frame.time + tail <= flight.told:
                     yield from flight.enter(frame)
-            elif braking or self._clock.now() >= silent_at:  # before that a pause was asked for, or also taken back
+            elif stands:
+                break
+            elif self._clock.now() >= silent_at:  # before that a pause was asked for, or also taken back
                 if not self._stage.moving():
                     break
-                if not braking and self._clock.now() >= flight.last_due + tail:
+                if self._clock.now() >= flight.last_due + tail:
                     break  # no trigger is still to come: what is missing is named with the rest of the pass
-                if not braking:
-                    raise InstrumentError(
-                        f"{self._camera.name}: no frame for {wait:.3g} s while the stage turned. Check the trigger "
-                        "cable and the camera. What was taken before is in the file."
-                    )
-        if not braking:
-            self._wait(flight.seconds)
-        elif flight.paused:
-            self.stand()
+                raise InstrumentError(
+                    f"{self._camera.name}: no frame for {wait:.3g} s while the stage turned. Check the trigger "
+                    "cable and the camera. What was taken before is in the file."
+                )
+        if flight.paused:
             return
+        if not stands:
+            self._wait(flight.seconds)
         while (frame := self._next_frame(0.0, until_stop=False)) is not None:
             yield from flight.enter(frame)  # all triggers have their frames: the ledger counts these as extra
+
+    def _brake(self, flight: _Pass) -> None:
+        """Slow down within a train, wait until the stage stands, and ask where."""
+        train, limits = flight.train, self._stage.limits
+        flight.told, flight.paused = self._clock.now(), not self._stop.stopping
+        self.stand()
+        if not flight.paused:
+            stood = (self._stage.to_counts(self._stage.position()) - train.start) / train.interval
+            counts = limits.acceleration * limits.counts_per_turn / (2 * math.pi)
+            flight.braking = Braking(flight.told, stood, counts / abs(train.interval))
 
     def _one_by_one(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         """Software triggers: at each angle of a step scan, or where the stage stands for darks and flats."""

@@ -6,7 +6,8 @@ While a stage turns at constant speed, trigger times are linear in the trigger's
 nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict &
 Bordner 1962). Noise on the trigger line exposes frames, too: where the first trigger's time is not known well, the
 first frames are those that make a regular train, and of two frames that could be a trigger's the nearer one is. That
-takes a look at the frames that follow: see `enter`. All functions are pure; a Ledger is a value.
+takes a look at the frames that follow: see `enter`. Frames exposed while the stage brakes come with the times at which
+their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from beamline.core.errors import DataError
 
 FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
 NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next, which may be nearer
+CONFIRMED = 0.2  # periods; the same for a frame of a stage that brakes
 KNOWN = 0.25  # periods by which the first trigger's time may be wrong, so that the first frame can be told by it
 TRAIN, LOOK = 3, 6  # frames that make a train, and how many are looked at for it at most
 UNEVEN = 0.25  # periods; frames of a train are more regular than this
@@ -90,6 +92,7 @@ class Ledger:
         ignored: of these, triggers that exposed nothing.
         extra: framestamps of frames that no trigger exposed.
         beyond: of these, frames that came when a trigger after the last one would have come.
+        unconfirmed: of the extra frames, those exposed while the stage braked.
         off: of the matched frames the largest distance from the trigger's expected time, in periods.
     """
 
@@ -105,6 +108,7 @@ class Ledger:
     ignored: int = 0
     extra: tuple[int, ...] = ()
     beyond: int = 0
+    unconfirmed: int = 0
     off: float = 0.0
 
     @property
@@ -122,6 +126,7 @@ class Account:
         lost: of these, exposed but not delivered (framestamp gap).
         ignored: of these, not exposed (time gap). Those after the last frame may be either.
         extra: framestamps of the frames that no trigger exposed.
+        unconfirmed: how many of them were exposed while the stage braked.
         shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
             missing at the other, or a frame too many at the end could be one at the beginning; 0 where there is none
             or the time of the first trigger was known.
@@ -133,6 +138,7 @@ class Account:
     ignored: int
     extra: tuple[int, ...]
     shift: int
+    unconfirmed: int = 0
     off: float = 0.0
 
 
@@ -153,24 +159,24 @@ def enter(ledger: Ledger, frames: Sequence[Exposed], last: bool) -> tuple[Ledger
         last: there will be no further ones.
     """
     first, *others = frames
-    ahead = [frame for frame in others if frame.steady]
-    last = last or len(ahead) < len(others)  # frames of a braking stage show nothing
+    ahead = [frame for frame in others if not math.isnan(frame.time)]
+    last = last or len(ahead) < len(others)  # those that come where nobody knows show nothing
     after, entry = assign(ledger, first.framestamp, first.time, first.steady)
-    if not first.steady:
+    if math.isnan(first.time):
         return after, entry
-    if ledger.last < 0 and not _start_known(ledger.train):
+    if ledger.last < 0 and not start_known(ledger.train):
         regular = _regular([frame.time for frame in (first, *ahead)], ledger.train.period)
         if len(regular) < min(TRAIN, ledger.train.n) and len(frames) < LOOK and not last:
             return None
-        return (after, entry) if regular[0] == 0 else _extra(ledger, first.framestamp, 0.0, False)
+        return (after, entry) if regular[0] == 0 else _extra(ledger, first, 0.0)
     if entry.trigger == EXTRA or (off := _off(ledger, entry.trigger, first.time)) >= -NEAR:
         return after, entry
     if not ahead and not last:
         return None
     for other in ahead:
-        if assign(ledger, other.framestamp, other.time)[1].trigger == entry.trigger:
+        if assign(ledger, other.framestamp, other.time, other.steady)[1].trigger == entry.trigger:
             nearer = abs(_off(ledger, entry.trigger, other.time)) < -off
-            return _extra(ledger, first.framestamp, entry.trigger + off, False) if nearer else (after, entry)
+            return _extra(ledger, first, entry.trigger + off) if nearer else (after, entry)
     return after, entry
 
 
@@ -180,26 +186,24 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
     Frames come in the order in which they were exposed.
 
     Args:
-        time: the frame's trigger time in s.
-        steady: the stage turned at constant speed. While it brakes, times cannot be used; but the intervals between
-            triggers only grow, so none is ignored and the framestamps alone count them.
+        time: the frame's trigger time in s; nan: no trigger is known to have exposed it.
+        steady: the stage turned at constant speed; else the time is as if it had, and must fit better.
     """
-    train = ledger.train
+    train, frame = ledger.train, Exposed(framestamp, time, steady)
+    if math.isnan(time):
+        return _extra(ledger, frame, max(ledger.last, 0))
     new_exposures = framestamp - ledger.exposed
     exposures = ledger.unmatched + new_exposures
-    if not steady:
-        steps, residual = exposures, 0.0
-        trigger = ledger.last + steps
-        position = float(trigger)
-    elif ledger.last < 0:
+    if ledger.last < 0:
         position, trigger, residual = _first_place(train, exposures - 1, time)
         steps = trigger + 1
     else:
         position = ledger.last + (time - ledger.phase) / ledger.period
         trigger = round(position)
         steps, residual = trigger - ledger.last, position - trigger
-    if new_exposures < 1 or steps < 1 or trigger >= train.n or abs(residual) > FREE:
-        return _extra(ledger, framestamp, position, trigger >= train.n and abs(residual) <= FREE)
+    fits = abs(residual) <= (FREE if steady else CONFIRMED)
+    if new_exposures < 1 or steps < 1 or trigger >= train.n or not fits:
+        return _extra(ledger, frame, position, beyond=trigger >= train.n and fits)
     lost = min(exposures, steps) - 1
     matched = replace(
         ledger,
@@ -213,21 +217,24 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
     )
     if ledger.last < 0:
         matched = replace(matched, phase=time, period=train.period, first=(exposures - 1, trigger, position))
-    else:
+    elif steady:
         matched = _follow(ledger, matched, time, steps, residual)
+    else:
+        matched = replace(matched, phase=ledger.phase + steps * ledger.period)
     return matched, Entry(trigger, float(train.angles[trigger]))
 
 
-def _extra(ledger: Ledger, framestamp: int, position: float, beyond: bool) -> tuple[Ledger, Entry]:
+def _extra(ledger: Ledger, frame: Exposed, position: float, beyond: bool = False) -> tuple[Ledger, Entry]:
     """Enter a frame that no trigger exposed, at a position in periods."""
-    train, new_exposures = ledger.train, framestamp - ledger.exposed
+    train, new_exposures = ledger.train, frame.framestamp - ledger.exposed
     after = replace(
         ledger,
-        exposed=max(framestamp, ledger.exposed),
+        exposed=max(frame.framestamp, ledger.exposed),
         # An extra frame is accounted for: it takes no part in the count of exposures between two triggers.
         unmatched=ledger.unmatched + max(new_exposures - 1, 0),
-        extra=(*ledger.extra, framestamp),
+        extra=(*ledger.extra, frame.framestamp),
         beyond=ledger.beyond + beyond,
+        unconfirmed=ledger.unconfirmed + (not frame.steady),
     )
     return after, Entry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
 
@@ -245,11 +252,12 @@ def settle(ledger: Ledger, cut_short: bool = False) -> Account:
         ignored=ledger.ignored,
         extra=ledger.extra,
         shift=_shift(ledger, None if cut_short else len(at_the_end)),
+        unconfirmed=ledger.unconfirmed,
         off=ledger.off,
     )
 
 
-def _start_known(train: Train) -> bool:
+def start_known(train: Train) -> bool:
     return train.n == 1 or (train.first is not None and train.tolerance <= KNOWN * train.period)
 
 

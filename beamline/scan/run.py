@@ -150,7 +150,7 @@ def run_scan(
                 ) from error
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
             run = _Run(config, instrument, ready, folder, stop, emit, began, series)
-            stack.enter_context(verbs_taken(folder, stop, run.pause))
+            stack.enter_context(verbs_taken(folder, stop, run.pause, emit))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
                 guarded.enter_context(watched(folder, emit))

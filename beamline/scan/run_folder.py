@@ -9,6 +9,8 @@ from itertools import count
 from pathlib import Path
 from typing import TextIO
 
+from beamline.core.files import OURS
+
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
@@ -21,7 +23,7 @@ def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
     for number in count(1):
         folder = runs / (stem if number == 1 else f"{stem}-{number}")
         with suppress(FileExistsError):
-            folder.mkdir()
+            folder.mkdir(mode=OURS)
             break
     return folder
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import stat
 import time
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from beamline.core.events import Event
 from beamline.core.stop import PauseRequest, ScanAborted, ScanStopped, StopRequest
 from beamline.scan import control
 from beamline.scan.control import Verb, running, state_of, tell, verbs_taken
+from beamline.scan.run_folder import create_part, create_run_folder
 from beamline.scan.states import State
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
@@ -117,10 +119,61 @@ def test_a_dead_scan_is_told_and_nothing_of_the_request_is_left(
     monkeypatch.setattr(control, "_ANSWER", 0.2)
     with pytest.raises(ConfigError, match="no scan runs"):
         tell(tmp_path, Verb.PAUSE)
-    (tmp_path / "control").mkdir()
+    (tmp_path / "control").mkdir(mode=0o700)
     with pytest.raises(ConfigError, match="does not answer"):
         tell(tmp_path, Verb.PAUSE)
     assert list((tmp_path / "control").iterdir()) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no umask and no mode")
+@pytest.mark.parametrize("umask", [0o000, 0o002, 0o022])
+def test_nobody_else_may_put_a_folder_in_the_place_of_ours(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        run = create_run_folder(tmp_path / "runs", "foam", 0.0)
+        with verbs_taken(run, StopRequest(), PauseRequest()):
+            modes = [stat.S_IMODE(folder.stat().st_mode) for folder in (run, create_part(run), run / "control")]
+    finally:
+        os.umask(before)
+    assert modes == [0o755, 0o755, 0o700]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no mode")
+@pytest.mark.parametrize("how", ["another folder", "a link", "a mode"])
+def test_a_folder_that_others_can_write_to_tells_a_scan_nothing(tmp_path: Path, how: str) -> None:
+    stop, told, place = StopRequest(), list[str](), tmp_path / "control"
+    with verbs_taken(tmp_path, stop, PauseRequest(), lambda event, data: told.append(data["message"])):
+        if how == "a mode":
+            place.chmod(0o777)
+        else:
+            place.rename(tmp_path / "moved")
+            (tmp_path / "theirs").mkdir(mode=0o777)
+            (tmp_path / "theirs").chmod(0o777)
+            (tmp_path / "theirs").rename(place) if how == "another folder" else place.symlink_to("theirs")
+        (place / "stop").touch()
+        deadline = time.monotonic() + 10
+        while not told and time.monotonic() < deadline:
+            time.sleep(0.01)
+        with pytest.raises(ConfigError, match=r"no folder of its own|others may write to it"):
+            tell(tmp_path, Verb.ABORT)
+        assert not (place / "abort").exists()
+    assert not stop.stopping and len(told) == 1
+    assert "No verb from another terminal is done" in told[0]
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can give a file away")
+def test_a_request_that_is_a_link_or_somebody_elses_is_taken_away_and_not_done(tmp_path: Path) -> None:
+    stop = StopRequest()
+    with verbs_taken(tmp_path, stop, PauseRequest()):
+        (tmp_path / "made").touch()
+        os.chown(tmp_path / "made", 12345, -1)
+        (tmp_path / "made").rename(tmp_path / "control" / "stop")
+        (tmp_path / "control" / "abort").symlink_to(tmp_path)
+        deadline = time.monotonic() + 10
+        while any((tmp_path / "control").iterdir()) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert list((tmp_path / "control").iterdir()) == []
+    assert not stop.stopping
 
 
 def test_the_state_is_that_of_the_scan_not_of_its_live_reconstruction(tmp_path: Path) -> None:

@@ -246,22 +246,6 @@ def test_a_spurious_exposure_that_is_lost_too_is_no_lost_trigger() -> None:
     assert (account.lost, account.ignored, account.missing) == (0, 0, ())
 
 
-@given(st.lists(st.sampled_from([OK, OK, LOST]), min_size=1, max_size=20), st.floats(1.05, 2.0))
-def test_while_the_stage_brakes_framestamps_count_the_triggers(fates: list[str], slower: float) -> None:
-    ledger, _ = assign(Ledger(Train(angles(30), PERIOD, FIRST)), 0, FIRST)
-    time, interval, triggers = FIRST, PERIOD, []
-    for stamp, fate in enumerate(fates, 1):
-        interval *= slower
-        time += interval
-        if fate == OK:
-            ledger, entry = assign(ledger, stamp, time, steady=False)
-            triggers.append(entry.trigger)
-    kept = [i for i, fate in enumerate(fates, 1) if fate == OK]
-    assert triggers == kept
-    assert ledger.missing == tuple(i for i in range(1, max(kept, default=0)) if i not in kept)
-    assert ledger.ignored == 0
-
-
 def test_a_silent_camera_misses_everything() -> None:
     account = settle(Ledger(Train(angles(4), PERIOD, FIRST)))
     assert account == Account(missing=(0, 1, 2, 3), lost=0, ignored=0, extra=(), shift=0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -23,7 +23,7 @@ import pytest
 import serial
 
 from beamline.config.load import Config, config_folder, load
-from beamline.core.events import Event
+from beamline.core.events import Emit, Event
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.instrument.connect import Instrument, connect
 from beamline.scan import run as run_module
@@ -240,19 +240,24 @@ class Cable:
 class TriggerCable:
     """The cable from trigger output to camera: pulses get lost on it, and others are picked up halfway to the next.
 
-    Pulses are counted from 0 over all scans.
+    Pulses are counted from 0 over all scans. `noise` comes at times on the clock.
     """
 
     def __init__(self, line: TriggerLine) -> None:
         self.lost: Set[int] = frozenset()
         self.picked_up_after: Set[int] = frozenset()
-        self._line = line
+        self.noise: Sequence[float] = ()
+        self.line = line
 
     def next_after(self, time: float) -> Pulse | None:
+        heard = (Pulse(at, self.line.angle_at(at)) for at in self.noise if at > time)
+        return min((pulse for pulse in (self._sent_after(time), *heard) if pulse is not None), default=None)
+
+    def _sent_after(self, time: float) -> Pulse | None:
         if not (self.lost or self.picked_up_after):
-            return self._line.next_after(time)
+            return self.line.next_after(time)
         sent, at = [], 0.0
-        while (pulse := self._line.next_after(at)) is not None:
+        while (pulse := self.line.next_after(at)) is not None:
             sent.append(pulse)
             at = pulse.time
         halfway = {k: Pulse((a.time + b.time) / 2, (a.angle + b.angle) / 2) for k, (a, b) in enumerate(pairwise(sent))}
@@ -392,6 +397,7 @@ class Rig:
         """Everything is as it should be again."""
         self.cable.repair()
         self.trigger_cable.lost = self.trigger_cable.picked_up_after = frozenset()
+        self.trigger_cable.noise = ()
         self.block()
         self.after_connecting = lambda: None
         self.at_frame.clear()
@@ -419,9 +425,9 @@ class Rig:
             self.pause.release(cause)
 
     @contextmanager
-    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest) -> Iterator[None]:
+    def _verbs_taken(self, folder: Path, stop: StopRequest, pause: PauseRequest, emit: Emit) -> Iterator[None]:
         self.pause = pause
-        with verbs_taken(folder, stop, pause):
+        with verbs_taken(folder, stop, pause, emit):
             yield
 
     def _wait_in_pause(self, recorder: Recorder) -> bool:

@@ -1,0 +1,103 @@
+"""Braking: which triggers exposed the frames that came after a stage was told to stop within a train.
+
+Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
+frames: from its speed u it stands u²/2a further on (constant deceleration a), so the place where it stands tells when
+it began to brake, and where it was at the time of each frame. Of a stage that brakes otherwise, by jerk-limited ramps,
+the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
+Frames that neither confirms belong to no trigger. All functions are pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from beamline.scan.ledger import Exposed, Ledger, enter, start_known
+
+EARLY, LATE = 0.02, 0.5  # s by which a stage may seem to brake before it was told to, and may brake after that
+MOST = 0.75  # of the triggers that must have a frame by their times; by chance 0.4 have
+FEW = 4  # triggers; of fewer the exposures show nothing
+SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
+BESIDE = 0.02  # intervals by which a stage that stands at a trigger may have passed it or not
+
+
+@dataclass(frozen=True)
+class Braking:
+    """A stage that was told to stop within a train, and stands.
+
+    Attributes:
+        told: time at which it was told, in s.
+        stood: where it stands, in intervals beyond trigger 0.
+        deceleration: intervals/s².
+    """
+
+    told: float
+    stood: float
+    deceleration: float
+
+
+Placing = Callable[[Ledger, Braking, Exposed], Exposed]
+"""Gives a frame the time at which its trigger would have come at constant speed; nan where that is not known."""
+
+
+def placing(ledger: Ledger, braking: Braking, frames: Sequence[Exposed]) -> Placing:
+    """What confirms the frames that a stage gave until it stood: its motion, their number, or nothing."""
+    steady, moved, counted = (booked(ledger, braking, frames, way) for way in (by_nothing, by_motion, by_number))
+    fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
+    due = fewest - steady.last
+    if _matched(moved) - _matched(steady) >= MOST * due:
+        return by_motion
+    all_counted = fewest <= counted.last <= most and counted.unconfirmed == ledger.unconfirmed
+    return by_number if due >= FEW and all_counted and _ever_slower(ledger, braking, frames) else by_nothing
+
+
+def booked(ledger: Ledger, braking: Braking, frames: Sequence[Exposed], way: Placing) -> Ledger:
+    """The ledger with all frames."""
+    for i in range(len(frames)):
+        entered = enter(ledger, [way(ledger, braking, frame) for frame in frames[i:]], last=True)
+        ledger = ledger if entered is None else entered[0]
+    return ledger
+
+
+def by_motion(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
+    train = ledger.train
+    if ledger.last >= 0:
+        last, phase, period = ledger.last, ledger.phase, ledger.period
+    elif train.first is not None and start_known(train):
+        last, phase, period = 0, train.first, train.period
+    else:
+        return by_nothing(ledger, braking, frame)
+    seconds = 1 / (period * braking.deceleration)
+    began = phase + (braking.stood - last) * period - seconds / 2
+    if not -EARLY <= began - braking.told <= LATE:
+        return by_nothing(ledger, braking, frame)
+    if frame.time <= began:
+        return frame
+    braked = min(frame.time - began, seconds)
+    return Exposed(frame.framestamp, began + braked - braked**2 / (2 * seconds), steady=False)
+
+
+def by_number(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
+    if frame.time < braking.told or ledger.last < 0:
+        return by_nothing(ledger, braking, frame)
+    exposures = ledger.unmatched + frame.framestamp - ledger.exposed
+    return Exposed(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
+
+
+def by_nothing(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
+    return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
+
+
+def _matched(ledger: Ledger) -> int:
+    return ledger.last + 1 - len(ledger.missing)
+
+
+def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[Exposed]) -> bool:
+    """The intervals between exposures grow from the last steady one on."""
+    steady = [Exposed(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
+    came = [steady[-1], *(frame for frame in frames if frame.time >= braking.told)]
+    intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]
+    period = ledger.train.period
+    return all(later > before - SHRINKS * period for before, later in pairwise([period, *intervals]))
