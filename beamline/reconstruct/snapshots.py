@@ -26,7 +26,8 @@ class Snapshots:
         self._begin = clock.now()
         output = options.target.output
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
-        self.picture_path: Path = output.with_name(f"{output.stem}.live.png")
+        self.picture_path = options.target.live_picture
+        self.drawn = False  # the picture is of this scan
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
@@ -47,6 +48,7 @@ class Snapshots:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
             self._warn(f"A snapshot was left out: {error}")
             return
+        self.drawn = True
         data = {
             "path": self.path,
             "picture": self.picture_path,
@@ -57,10 +59,9 @@ class Snapshots:
         self._sink(Event("snapshot", self._clock.now(), data))
 
     def remove(self) -> None:
-        """The volume is delivered: what stood in for it goes."""
-        for path in (self.path, self.picture_path):
-            with suppress(PermissionError):  # Windows removes no file that a viewer holds open
-                path.unlink(missing_ok=True)
+        """The volume is delivered: what stood in for it goes. The picture stays, as it was when the views came."""
+        with suppress(PermissionError):  # Windows removes no file that a viewer holds open
+            self.path.unlink(missing_ok=True)
 
     def _write_picture(self, fit: StreamingFit, volume: Volume) -> None:
         new = f"residual of new views {fit.unlearnt:.3f}, " if math.isfinite(fit.unlearnt) else ""

@@ -153,6 +153,9 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     names = [event.event for event in events]
     assert names[0] == "state"
     assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
+    watch = f"open {tmp_path / 'recon.live.png'}: drawn anew about every {RHYTHM.snapshot:g} s"
+    assert watch in str(events[1].data["message"])
+    assert '<a href="recon.live.png">' in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert names.count("recon_started") == 1
     assert "snapshot" in names
     assert names[-1] == "done"
@@ -462,8 +465,8 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     assert max(quality for _, quality in seen) > 18
     known = [u for u in unlearnt if np.isfinite(u)]
     assert known[-1] < known[0] < 1  # of views that no step had seen
-    assert not (tmp_path / "recon.live.png").exists()  # nor the snapshot: the volume is there
-    assert not (tmp_path / "recon.snapshot.h5").exists()
+    assert (tmp_path / "recon.live.png").exists()  # the report links it
+    assert not (tmp_path / "recon.snapshot.h5").exists()  # the volume is there
 
 
 def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,14 @@ def test_page_nests_is_self_contained_and_escapes() -> None:
     assert base64.b64decode((image["src"] or "").split(",")[1]) == b"\x89PNG fake"
 
 
+def test_the_live_picture_is_a_link_where_there_is_one() -> None:
+    def links(report: Report) -> list[str | None]:
+        return [attrs["href"] for tag, attrs in parsed_page(to_html(report)).seen if tag == "a"]
+
+    assert links(_report()) == []
+    assert links(_report(live_picture="a #1.live.png")) == ["a%20%231.live.png"]
+
+
 def test_metrics_stand_in_their_method_column() -> None:
     page = to_html(_report())
     row = re.search(r'<tr><th scope="row">PSNR.*?</tr>', page)
