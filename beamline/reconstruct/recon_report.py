@@ -272,8 +272,8 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, z downwards as the camera sees "
-            "it, all in one grey window (1st to 99.5th percentile of these slices).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as image "
+            "viewers show them, all in one grey window (1st to 99.5th percentile of these slices).",
             figures.orthogonal_slices(shown, unit),
         ),
         Picture(
