@@ -145,12 +145,10 @@ def _imagej(record: ReconRecord, facts: str) -> dict[str, Any]:
 
 def _ome(record: ReconRecord, facts: str) -> dict[str, Any]:
     """The edges of a voxel, as OME has them."""
-    edges = zip("ZYX", record.volume.grid.spacing, strict=True)
-    unit = _UNITS[record.length_unit]
-    physical = {
-        f"PhysicalSize{axis}{end}": value for axis, edge in edges for end, value in (("", edge), ("Unit", unit))
-    }
-    return {"metadata": {"axes": "ZYX", **physical, "Description": facts}}
+    metadata: dict[str, Any] = {"axes": "ZYX", "Description": facts}
+    for axis, edge in zip("ZYX", record.volume.grid.spacing, strict=True):
+        metadata |= {f"PhysicalSize{axis}": edge, f"PhysicalSize{axis}Unit": _UNITS[record.length_unit]}
+    return {"metadata": metadata}
 
 
 def _tags(record: ReconRecord, facts: dict[str, Any]) -> dict[str, Any]:
