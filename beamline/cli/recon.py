@@ -385,9 +385,7 @@ def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: boo
         done = last[-1].data
         scores = "\n".join(f"  {col:>8}  {score:.4f}" for col, score in done["scores"].items())
         click.echo(f"axis    share below 0 (lower is better)\n{scores}\nbest    {done['axis_col']:g}\nsheet   {path}")
-        click.echo(
-            f"Where the sheet agrees: beamline recon {options.source.path} --axis {done['axis_col']:g}", err=True
-        )
+        click.echo(f"If the picture agrees: beamline recon {options.source.path} --axis {done['axis_col']:g}", err=True)
 
 
 def _write_recipe(path: Path, text: str) -> None:
