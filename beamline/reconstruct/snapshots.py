@@ -24,6 +24,7 @@ class Snapshots:
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self._source, self._sink, self._clock, self._warn = source, sink, clock, warn
         self._begin = clock.now()
+        self._sample = str(source.attributes.get("sample", "not stated"))
         output = options.target.output
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
         self.picture_path = options.target.live_picture
@@ -37,7 +38,7 @@ class Snapshots:
             length_unit=self._unit,
             raw_file=str(self._source.path.resolve()),
             title=f"Snapshot from {fit.n_views} views",
-            sample=str(self._source.attributes.get("sample", "not stated")),
+            sample=self._sample,
             time=self._clock.now(),
             parameters={"axis_col": axis_col, "n_views": fit.n_views},
         )

@@ -58,7 +58,7 @@ def _mean(frames: Image, what: str) -> Image:
         return frames
     if not len(frames):
         raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
-    return np.mean(frames, axis=0, dtype=np.float64).astype(np.float32)
+    return np.asarray(np.mean(frames, axis=0, dtype=np.float64), np.float32)
 
 
 @dataclass(frozen=True)
