@@ -189,6 +189,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
         low, high = grey_window([few], 0.05, 99.95)
         count, edges = np.histogram(few, bins=120, range=(low, high))
         right.stairs(count / few.size, edges, lw=1.2, label=name)
+    left.xaxis.set_major_locator(MaxNLocator(5))
     left.set(xlabel=f"along the line ({unit})", ylabel=f"attenuation (1/{unit})")
     left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
     right.set(xlabel=f"attenuation (1/{unit})", ylabel="share of voxels", yscale="log")
