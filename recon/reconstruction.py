@@ -16,7 +16,7 @@ from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
-from recon.base.units import look_like_counts, look_like_degrees
+from recon.base.units import look_like_counts, warn_of_degrees
 from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
@@ -132,12 +132,7 @@ def reconstruct(
                 "-log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
                 stacklevel=2,
             )
-    if look_like_degrees(geometry.angles):
-        warnings.warn(
-            f"angles reach {np.abs(geometry.angles).max():.5g} rad and look like degrees. A Geometry takes radians: "
-            "give np.deg2rad(angles)",
-            stacklevel=2,
-        )
+    warn_of_degrees(geometry.angles)
     begin = control.now()
     found = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
     return Reconstruction(

@@ -134,7 +134,9 @@ def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
         return now() - begin
 
     took(2)
-    step = (took(2 * _STEPS) - took(_STEPS)) / _STEPS
+    short, long = (min(took(steps) for _ in range(2)) for steps in (_STEPS, 2 * _STEPS))
+    mean = long / (2 * _STEPS)
+    step = min(max((long - short) / _STEPS, mean / 4), mean)  # on a busy machine the longer run may take less
     voxels = _FEW_ROWS * _FIT_COLS**2
     given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
     fitted = 0.0

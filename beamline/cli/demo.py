@@ -116,8 +116,11 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         settings=record.parameters,
         psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes],
     )
-    context = ReportContext(facts, selection, command, config.recon.seed, warnings, started, snapshots.flags)
     target = OutputPaths(folder / RECON, folder / REPORT, replace=True)
+    live = target.live_picture.name if target.live_picture.exists() else ""
+    context = ReportContext(
+        facts, selection, command, config.recon.seed, warnings, started, snapshots.flags, live_picture=live
+    )
     write_result(made, prepared, ideal, target, context, outside, clock)
 
 

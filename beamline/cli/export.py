@@ -54,7 +54,7 @@ def window_of(text: str) -> tuple[float, float]:
 def export(
     volume: Path, output: Path, bits: str, window: tuple[float, float] | None, dataset: str | None, as_json: bool
 ) -> None:
-    """Copy VOLUME to another format: TIFF (BigTIFF from 2 GiB on), folder of TIFFs, NRRD, npy, OME-Zarr or NXtomoproc.
+    """Copy VOLUME to another format: TIFF (BigTIFF from 4 GB on), folder of TIFFs, NRRD, npy, OME-Zarr or NXtomoproc.
 
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
     Nothing is overwritten, and a failure leaves nothing.

@@ -65,7 +65,7 @@ def _text(value: Any) -> str:
         return " x ".join(str(v) for v in value)
     if isinstance(value, float):
         return f"{value:.6g}"
-    text = printable(str(value))
+    text = printable("; ".join(str(value).splitlines()))
     return text if len(text) <= 160 else text[:157] + "..."
 
 

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 import click
 from click.exceptions import Abort, ClickException, Exit
+from click.shell_completion import CompletionItem
 
 from beamline.cli.lasting import Outputs
 from beamline.core.errors import (
@@ -90,6 +91,12 @@ class LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, entry.help) for name, entry in _COMMANDS.items()])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        names = [
+            CompletionItem(name, help=entry.help) for name, entry in _COMMANDS.items() if name.startswith(incomplete)
+        ]
+        return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -64,6 +64,11 @@ def volume_path(text: str) -> Path:
     return Path(text)
 
 
+def output_path(text: str) -> Path:
+    """That of a volume, or of the picture that --axis try draws. ValueError for another."""
+    return Path(text) if Path(text).suffix.lower() == _SHEET else volume_path(text)
+
+
 def memory_size(text: str) -> int:
     """Bytes of a size such as 8G, 500M or 1.5GB (decimal units). ValueError for anything else."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
@@ -85,6 +90,9 @@ def region_of(text: str) -> Region:
     from beamline.reconstruct.region import Region  # here: help needs none of it
 
     return Region.parse(text)
+
+
+_SHEET = ".png"
 
 
 @click.command(cls=Repeatable)
@@ -122,9 +130,9 @@ def region_of(text: str) -> Region:
     "-o",
     "--output",
     metavar="PATH",
-    callback=parsed(volume_path),
-    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, .zarr, or no suffix: a folder of TIFFs. Default: FILE's "
-    "stem + _METHOD.h5, in this folder.",
+    callback=parsed(output_path),
+    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, .zarr, or no suffix: a folder of TIFFs; of --axis try a "
+    ".png. Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
 @click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")
@@ -269,6 +277,9 @@ def recon(
         raise click.UsageError("--axis try is for a finished scan: it needs all views.")
     if tried is not None and (dry or log is not None):
         raise click.UsageError("--axis try does not go with --dry-run or --log: it writes a picture of slices only.")
+    if typed is not None and (typed.suffix.lower() == _SHEET) != (tried is not None):
+        what, suffix = ("--axis try writes a picture", _SHEET) if tried else ("only --axis try writes a picture", ".h5")
+        raise click.UsageError(f"-o {typed}: {what}; give a name such as {typed.with_suffix(suffix)}.")
     if earlier and not follow:
         raise click.UsageError("--earlier is for a run that goes on: give --follow, or the joined.h5 of its parts.")
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
@@ -300,9 +311,7 @@ def recon(
         return
     clock = SystemClock()
     if tried is not None:
-        _try_axes(
-            options, tried, Path(f"{file.stem}_axis.png") if typed is None else typed.with_suffix(".png"), as_json
-        )
+        _try_axes(options, tried, typed or Path(f"{file.stem}_axis{_SHEET}"), as_json)
         return
     if dry:
         _dry_run(options, clock, as_json)
@@ -376,6 +385,7 @@ def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: boo
         done = last[-1].data
         scores = "\n".join(f"  {col:>8}  {score:.4f}" for col, score in done["scores"].items())
         click.echo(f"axis    share below 0 (lower is better)\n{scores}\nbest    {done['axis_col']:g}\nsheet   {path}")
+        click.echo(f"If the picture agrees: beamline recon {options.source.path} --axis {done['axis_col']:g}", err=True)
 
 
 def _write_recipe(path: Path, text: str) -> None:

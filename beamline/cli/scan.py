@@ -219,4 +219,6 @@ def _results(result: RunResult) -> str:
         lines.append(f"{'retaken':<10}{result.retaken} views with an alarm; `beamline recon` uses the new ones")
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
+        if report := result.recon.get("report"):
+            lines.append(f"{'report':<10}{report}")
     return "\n".join(lines)

@@ -107,6 +107,7 @@ def study(
         table = run_study(options, fan_out(*(json_sinks or [terminal])), SystemClock())
     if not as_json:
         click.echo(text(table))
+        click.echo(f"\n{'report':<10}{options.folder / 'report.html'}")
     if table.stopped:
         rows = sum(cell.row.groups is not None for cell in table.cells)
         raise ScanStopped(

@@ -90,6 +90,7 @@ def tradeoff(
         table = run_tradeoff(options, fan_out(*(json_sinks or [terminal])), SystemClock())
     if not as_json:
         click.echo(text(table))
+        click.echo(f"\n{'report':<10}{options.folder / 'tradeoff.html'}")
     if table.stopped:
         counts = f"{table.n_done} of {len(table.outcomes)}"
         raise ScanStopped(f"The trade-off was stopped after {counts} trials; {options.folder} holds them.")

@@ -75,7 +75,7 @@ def measure(
 
 def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = temporary) -> Check:
     """Write speed of the disk that holds `folder`, or will hold it, against the rate of the frames."""
-    expected = "" if needs is None else f"{size(needs.rate)}/s at the highest frame rate"
+    expected = "" if needs is None else f"{size(needs.rate)}/s, with previews, at the highest frame rate"
     there = existing(folder)
     # The file is temporary, but must not fill the disk even for a moment.
     most = min(MOST, shutil.disk_usage(there).free // 4)

@@ -20,9 +20,10 @@ from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run
 from drivers.clock import Clock
 from drivers.errors import DeviceError
+from drivers.frame import FrameKind
 from drivers.serial.ports import SerialPort, serial_ports
 
-_MEMORY = "memory"
+_MEMORY, _RATE = "memory", "frame rate"
 
 
 def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Check]:
@@ -36,7 +37,10 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     Raises:
         ConfigError: an impossible plan, scene or device setting. Violated limits are reported by `beamline check`.
     """
-    need = None if config is None else _needs(config, dry_run(config))
+    worked = None if config is None else dry_run(config)
+    need = None if config is None or worked is None else _needs(config, worked)
+    if worked is not None:
+        yield frame_rate(worked)
     cam = None if config is None else config.devices.camera
     if cam is None or isinstance(cam, DcamOrca):
         yield camera.link(cam, usb)
@@ -54,6 +58,26 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     yield disk.room(folder, need)
     yield disk.speed(folder, need, clock)
     yield memory(free_memory(), need)
+
+
+def frame_rate(worked: DryRun) -> Check:
+    """Frames/s and bytes/s of the scan's blocks against what camera and link give."""
+    frame, most = worked.timeline.frame_bytes, 1 / worked.camera.min_period
+
+    def said(rate: float) -> str:
+        return f"{rate:.3g} frames/s = {size(rate * frame)}/s"
+
+    rates = {
+        "views" if block.kind is FrameKind.PROJECTION else f"{block.kind.name.lower()}s": 1 / block.period
+        for block in worked.timeline.blocks
+    }
+    fastest = max(rates.values())
+    found = "; ".join(f"{name} {said(rate)}" for name, rate in rates.items()) + f", frames of {size(frame)}."
+    expected = f"at most {said(most)}, which camera and link give"
+    values = {"frames_per_s": fastest, "bytes_per_s": fastest * frame, "most_frames_per_s": most}
+    if fastest <= most * (1 + 1e-9):
+        return Check(_RATE, Verdict.OK, found, expected, values=values)
+    return Check(_RATE, Verdict.FAILED, found, expected, "`beamline check` says which limits it breaks", values)
 
 
 def _needs(config: Config, worked: DryRun) -> Needs:

@@ -50,7 +50,7 @@ def follow(
     """Reconstruct a scan while it runs (or one that has ended). Returns the metrics; the event `done` says the rest.
 
     Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`, each replacing the last
-    in one step; a failure leaves the newest ones, success none.
+    in one step; a failure leaves the newest ones, success the picture.
 
     A stop ends it with the volume of the views so far, marked `ended_early`.
 
@@ -75,7 +75,7 @@ def follow(
     wanted = None if options.truth is None else read_truth(options.truth)
     started = clock.now()
     warn = Warnings(sink, clock)
-    _compile(sink, clock)
+    _compile(options, sink, clock, rhythm)
     with _open(options, sink, clock, rhythm) as source:
         growing = ScanFollower(options, source, sink, clock, warn)
         with stop_scope() as stopped:
@@ -85,18 +85,24 @@ def follow(
                 n = growing.n_views_taken
                 warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
             made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
+    # Opened again: when it closed the file, the writer wrote some texts anew, of which HDF5 knows the old places.
+    with _open(options, sink, clock, rhythm) as source:
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)
     context = ReportContext(
-        facts, options.selection, options.command, options.seed, warn.messages, started, recipe=options.recipe
-    )
+        facts, options.selection, options.command, options.seed, warn.messages, started, recipe=options.recipe,
+        live_picture=options.target.live_picture.name if growing.snapshots.drawn else "",
+    )  # fmt: skip
     metrics = write_result(made, prepared, truth, options.target, context, sink, clock)
     growing.snapshots.remove()
     return metrics
 
 
-def _compile(sink: Sink, clock: Clock) -> None:
-    """Compile what the fit needs, once on a machine, before the first view; the state `ready` says that it is there."""
+def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> None:
+    """Compile what the fit needs, once on a machine, before the first view.
+
+    The state `ready` says that it is there, and where the volume can be watched.
+    """
     begin = clock.now()
 
     def compiled(n: int) -> None:
@@ -105,7 +111,12 @@ def _compile(sink: Sink, clock: Clock) -> None:
 
     sink(Event("state", begin, {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
     warm_up(on_kernel=compiled)
-    sink(Event("state", clock.now(), {"state": "ready", "message": "The live volume is ready for views"}))
+    picture = options.target.live_picture
+    message = (
+        f"The live volume is ready for views. To watch it grow, open {picture}: drawn anew about every "
+        f"{rhythm.snapshot:g} s, as soon as there are views enough"
+    )
+    sink(Event("state", clock.now(), {"state": "ready", "message": message, "picture": picture}))
 
 
 def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> ScanSource:

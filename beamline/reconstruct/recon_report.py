@@ -132,6 +132,7 @@ class ReportContext:
     scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
     region: RegionOfRows | None = None
+    live_picture: str = ""  # file name of the last picture of a volume that grew with its scan
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
@@ -235,6 +236,7 @@ def compose(
         command=context.command,
         recipe=context.recipe,
         footnotes=footnotes,
+        live_picture=context.live_picture,
     )
 
 
@@ -270,8 +272,8 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, z downwards as the camera sees "
-            "it, all in one grey window (1st to 99.5th percentile of these slices).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as image "
+            "viewers show them, all in one grey window (1st to 99.5th percentile of these slices).",
             figures.orthogonal_slices(shown, unit),
         ),
         Picture(

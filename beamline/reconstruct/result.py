@@ -49,6 +49,11 @@ class OutputPaths:
         """Of a volume that is made in slabs, while it is made."""
         return self.output.with_name(f"{self.output.stem}.partial.h5")
 
+    @property
+    def live_picture(self) -> Path:
+        """Of a volume that grows with its scan."""
+        return self.output.with_name(f"{self.output.stem}.live.png")
+
     def refuse_partial(self) -> None:
         """Raise DataError where slabs of an earlier call are in the way of those to be made."""
         if self.partial.exists():

@@ -24,9 +24,11 @@ class Snapshots:
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self._source, self._sink, self._clock, self._warn = source, sink, clock, warn
         self._begin = clock.now()
+        self._sample = str(source.attributes.get("sample", "not stated"))
         output = options.target.output
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
-        self.picture_path: Path = output.with_name(f"{output.stem}.live.png")
+        self.picture_path = options.target.live_picture
+        self.drawn = False  # the picture is of this scan
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
@@ -36,7 +38,7 @@ class Snapshots:
             length_unit=self._unit,
             raw_file=str(self._source.path.resolve()),
             title=f"Snapshot from {fit.n_views} views",
-            sample=str(self._source.attributes.get("sample", "not stated")),
+            sample=self._sample,
             time=self._clock.now(),
             parameters={"axis_col": axis_col, "n_views": fit.n_views},
         )
@@ -47,6 +49,7 @@ class Snapshots:
             # Windows does not replace a file that a viewer holds open: the next snapshot will.
             self._warn(f"A snapshot was left out: {error}")
             return
+        self.drawn = True
         data = {
             "path": self.path,
             "picture": self.picture_path,
@@ -57,10 +60,9 @@ class Snapshots:
         self._sink(Event("snapshot", self._clock.now(), data))
 
     def remove(self) -> None:
-        """The volume is delivered: what stood in for it goes."""
-        for path in (self.path, self.picture_path):
-            with suppress(PermissionError):  # Windows removes no file that a viewer holds open
-                path.unlink(missing_ok=True)
+        """The volume is delivered: what stood in for it goes. The picture stays, as it was when the views came."""
+        with suppress(PermissionError):  # Windows removes no file that a viewer holds open
+            self.path.unlink(missing_ok=True)
 
     def _write_picture(self, fit: StreamingFit, volume: Volume) -> None:
         new = f"residual of new views {fit.unlearnt:.3f}, " if math.isfinite(fit.unlearnt) else ""

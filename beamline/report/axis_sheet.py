@@ -48,8 +48,10 @@ def axis_sheet(trials: list[AxisTrial], title: str) -> bytes:
     curve.legend(fontsize=8)
     for n, ((trial, _), image) in enumerate(zip(shown, images, strict=True)):
         axes = figure.add_subplot(panels[1 + n // _COLUMNS, n % _COLUMNS])
-        axes.imshow(image, cmap="gray", norm=window, interpolation="nearest", origin="lower")
+        axes.imshow(image, cmap="gray", norm=window, interpolation="nearest")
         axes.set(xticks=[], yticks=[])
+        if n == 0:
+            axes.set(xlabel="x →", ylabel="← y")
         axes.set_title(f"{trial.col:g}", fontsize=8, color="tab:red" if trial is best else "black")
     return png(figure)
 

@@ -96,5 +96,7 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
         )
         axes.tick_params(labelsize=6)
         axes.set_title(title, fontsize=8)
+        axes.set_xlabel("column", fontsize=7)
+        axes.set_ylabel("← row", fontsize=7)
         figure.colorbar(shown, ax=axes, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
     return png(figure)

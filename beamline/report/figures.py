@@ -56,7 +56,7 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     axes.set(
         xlabel=f"u ({unit})",
-        ylabel=f"z ({unit})",
+        ylabel=downwards("z", unit),
         title=f"View at {np.degrees(geometry.angles[view]):.2f}°",
     )
     figure.colorbar(image, ax=axes, label="line integral", shrink=0.9, pad=0.02)
@@ -83,13 +83,18 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
 
 
 def planes(grid: Grid) -> list[tuple[str, str, Window, Window]]:
-    """Of slices at one z, y and x: the axes to the right and up (z: down), and their edges."""
+    """Of slices at one z, y and x: the axes to the right and down, and their edges: left and right, bottom and top."""
     z, y, x = (_edges(grid.centre[i], grid.shape[i], grid.voxel_size) for i in range(3))
-    return [("x", "y", x, y), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
+    return [("x", "y", x, y[::-1]), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
+
+
+def downwards(axis: str, unit: str) -> str:
+    """Label of a vertical axis whose numbers grow downwards: the text is turned, so that its arrow points down."""
+    return f"← {axis} ({unit})"
 
 
 def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Window = (1.0, 99.5)) -> bytes:
-    """Three orthogonal slices through each volume, side by side in one grey window; z downwards, as the camera sees it.
+    """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
 
     They intersect at the centre of mass of the bright voxels of the last volume.
 
@@ -109,13 +114,12 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
     figure = Figure(figsize=size, dpi=dpi_for(nx, column - 0.35), layout="constrained")
     panels = figure.subplots(3, len(volumes), squeeze=False, height_ratios=heights)
     for j, (name, images) in enumerate(slices.items()):
-        for i, (image, (across, up, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
+        for i, (image, (across, down, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
             axes = panels[i][j]
             thin = image.shape[0] < _THIN * image.shape[1]
             shown = axes.imshow(
                 image,
                 cmap="gray",
-                origin="upper" if up == "z" else "lower",
                 extent=(*h_edges, *v_edges),
                 aspect="auto" if thin else "equal",
                 interpolation="nearest",
@@ -125,7 +129,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Win
             axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)
             if j == 0:
-                axes.set_ylabel(f"{up} ({unit})", fontsize=8)
+                axes.set_ylabel(downwards(down, unit), fontsize=8)
                 cut = first.coordinates()[i][at[i]]
                 text = axes.text(0.02, 0.04, f"{'zyx'[i]} = {cut:.3g} {unit}", fontsize=7, transform=axes.transAxes)
                 text.set_bbox({"facecolor": "white", "alpha": 0.7, "edgecolor": "none", "pad": 1.5})
@@ -151,12 +155,12 @@ def differences(volumes: Mapping[str, Volume], unit: str) -> bytes:
     )
     for axes, image, (name, _) in zip(figure.subplots(1, len(images), squeeze=False)[0], images, others, strict=True):
         shown = axes.imshow(
-            image, cmap="RdBu_r", origin="lower", extent=(*_edges(cx, nx, size), *_edges(cy, ny, size)),
+            image, cmap="RdBu_r", extent=(*_edges(cx, nx, size), *_edges(cy, ny, size)[::-1]),
             norm=Normalize(-reach, reach), interpolation="nearest",
         )  # fmt: skip
         axes.tick_params(labelsize=7)
         axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))
-        axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
+        axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit))
         axes.set_title(f"{name} − {first}", fontsize=10)
     figure.colorbar(shown, ax=figure.axes, label=f"difference (1/{unit})", shrink=0.8, pad=0.02)
     return png(figure)
@@ -185,6 +189,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
         low, high = grey_window([few], 0.05, 99.95)
         count, edges = np.histogram(few, bins=120, range=(low, high))
         right.stairs(count / few.size, edges, lw=1.2, label=name)
+    left.xaxis.set_major_locator(MaxNLocator(5))
     left.set(xlabel=f"along the line ({unit})", ylabel=f"attenuation (1/{unit})")
     left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
     right.set(xlabel=f"attenuation (1/{unit})", ylabel="share of voxels", yscale="log")
@@ -199,11 +204,9 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
     """A slice [y, x] of the residual's back-projection in units of its noise; `at` is its number in the volume."""
     figure, axes = _figure((6.4, 5.4))
     (y, x), (_, cy, cx) = image.shape, grid.centre
-    extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size))
-    shown = axes.imshow(
-        image, cmap="RdBu_r", origin="lower", extent=extent, norm=Normalize(-8, 8), interpolation="nearest"
-    )
-    axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})", title=f"Slice {at}")
+    extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size)[::-1])
+    shown = axes.imshow(image, cmap="RdBu_r", extent=extent, norm=Normalize(-8, 8), interpolation="nearest")
+    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
     figure.colorbar(shown, ax=axes, label="standard deviations of the noise", pad=0.02)
     return png(figure)
 

@@ -43,6 +43,7 @@ class Report:
         command: that repeats the reconstruction.
         recipe: its options that hold for other scans; empty: none are shown.
         footnotes: definitions that the metrics need.
+        live_picture: name of the picture beside the page that showed the volume grow; empty: there is none.
     """
 
     title: str
@@ -56,6 +57,7 @@ class Report:
     command: str
     footnotes: Sequence[str] = ()
     recipe: str = ""
+    live_picture: str = ""
 
 
 def write_report(path: Path, report: Report, *, replace: bool = False) -> None:

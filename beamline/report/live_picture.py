@@ -60,10 +60,14 @@ class LivePicture:
         k, j, i = (1 + n // 100 for n in data.shape)  # the middle of what is bright need not be known to a voxel
         z, y, x = np.multiply((k, j, i), bright_centre(data[::k, ::j, ::i])).tolist()
         at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
-        images = (data[z], data[::-1, y], data[::-1, :, x])  # z downwards, as the camera sees it
+        images = (data[z], data[:, y], data[:, :, x])
         window = grey_window(images)
         grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{self.unit}"
-        labels = (f"x, y at z = {at[0]:.3g} {self.unit}", f"x, z at y = {at[1]:.3g}", f"y, z at x = {at[2]:.3g}")
+        labels = (
+            f"x → y ↓ at z = {at[0]:.3g} {self.unit}",
+            f"x → z ↓ at y = {at[1]:.3g}",
+            f"y → z ↓ at x = {at[2]:.3g}",
+        )
         notes = (grey, "the same greys and scale", "the same greys and scale")
         pixels, zoom = _sized(images)
         bar = grid.voxel_size / zoom, self.unit
@@ -78,9 +82,9 @@ class LivePicture:
         left = (self.view - self.render) / np.float32(noise)
         greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
         spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(left**2))):.2f}"
-        (view, render, left), _ = _sized((self.view[::-1], self.render[::-1], left[::-1]))
+        (view, render, left), _ = _sized((self.view, self.render, left))
         return [
-            _Panel(view, "gray", window, "newest view", greys),
+            _Panel(view, "gray", window, "newest view, u → z ↓", greys),
             _Panel(render, "gray", window, "the volume seen from there", "the same greys"),
             _Panel(left, _DIFFERENCES, (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread),
         ]
@@ -88,7 +92,7 @@ class LivePicture:
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """An image, row 0 at the bottom, below two lines of text.
+    """An image, row 0 at the top, below two lines of text.
 
     Attributes:
         pixels: of the screen [row, col].
@@ -111,7 +115,7 @@ class _Panel:
             figure.text(left / width, (top + 4 - line * _LINE) / height, text, fontsize=8, color=colour)
         bottom = top - 2 * _LINE - self.pixels.shape[0]
         low, high = self.limits
-        figure.figimage(self.pixels, left, bottom, cmap=self.colours, vmin=low, vmax=high, origin="lower")
+        figure.figimage(self.pixels, left, bottom, cmap=self.colours, vmin=low, vmax=high, origin="upper")
         if self.bar is not None:
             self._scale(figure, left + 6, bottom + 6, *self.bar)
 

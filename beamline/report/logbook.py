@@ -193,14 +193,13 @@ class _Page:
             window = grey_window(images, low, top)
             self.y -= label
             self._text(_MARGIN, self.y + 0.04, f"{name}: {window[0]:.3g} to {window[1]:.3g} 1/{unit}", _SMALL, {})
-            for j, (image, ratio, (across, up, *edges)) in enumerate(zip(images, ratios, planes(grid), strict=True)):
+            for j, (image, ratio, (across, down, *edges)) in enumerate(zip(images, ratios, planes(grid), strict=True)):
                 left, foot = _MARGIN + j * pitch, self.y - wide * ratio
                 size = wide / _PAGE[0], wide * ratio / _PAGE[1]
                 axes = self.figure.add_axes((left / _PAGE[0], foot / _PAGE[1], *size))
                 axes.imshow(
                     _coarse(image),
                     cmap="gray",
-                    origin="upper" if up == "z" else "lower",
                     aspect="auto",
                     interpolation="nearest",
                     norm=Normalize(*window),
@@ -208,7 +207,7 @@ class _Page:
                 axes.set(xticks=[], yticks=[])
                 sides = " × ".join(f"{abs(last - first):.3g}" for first, last in edges)
                 cut = f"{'zyx'[j]} = {grid.coordinates()[j][at[j]]:.3g} {unit}"
-                text = f"{cut}, {across} → {up} {'↓' if up == 'z' else '↑'}, {sides} {unit}"
+                text = f"{cut}, {across} → {down} ↓, {sides} {unit}"
                 caption = self.fitting(text, pitch - _GAP)
                 self._text(left, foot - 0.7 * label, caption, _SMALL, {"color": "0.35"})
             self.y -= tallest + label

@@ -48,7 +48,8 @@ class Slices:
         axes.set_axis_off()
         for i, label in enumerate(labels):
             top, left = i // _COLUMNS * (rows + head), i % _COLUMNS * (cols + gap)
-            sheet[top + head : top + head + rows, left : left + cols] = self._shown[label][::-1]  # y grows upwards
+            sheet[top + head : top + head + rows, left : left + cols] = self._shown[label]
             axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
+        axes.text(0.02 * cols, head + 0.95 * rows, "x → y ↓", fontsize=6, color="tab:orange")
         axes.imshow(sheet, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
         return png(figure)

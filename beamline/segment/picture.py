@@ -7,7 +7,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from beamline.report.figures import grey_window, png
+from beamline.report.figures import downwards, grey_window, png
 from recon.base.volume import Volume
 from recon.post.particles import Particles
 
@@ -20,7 +20,7 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
     z, y, x = volume.grid.coordinates()
     at = np.linspace(0, z.size - 1, _SLICES + 2).round().astype(int)[1:-1]
     half = volume.grid.voxel_size / 2
-    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
+    extent = (x[0] - half, x[-1] + half, y[-1] + half, y[0] - half)
     column = _WIDTH / _SLICES
     figure = Figure(figsize=(_WIDTH, 2 * column * y.size / x.size + 3.2), dpi=_DPI, layout="constrained")
     ratios = (2 * column * y.size / x.size + 0.8, 2.4)
@@ -31,9 +31,7 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
     colours = ListedColormap([(0, 0, 0, 0), *figure_colours()])
     for column_of, k in zip(panels.T, at, strict=True):
         for axes in column_of:
-            axes.imshow(
-                volume.data[k], cmap="gray", norm=window, extent=extent, origin="lower", interpolation="nearest"
-            )
+            axes.imshow(volume.data[k], cmap="gray", norm=window, extent=extent, interpolation="nearest")
             axes.tick_params(labelsize=6)
         shown = np.where(labels[k] > 0, (labels[k] - 1) % _COLOURS + 1, 0)
         shown[1:][(labels[k][1:] != labels[k][:-1]) & (labels[k][:-1] > 0)] = 0  # a line between those that touch
@@ -44,7 +42,6 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
             vmin=0,
             vmax=_COLOURS,
             extent=extent,
-            origin="lower",
             interpolation="nearest",
             alpha=0.65,
         )
@@ -53,7 +50,7 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
         column_of[0].set_title(f"z = {z[k]:.3g} {unit}", fontsize=8)
         column_of[1].set_title(f"{n} particles here", fontsize=8)
     for axes in panels[:, 0]:
-        axes.set_ylabel(f"y ({unit})", fontsize=7)
+        axes.set_ylabel(downwards("y", unit), fontsize=7)
     axes = lower.subplots()
     whole = ~particles.cut
     if particles.label.size:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +31,16 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
     whole = span + span / (distinct.size - 1)
     turns = any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
     return bool(round_numbers or turns)
+
+
+def warn_of_degrees(angles: NDArray[np.floating]) -> None:
+    """A UserWarning where angles look like degrees, at the line that calls the function which asks."""
+    if look_like_degrees(angles):
+        warnings.warn(
+            f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
+            "np.deg2rad(angles)",
+            stacklevel=3,
+        )
 
 
 def look_like_counts(projections: NDArray[np.floating]) -> bool:

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
+from recon.base.units import warn_of_degrees
+
 Floats = NDArray[np.float64]
 
 _MOST_VIEWS, _MOST_ROWS, _MOST_COLS = 256, 16, 1024  # enough for 0.1 px
@@ -364,10 +366,14 @@ def find_axis(
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
+
+    Warns:
+        UserWarning: where angles look like degrees.
     """
     theta = np.asarray(angles, np.float64)
     if projections.ndim != 3:
         raise ValueError(f"projections must be [view, row, col], got shape {projections.shape}")
+    warn_of_degrees(theta)
     try:
         from_all = axis_from_sinogram(projections, theta, search)
     except AxisError:

@@ -24,9 +24,12 @@ class UnlitViewsError(ValueError):
 class References:
     """Darks and flats: the images without beam, and with beam but without a sample.
 
+    Of a stack of frames [frame, row, col], any real type, the mean is kept.
+
     Attributes:
-        dark: float32 [row, col], mean or median of the darks.
-        flats: (position, float32 [row, col]) of each group of flats; the position counts frames of the scan.
+        dark: float32 [row, col], mean or median of the darks; or all of them, as a stack.
+        flats: (position, float32 [row, col]) of each group of flats, or (position, stack); the position counts frames
+            of the scan.
         dynamic: how flats differ from one another; None: a view's flat is interpolated between groups.
         part_starts: ascending, the first frame of each part of the scan. A view's flat is that of the flats of its own
             part; of the nearest group, where this part has none.
@@ -37,11 +40,25 @@ class References:
     dynamic: DynamicFlats | None = None
     part_starts: tuple[int, ...] = (0,)
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dark", _mean(self.dark, "darks"))
+        flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
+        object.__setattr__(self, "flats", flats)
+
     def rows(self, rows: slice) -> References:
         """The same of some detector rows."""
         flats = tuple((position, flat[rows]) for position, flat in self.flats)
         dynamic = None if self.dynamic is None else self.dynamic.rows(rows)
         return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
+
+
+def _mean(frames: Image, what: str) -> Image:
+    """The mean of a stack; an image as it is."""
+    if np.ndim(frames) != 3:
+        return frames
+    if not len(frames):
+        raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
+    return np.asarray(np.mean(frames, axis=0, dtype=np.float64), np.float32)
 
 
 @dataclass(frozen=True)

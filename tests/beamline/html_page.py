@@ -36,7 +36,11 @@ def parsed_page(page: str) -> PageParser:
     assert parser.open == []
     assert page.startswith("<!DOCTYPE html>")
     assert not {"script", "link", "iframe", "object"} & {tag for tag, _ in parser.seen}
-    sources = [v for _, attrs in parser.seen for k, v in attrs.items() if k in ("src", "href", "srcset")]
+    sources = [
+        v for tag, attrs in parser.seen for k, v in attrs.items() if k in ("src", "srcset", "href") and tag != "a"
+    ]
+    links = [attrs.get("href") or "" for tag, attrs in parser.seen if tag == "a"]
+    assert all(link and "/" not in link for link in links)  # of a file beside the page, for the reader to open
     assert all(v is not None and v.startswith("data:image/png;base64,") for v in sources)
     assert "http" not in page
     assert "url(" not in page

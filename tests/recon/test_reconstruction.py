@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -377,8 +378,19 @@ def test_degrees_and_counts_are_warned_of_with_what_to_give(noisy: np.ndarray) -
     degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, PITCH, axis_col=18.3)
     with pytest.warns(UserWarning, match=r"172\.5 rad and look like degrees.*np\.deg2rad"):
         recon.reconstruct(noisy, degrees, "fbp")
+    with (
+        pytest.warns(UserWarning, match=r"172\.5 rad and look like degrees.*np\.deg2rad") as told,
+        suppress(ValueError),
+    ):
+        recon.find_axis(noisy, np.rad2deg(ANGLES))
+    assert told[0].filename == __file__  # the line of the caller
     with pytest.warns(UserWarning, match="look like counts.*recon.correct"):
         recon.reconstruct(np.round(2e4 * np.exp(-noisy)), VIEWS, "fbp")
+
+
+def test_the_names_that_load_late_are_listed() -> None:
+    assert set(recon.__all__) <= set(dir(recon))
+    assert len(dir(recon)) == len(set(dir(recon)))
 
 
 def test_from_counts_to_a_volume_by_public_names(phantom: Phantom, rng: np.random.Generator) -> None:

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.storage.readers.tiff import UNREADABLE, Complaints
+from beamline.storage.readers.tiff import UNREADABLE, VOLUME, Complaints
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
 from beamline.storage.writers.recon_file import ReconRecord
 
-_CLASSIC = 2**31  # bytes of voxels that a TIFF with offsets of 32 bits holds; more take a BigTIFF
+_CLASSIC = 4_000_000_000  # bytes of voxels that a TIFF with offsets of 32 bits holds; more take a BigTIFF
+_UNITS = {"mm": "mm", "px": "pixel"}  # as ImageJ and OME call them
 
 
 @dataclass(frozen=True)
 class TiffFile:
-    """One TIFF, or BigTIFF from 2 GiB on; the facts are JSON in the description of the first slice."""
+    """One TIFF, a hyperstack of ImageJ; from 4 GB on, which ImageJ's own cannot hold, a BigTIFF in the way of OME.
+
+    Both say the edges of a voxel in x, y and z; the facts are JSON in ImageJ's `Info` or OME's `Description`.
+    """
 
     name: str = "TIFF"
     suffixes: tuple[str, ...] = (".tif", ".tiff")
@@ -30,9 +36,11 @@ class TiffFile:
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         dtype = slices.pixels.dtype
-        size = int(np.prod(slices.shape, dtype=np.int64)) * dtype.itemsize
-        with tifffile.TiffWriter(path, bigtiff=size >= _CLASSIC) as tif:
-            tif.write(iter(slices), shape=slices.shape, dtype=dtype, **_tags(record, facts_of(record, slices.pixels)))
+        big = int(np.prod(slices.shape, dtype=np.int64)) * dtype.itemsize >= _CLASSIC
+        facts = json.dumps(facts_of(record, slices.pixels) | {"shape": slices.shape})
+        tags = _ome(record, facts) if big else _imagej(record, facts)
+        with tifffile.TiffWriter(path, bigtiff=big, ome=big, imagej=not big, byteorder="<") as tif:
+            tif.write(iter(slices), shape=slices.shape, dtype=dtype, photometric="minisblack", **tags)
 
     def holds(self, path: Path) -> bool:
         return path.is_file() and path.name.lower().endswith(self.suffixes) and _facts(path) is not None
@@ -114,9 +122,33 @@ def _slice(folder: Path, z: int) -> Path:
 def _facts(path: Path) -> dict[str, Any] | None:
     try:
         with Complaints(), tifffile.TiffFile(path) as tif:
-            return marked(tif.pages.first.description)
-    except UNREADABLE:
+            return marked(_said(tif))
+    except (*UNREADABLE, ElementTree.ParseError):
         return None
+
+
+def _said(tif: tifffile.TiffFile) -> str:
+    """Where our facts stand: in ImageJ's information, OME's description, or the description of a slice."""
+    if tif.is_imagej:
+        return str((tif.imagej_metadata or {}).get("Info", ""))
+    if tif.ome_metadata:
+        return ElementTree.fromstring(tif.ome_metadata).findtext("{*}Image/{*}Description") or ""
+    return str(tif.pages.first.description)
+
+
+def _imagej(record: ReconRecord, facts: str) -> dict[str, Any]:
+    """Pixels per unit, and the pitch of slices in that unit, as ImageJ has them."""
+    z, _, x = record.volume.grid.spacing
+    metadata = {"axes": "ZYX", "spacing": z, "unit": _UNITS[record.length_unit], "format": VOLUME, "Info": facts}
+    return {"resolution": (1 / x, 1 / x), "resolutionunit": "NONE", "metadata": metadata}
+
+
+def _ome(record: ReconRecord, facts: str) -> dict[str, Any]:
+    """The edges of a voxel, as OME has them."""
+    metadata: dict[str, Any] = {"axes": "ZYX", "Description": facts}
+    for axis, edge in zip("ZYX", record.volume.grid.spacing, strict=True):
+        metadata |= {f"PhysicalSize{axis}": edge, f"PhysicalSize{axis}Unit": _UNITS[record.length_unit]}
+    return {"metadata": metadata}
 
 
 def _tags(record: ReconRecord, facts: dict[str, Any]) -> dict[str, Any]:

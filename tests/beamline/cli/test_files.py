@@ -51,6 +51,12 @@ def test_info_for_people(folder: Path) -> None:
     assert said["sample"] == "two cylinders"
 
 
+def test_info_takes_a_line_for_each_fact_of_a_volume(folder: Path) -> None:
+    assert _beamline("recon", "scan.h5", "-m", "fbp", "--axis", "19.5", "-o", "v.h5", "--no-report").exit_code == 0
+    lines = _beamline("info", "v.h5").stdout.splitlines()
+    assert [line.split(maxsplit=1)[1] for line in lines if line.startswith("recipe ")] == ["method: fbp; axis: 19.5"]
+
+
 def test_info_for_machines(folder: Path) -> None:
     result = _beamline("info", "exchange.h5", "--json")
     (line,) = result.stdout.splitlines()

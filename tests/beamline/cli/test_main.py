@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import click
 import h5py
 import pytest
+from click.shell_completion import get_completion_class
 from click.testing import CliRunner
 
 from beamline.cli import main as module
@@ -167,3 +168,21 @@ def test_every_command_has_its_line_in_the_page_on_commands() -> None:
     assert [
         name for name in module.main.list_commands(click.Context(module.main)) if f"\nbeamline {name} " not in page
     ] == []
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_completes_commands_without_their_modules_and_their_options(
+    shell: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = get_completion_class(shell)
+    assert kind is not None
+    completion = kind(module.main, {}, "beamline", "_BEAMLINE_COMPLETE")
+    assert "_BEAMLINE_COMPLETE" in completion.source()
+
+    def completed(*words: str) -> list[str]:
+        return [item.value for item in completion.get_completions(list(words[:-1]), words[-1])]
+
+    assert completed("doctor", "--se") == ["--session", "--set"]
+    monkeypatch.setattr(module, "import_module", None)
+    assert completed("re") == ["resume", "recon", "recover"]
+    assert completed("--v") == ["--version"]

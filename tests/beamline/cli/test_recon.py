@@ -302,10 +302,11 @@ def test_axes_are_tried_on_one_slice_and_drawn(folder: Path) -> None:
     said = dict(line.split() for line in result.stdout.splitlines()[1:])
     assert float(said["best"]) == pytest.approx(SCAN.axis_col, abs=0.3)
     assert said["sheet"] == "scan_axis.png" and float(said["17"]) > 2 * float(said[said["best"]])
-    result = beamline("recon", "scan.h5", "--axis", "try:23:25:1", "--json", "-o", "far.h5")
+    (folder / "sub.d").mkdir()
+    result = beamline("recon", "scan.h5", "--axis", "try:23:25:1", "--json", "-o", "sub.d/far.PNG")
     events = [json.loads(line) for line in result.stdout.splitlines()]
     assert "at the end of the range, column 23" in str(events) and events[-1]["axis_col"] == 23
-    assert left(folder) == {"scan.h5", "scan_axis.png", "far.png"}
+    assert left(folder) == {"scan.h5", "scan_axis.png", "sub.d"} and (folder / "sub.d/far.PNG").is_file()
     for tried, code, error in (
         ("try:17:24", 2, "is not try:FIRST:LAST:STEP"),
         ("try:24:17:1", 2, "expected FIRST < LAST"),
@@ -313,7 +314,10 @@ def test_axes_are_tried_on_one_slice_and_drawn(folder: Path) -> None:
         ("try:30:50:1", 2, "lies outside the detector"),
         ("try:17:24:0.5", 5, "scan_axis.png exists"),
     ):
-        result = beamline("recon", "scan.h5", "--axis", tried, *(() if code == 5 else ("-o", "other.h5")))
+        result = beamline("recon", "scan.h5", "--axis", tried, *(() if code == 5 else ("-o", "other.png")))
         words = " ".join(result.stderr.replace("│", " ").split())
         assert (result.exit_code, error in words) == (code, True), result.stderr
+    for options, name in ((("--axis", "try:17:24:1", "-o", "x.tif"), "x.png"), (("-m", "fbp", "-o", "x.png"), "x.h5")):
+        result = beamline("recon", "scan.h5", *options)
+        assert (result.exit_code, name in result.stderr) == (2, True), result.stderr
     assert beamline("tradeoff", "scan.h5", "--axis", "try:17:24:0.5").exit_code == 2

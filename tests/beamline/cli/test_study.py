@@ -91,6 +91,7 @@ def test_every_method_gets_the_options_that_it_takes(folder: Path, seen: list[An
     settings = {trial.method: trial.settings for trial, _ in seen[1:]}
     assert settings == {"r2": {"steps": 50}, "sirt": {"iterations": 7}, "fbp": {}}
     assert "r2: steps 50." in result.stdout and "sirt: iterations 7." in result.stdout
+    assert (folder / result.stdout.split()[-1]).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
 
 
 def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any]) -> None:

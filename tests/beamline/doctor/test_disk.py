@@ -94,7 +94,7 @@ def test_the_verdict_is_what_would_have_to_wait(
     clock = VirtualClock()
     check = disk.speed(tmp_path, need(100 * MB), clock, lambda folder: Slow(clock, rate))
     assert check.verdict is verdict
-    assert check.expected == "100 MB/s at the highest frame rate"
+    assert check.expected == "100 MB/s, with previews, at the highest frame rate"
     assert check.values["backlog"] == pytest.approx(max(0, (100 * MB - rate) * 100), rel=0.01, abs=MB)
     assert (check.advice == "") == (verdict is Verdict.OK)
 

@@ -6,6 +6,9 @@ import json
 from collections.abc import Callable, Iterator, Set
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime
+from multiprocessing import get_context
+from multiprocessing.synchronize import Event as MpEvent
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +156,9 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     names = [event.event for event in events]
     assert names[0] == "state"
     assert [event.data["state"] for event in events[:3]] == ["warming_up", "ready", "waiting"]
+    watch = f"open {tmp_path / 'recon.live.png'}: drawn anew about every {RHYTHM.snapshot:g} s"
+    assert watch in str(events[1].data["message"])
+    assert '<a href="recon.live.png">' in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert names.count("recon_started") == 1
     assert "snapshot" in names
     assert names[-1] == "done"
@@ -462,8 +468,38 @@ def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None
     assert max(quality for _, quality in seen) > 18
     known = [u for u in unlearnt if np.isfinite(u)]
     assert known[-1] < known[0] < 1  # of views that no step had seen
-    assert not (tmp_path / "recon.live.png").exists()  # nor the snapshot: the volume is there
-    assert not (tmp_path / "recon.snapshot.h5").exists()
+    assert (tmp_path / "recon.live.png").exists()  # the report links it
+    assert not (tmp_path / "recon.snapshot.h5").exists()  # the volume is there
+
+
+def _write_and_wait(path: Path, frames: list[Frame], written: MpEvent, close: MpEvent) -> None:
+    writer = NXtomoWriter(path, ScanInfo(sample="two cylinders"), frames[0].counts.shape, clock=StandingClock())
+    for frame in frames:
+        writer.append(frame, digest(frame.counts), [])
+    written.set()
+    close.wait(60)
+    writer.close("complete")
+
+
+@pytest.mark.slow  # a process starts
+def test_the_report_has_the_facts_of_the_closed_file(tmp_path: Path) -> None:
+    """A writer of another process writes texts anew when it closes the file, which the follower has open."""
+    spawn = get_context("spawn")
+    written, close = spawn.Event(), spawn.Event()
+    arguments = (tmp_path / "scan.h5", frames_of(INTERLACED), written, close)
+    writer = spawn.Process(target=_write_and_wait, args=arguments)
+    writer.start()
+    assert written.wait(60)
+
+    def look(event: Event) -> None:
+        if event.event == "snapshot" and not close.is_set():
+            close.set()
+            writer.join(60)
+
+    target = OutputPaths(tmp_path / "recon.h5", tmp_path / "report.html")
+    follow(_options(tmp_path, target=target), look, ScanClock(), RHYTHM)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"end_time</th><td>{datetime.fromtimestamp(EPOCH, UTC).isoformat(timespec='milliseconds')}</td>" in page
 
 
 def test_enough_views_are_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,14 @@ def test_page_nests_is_self_contained_and_escapes() -> None:
     assert base64.b64decode((image["src"] or "").split(",")[1]) == b"\x89PNG fake"
 
 
+def test_the_live_picture_is_a_link_where_there_is_one() -> None:
+    def links(report: Report) -> list[str | None]:
+        return [attrs["href"] for tag, attrs in parsed_page(to_html(report)).seen if tag == "a"]
+
+    assert links(_report()) == []
+    assert links(_report(live_picture="a #1.live.png")) == ["a%20%231.live.png"]
+
+
 def test_metrics_stand_in_their_method_column() -> None:
     page = to_html(_report())
     row = re.search(r'<tr><th scope="row">PSNR.*?</tr>', page)
@@ -141,19 +149,22 @@ def test_slices_meet_where_the_volume_is_bright() -> None:
     assert figures.bright_centre(np.zeros((4, 6, 8), np.float32)) == (2, 3, 4)
 
 
-def test_z_runs_downwards_in_slices_and_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Row 0 of the detector is at the top, and the numbers beside it agree; x, y is a map with y upwards."""
+def test_y_and_z_run_downwards_in_slices_and_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Row 0 is at the top, as image viewers show it, and the numbers beside it agree."""
     drawn: list[Figure] = []
     monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
     data = np.arange(40.0, dtype=np.float32).reshape(4, 10, 1).repeat(10, axis=2)
     figures.projection(data[:, :, 0][None], Geometry.parallel([0.0], (4, 10)), 0, "mm")
     figures.orthogonal_slices({"v": Volume(data, Grid(data.shape, 1.0))}, "mm")
+    volume = Volume(data, Grid(data.shape, 1.0))
+    figures.differences({"v": volume, "w": volume}, "mm")
+    figures.significance(data[0], volume.grid, 0, "mm")
     axes = [axes for figure in drawn for axes in figure.axes if axes.get_xlabel() in ("u (mm)", "x (mm)", "y (mm)")]
     names = [panel.get_ylabel() for panel in axes]
-    assert names == ["z (mm)", "y (mm)", "z (mm)", "z (mm)"]
-    for panel, name in zip(axes, names, strict=True):
+    assert names == ["← z (mm)", "← y (mm)", "← z (mm)", "← z (mm)", "← y (mm)", "← y (mm)"]
+    for panel in axes:
         bottom, top = panel.get_ylim()
-        assert (panel.images[0].origin, top < bottom) == (("upper", True) if name == "z (mm)" else ("lower", False))
+        assert (panel.images[0].origin, top < bottom) == ("upper", True)
 
 
 def test_profile_and_values_of_an_edge_and_of_nothing(rng: np.random.Generator) -> None:

@@ -23,11 +23,11 @@ def shown(picture: LivePicture) -> np.ndarray:
 
 
 def panel(image: np.ndarray, across: int, tall: int, above: int | None = None) -> np.ndarray:
-    """The image below a label, row 0 at the bottom, `tall` pixels high, that far from the left; `above`: the height of
+    """The image below a label, row 0 at the top, `tall` pixels high, that far from the left; `above`: the height of
     the panels above it."""
     pitch = (image.shape[1] - GAP) // 3
     top = TOP + GAP + LINES + (0 if above is None else above + GAP + LINES)
-    return image[top : top + tall, GAP + across * pitch : (across + 1) * pitch][::-1]
+    return image[top : top + tall, GAP + across * pitch : (across + 1) * pitch]
 
 
 @pytest.mark.parametrize(("side", "zoom"), [(40, 7), (160, 2), (280, 1), (700, 0.5)])
@@ -42,8 +42,8 @@ def test_slices_are_where_the_matter_is_and_fill_their_panels(side: int, zoom: f
     assert image.shape[0] == TOP + 2 * (GAP + LINES) + tall + low + GAP
     slice_ = panel(image, 0, tall)
     y, x = (round(f * tall) for f in (0.625, 0.375))
-    assert slice_[y, x].min() > 0.95 and slice_[x, y].max() < 0.05  # y up, x to the right
-    assert panel(image, 1, round(4 * zoom))[-1, 0].max() < 0.05  # right below its label
+    assert slice_[y, x].min() > 0.95 and slice_[x, y].max() < 0.05  # y down, x to the right
+    assert panel(image, 1, round(4 * zoom))[0, 0].max() < 0.05  # right below its label
     assert panel(image, 2, low, tall).min() > 0.99  # a view like its render differs by nothing
 
 
@@ -53,7 +53,7 @@ def test_differences_are_in_units_of_the_noise(rng: np.random.Generator) -> None
     view = rng.normal(0, 0.1, (64, 64)).astype(np.float32)
     render = np.zeros((64, 64), np.float32)
     render[:32] = -0.5  # five times the noise less than the view
-    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 256, 256)[::-1]  # row 0 at the top
+    difference = panel(shown(LivePicture(volume, view, render, "1 view", "mm")), 2, 256, 256)
     red, _, blue = (difference[..., k].mean(axis=1) for k in range(3))
     assert blue[10:100].mean() < 0.35 < 0.8 < red[10:100].mean()
     assert blue[150:250].mean() == pytest.approx(red[150:250].mean(), abs=0.05)  # noise alone

@@ -176,6 +176,19 @@ def test_flats_are_interpolated_between_groups_and_held_outside(rng: np.random.G
     np.testing.assert_allclose(result.data, 0.7, atol=1e-5)
 
 
+def test_stacks_of_darks_and_flats_count_by_their_means(rng: np.random.Generator) -> None:
+    counts, references = beer_lambert(sphere(), rng)
+    (position, flat), change = references.flats[0], np.array([-3.0, 0.0, 3.0], np.float32)[:, None, None]
+    stacks = References(references.dark + change, ((position, flat + 10 * change),))
+    expected = correct(counts, positions(counts), references)
+    np.testing.assert_allclose(correct(counts, positions(counts), stacks).data, expected.data, atol=1e-5)
+    camera = np.stack([np.full((2, 5), n, np.uint16) for n in (65535, 65533)])  # their sum is beyond 16 bits
+    assert (References(camera, ((0.0, camera[:1]),)).dark == 65534).all()
+    assert references.rows(slice(0, 2)).dark.shape == (2, 48)
+    with pytest.raises(ValueError, match=r"stack of flats at 7 is empty"):
+        References(references.dark, ((7.0, camera[:0]),))
+
+
 def test_air_takes_out_the_beam(rng: np.random.Generator) -> None:
     truth = sphere(views=40)
     counts, references = beer_lambert(truth, rng, noise=0.01)

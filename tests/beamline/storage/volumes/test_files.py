@@ -12,6 +12,7 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate
 from beamline.storage.volumes import tiff
 from beamline.storage.volumes.base import Pixels, Slices
@@ -71,7 +72,7 @@ def test_other_programs_read_the_same(tmp_path: Path) -> None:
     with tifffile.TiffFile(tmp_path / "v.tif") as tif:
         np.testing.assert_array_equal(tif.asarray(), VALUES)
         assert len(tif.pages) == SHAPE[0]
-        assert tif.pages.first.get_resolution("MILLIMETER") == (4.0, 4.0)  # pixels of 0.25 mm
+        assert (tif.is_imagej, tif.series[0].axes) == (True, "ZYX")
     slices = sorted((tmp_path / "v").iterdir())
     assert [path.name for path in slices] == ["slice_00000.tif", "slice_00001.tif", "slice_00002.tif"]
     np.testing.assert_array_equal([tifffile.imread(path) for path in slices], VALUES)
@@ -139,12 +140,32 @@ def test_nothing_is_overwritten(tmp_path: Path, name: str) -> None:
     assert list(tmp_path.iterdir()) == [tmp_path / name]
 
 
-def test_large_volumes_are_a_bigtiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiff, "_CLASSIC", VALUES.nbytes)
-    write_volume(tmp_path / "v.tif", RECORD)
+LONG = replace(RECORD, volume=Volume(VALUES, Grid(SHAPE, 0.25, (0.5, 0.0, -1.0), slice_pitch=0.4)))  # along z
+
+
+@pytest.mark.parametrize(("unit", "name"), [("mm", "mm"), ("px", "pixel")])
+def test_imagej_sees_a_stack_along_z_with_the_edges_of_a_voxel(tmp_path: Path, unit: str, name: str) -> None:
+    write_volume(tmp_path / "v.tif", replace(LONG, length_unit=unit))
     with tifffile.TiffFile(tmp_path / "v.tif") as tif:
-        assert tif.is_bigtiff
+        said = tif.imagej_metadata or {}
+        assert (said["slices"], said["spacing"], said["unit"]) == (3, 0.4, name)
+        assert [tif.pages.first.tags[f"{axis}Resolution"].value for axis in "XY"] == [(4, 1)] * 2  # pixels per unit
+        assert tif.pages.first.tags["ResolutionUnit"].value == 1  # that of the description
+
+
+def test_large_volumes_are_a_bigtiff_of_ome(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiff, "_CLASSIC", VALUES.nbytes)
+    write_volume(tmp_path / "v.tif", LONG)
+    with tifffile.TiffFile(tmp_path / "v.tif") as tif:
+        assert (tif.is_bigtiff, tif.series[0].axes) == (True, "ZYX")
         np.testing.assert_array_equal(tif.asarray(), VALUES)
+        for size in ('PhysicalSizeZ="0.4"', 'PhysicalSizeY="0.25"', 'PhysicalSizeXUnit="mm"'):
+            assert size in (tif.ome_metadata or "")
+    with opened_volume(tmp_path / "v.tif") as read:
+        np.testing.assert_array_equal(read.volume.data[:], VALUES)
+        assert (read.volume.grid, read.title) == (LONG.volume.grid, LONG.title)
+    with pytest.raises(DataError, match="is a volume that this program wrote"):
+        open_scan(tmp_path / "v.tif")
 
 
 @pytest.mark.parametrize("name", ["v.h5", "v.tif", "v.nrrd"])
