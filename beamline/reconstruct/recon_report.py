@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.phases import Phases
 from beamline.core.text import spans
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.projections.prepare import PreparedProjections
@@ -132,6 +133,7 @@ class ReportContext:
     scan_flags: Sequence[str] = field(default_factory=tuple)
     recipe: str = ""
     region: RegionOfRows | None = None
+    phases: Phases = field(default_factory=Phases)
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
