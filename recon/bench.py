@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr, ssim3d
+from recon.base.choices import N_GAUSSIANS, SIDE
 from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
 from recon.base.volume import Grid
@@ -27,7 +28,6 @@ from recon.splatting.splat import project
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]
 
-N_GAUSSIANS, SIDE = 50_000, 256
 _FAINT, _SIGMAS = 1e-3, 3.5
 
 

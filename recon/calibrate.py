@@ -14,16 +14,13 @@ from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import SUBSETS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
 from recon.voxels.held_out_weight import choice_sweeps
-from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.projector import Projector
-from recon.voxels.tv import TotalVariationProx, difference_weights
 
 F32 = NDArray[np.float32]
 Clock = Callable[[], float]
@@ -31,7 +28,7 @@ Clock = Callable[[], float]
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60
 _STEP_VIEWS, _STEPS = 4, 6
-_SWEPT_VIEWS, _SWEPT_ROWS = 8, 64  # fewer rows take longer each: 1.5 times at 16
+_SWEPT_ROWS = 64  # fewer rows take longer each: 1.5 times at 16
 
 
 def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
@@ -80,23 +77,6 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     sweep = sweep_seconds(high, some, now) * grid.shape[0] / some.shape[0]
     trials = choice_sweeps(geometry) * sweep if math.isfinite(sweep) else 0.0
     return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds, sweep, trials)
-
-
-def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """Time of a sweep of FISTA-TV over all views; infinite for rolled or tilted ones, which voxels do not take.
-
-    A few views are projected there and back, and one proximal step of total variation is taken, to measure it.
-    """
-    if not geometry.is_straight:
-        return math.inf
-    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
-    projector = Projector(some, grid)
-    begin = now()
-    x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
-    projected = now()
-    TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
-    parts = subsets_of(geometry, SUBSETS)
-    return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
 
 
 def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:

@@ -7,27 +7,24 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.terminal import Terminal
-from beamline.config.load import load
-from beamline.config.models import Storage
-from beamline.config.monitor import configured_checks
 from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
 from beamline.core.text import size
-from beamline.scan.rate import Load, RateRow, rates, summary
 from drivers import orca_quest
 from drivers.clock import SystemClock
-from drivers.protocols import CameraSettings, TriggerSource
-from recon.bench import N_GAUSSIANS, SIDE, Timing, VolumeRow, kernel_timings, step_timing, volume_rows
+from recon.base.choices import N_GAUSSIANS, SIDE
 from recon.methods import by_name, names
-from recon.splatting.r2 import R2
-from recon.warm_up import warm_up
+
+if TYPE_CHECKING:
+    from beamline.scan.rate import Load, RateRow
+    from recon.bench import Timing, VolumeRow
 
 _STEPS = (125, 500, 2000)
 
@@ -77,6 +74,8 @@ def acquire(
     digest of each frame, the monitor, and all of it behind the queue that a scan feeds. Half of the free disk is used
     at most, and every file is removed. Run it on an idle machine; ratios of one round are more reliable than rates.
     """
+    from beamline.scan.rate import rates, summary
+
     clock, taken = SystemClock(), []
     with terminated_like_interrupted(), json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
         work = _load(file, shape)
@@ -107,6 +106,12 @@ def acquire(
 
 
 def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
+    from beamline.config.load import load
+    from beamline.config.models import Storage
+    from beamline.config.monitor import configured_checks
+    from beamline.scan.rate import Load
+    from drivers.protocols import CameraSettings, TriggerSource
+
     if file is None:
         return Load(shape or orca_quest.SENSOR_SHAPE, Storage().preview_bin, Storage().flush_every)
     config = load(file)
@@ -156,6 +161,8 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
 
     Nothing is written. Run it on an idle machine; ratios within one run are more reliable than times.
     """
+    from recon.warm_up import warm_up
+
     clock = SystemClock()
     with json_events(as_json) as sinks:
 
@@ -178,11 +185,16 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
 
 
 def _timings(gaussians: int, side: int) -> Iterator[Timing]:
+    from recon.bench import kernel_timings, step_timing
+
     yield from kernel_timings(time.perf_counter, gaussians, side)
     yield step_timing(time.perf_counter, gaussians, side)
 
 
 def _rows() -> Iterator[VolumeRow]:
+    from recon.bench import volume_rows
+    from recon.splatting.r2 import R2
+
     others = [by_name(name) for name in names()]
     yield from volume_rows(time.perf_counter, [*map(R2, _STEPS), *(method() for method in others if method is not R2)])
 

@@ -8,9 +8,7 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
-from beamline.config.load import load
 from beamline.core.events import Event
-from beamline.scan.preflight import dry_run, refuse_violations
 from drivers.clock import SystemClock
 
 
@@ -26,6 +24,9 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 
     Exit code: 0 valid, 2 wrong configuration or violated limit.
     """
+    from beamline.config.load import load
+    from beamline.scan.preflight import dry_run, refuse_violations
+
     with json_events(as_json) as sinks:
         worked = dry_run(load(file, overrides))
         if not as_json:

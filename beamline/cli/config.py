@@ -8,7 +8,6 @@ from pathlib import Path
 import click
 
 from beamline.cli.options import config_argument, set_option
-from beamline.config.load import config_folder, load, resolved_yaml, schema
 
 
 @click.group()
@@ -20,6 +19,8 @@ def config() -> None:
 @click.option("--instrument", is_flag=True, help="A template for a real instrument instead of simulated devices.")
 def init(instrument: bool) -> None:
     """Print a complete, commented configuration to edit: beamline config init > my.yaml"""
+    from beamline.config.load import config_folder
+
     name = "instrument.yaml" if instrument else "simulated.yaml"
     click.echo((config_folder() / name).read_text(encoding="utf-8"), nl=False)
 
@@ -29,10 +30,14 @@ def init(instrument: bool) -> None:
 @set_option
 def show(file: Path, overrides: tuple[str, ...]) -> None:
     """Print CONFIG as a scan would use it: with all defaults, --set and BEAMLINE_* variables applied."""
+    from beamline.config.load import load, resolved_yaml
+
     click.echo(resolved_yaml(load(file, overrides)), nl=False)
 
 
 @config.command("schema", short_help="Print the JSON schema of a configuration.")
 def print_schema() -> None:
     """Print the JSON schema of a configuration, for editors that complete and check YAML files."""
+    from beamline.config.load import schema
+
     click.echo(json.dumps(schema(), indent=2))

@@ -6,41 +6,44 @@ from pathlib import Path
 
 import click
 
-from beamline.config.models import Storage
 from beamline.core.errors import ConfigError
-from beamline.scan.control import Verb, running, tell
 
 _EXIT_CODES = "Exit code: 0 it was told, 2 no scan runs there or it does not answer, 5 disk error."
 
 
-def _command(verb: Verb, help_text: str) -> click.Command:
-    """The command of a verb; `help_text` begins its help."""
+def _command(verb: str, help_text: str) -> click.Command:
+    """The command of a `beamline.scan.control.Verb`; `help_text` begins its help."""
 
-    @click.command(verb.value, help=f"{help_text}\n\n{_EXIT_CODES}")
+    @click.command(verb, help=f"{help_text}\n\n{_EXIT_CODES}")
     @click.argument("run", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
     def send(run: Path | None) -> None:
+        from beamline.config.models import Storage  # here: help needs none of it
+        from beamline.scan.control import Verb, tell
+
         run = run or _only(Path(Storage.model_fields["folder"].default))
-        click.echo(f"{run}: {tell(run, verb)}")
+        click.echo(f"{run}: {tell(run, Verb(verb))}")
 
     return send
 
 
 pause = _command(
-    Verb.PAUSE,
+    "pause",
     "Pause the scan in the folder RUN (the running one of ./runs): the stage stands, the shutter closes, and no view "
     "is lost or taken twice. `beamline resume` goes on.",
 )
-resume = _command(Verb.RESUME, "Let the paused scan in the folder RUN (the running one of ./runs) go on.")
+resume = _command("resume", "Let the paused scan in the folder RUN (the running one of ./runs) go on.")
 stop = _command(
-    Verb.STOP, "Stop the scan in the folder RUN (the running one of ./runs) cleanly, as the first Ctrl-C does."
+    "stop", "Stop the scan in the folder RUN (the running one of ./runs) cleanly, as the first Ctrl-C does."
 )
 abort = _command(
-    Verb.ABORT, "Abort the scan in the folder RUN (the running one of ./runs) at once, as the second Ctrl-C does."
+    "abort", "Abort the scan in the folder RUN (the running one of ./runs) at once, as the second Ctrl-C does."
 )
 
 
 def _only(runs: Path) -> Path:
     """The one run in a folder that goes on."""
+    from beamline.scan.control import running
+
     found = running(runs)
     if len(found) == 1:
         return found[0]

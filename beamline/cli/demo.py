@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,25 +15,15 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan import stop_signals
 from beamline.cli.terminal import Terminal, results
-from beamline.config.load import Config, config_folder, load
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.narration import sentence
 from beamline.core.stop import StopRequest
-from beamline.instrument.connect import connect
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
-from beamline.reconstruct.result import OutputPaths, axis_of, write_result
-from beamline.report.record import history_from
-from beamline.scan.live_process import follow_command
-from beamline.scan.run import run_scan
-from beamline.scan.run_folder import RECON, RECON_LOG
-from beamline.storage.readers.open import open_scan
-from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
-from recon.assess.metrics import psnr
-from recon.base.volume import Grid, Volume
+
+if TYPE_CHECKING:
+    from beamline.config.load import Config
+    from recon.base.volume import Volume
 
 
 @click.command()
@@ -49,6 +40,8 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
 
     The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
     """
+    from beamline.config.load import config_folder, load
+
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
     with json_events(as_json) as sinks:
         config = load(config_folder() / "demo.yaml", overrides)
@@ -80,6 +73,20 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         ConfigError: for a real instrument, where there is no truth.
         DataError: the live reconstruction failed; the scan is in its file.
     """
+    from beamline.instrument.connect import connect
+    from beamline.projections.prepare import prepare_projections
+    from beamline.projections.selection import Selection
+    from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+    from beamline.reconstruct.result import OutputPaths, axis_of, write_result
+    from beamline.report.record import history_from
+    from beamline.scan.live_process import follow_command
+    from beamline.scan.run import run_scan
+    from beamline.scan.run_folder import RECON, RECON_LOG
+    from beamline.storage.readers.open import open_scan
+    from beamline.storage.writers.recon_file import read_reconstruction
+    from recon.assess.metrics import psnr
+    from recon.base.volume import Grid, Volume
+
     clock = SystemClock()
     started = clock.now()
     snapshots = _Snapshots()
@@ -132,6 +139,8 @@ class _Snapshots:
         self.flags: list[str] = []
 
     def __call__(self, event: Event) -> None:
+        from beamline.storage.writers.recon_file import read_reconstruction
+
         if event.event == "snapshot":
             try:
                 volume = read_reconstruction(Path(event.data["path"])).volume

@@ -6,19 +6,18 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import set_option
-from beamline.config.load import load
 from beamline.core.events import Event
-from beamline.doctor.check import Check, Verdict
-from beamline.doctor.examine import examine
+from beamline.doctor.check import Verdict
 from drivers.clock import SystemClock
+
+if TYPE_CHECKING:
+    from beamline.doctor.check import Check
 
 _STYLES = {
     Verdict.OK: "green",
@@ -49,6 +48,10 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
 
     Exit code: 0 no check failed, 1 a check failed, 2 wrong configuration.
     """
+    from beamline.config.load import load
+    from beamline.doctor.check import Check
+    from beamline.doctor.examine import examine
+
     if file is None and overrides:
         raise click.UsageError("--set needs a CONFIG.")
     clock, checks = SystemClock(), list[Check]()
@@ -71,6 +74,10 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
 
 
 def _show(checks: Sequence[Check], compared: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
     console = Console(file=sys.stdout, highlight=False)
     if not console.is_terminal:
         console = Console(file=sys.stdout, highlight=False, width=_WIDTH)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-import numpy as np
 
 from beamline.cli.json_output import json_events, terminated_like_interrupted
 from beamline.cli.options import json_option
@@ -15,10 +15,10 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.files import refuse_existing
 from beamline.core.text import size
-from beamline.storage.volumes.base import Pixels
-from beamline.storage.volumes.files import format_of, opened_volume, write_volume
-from beamline.storage.writers.recon_file import ReconRecord
 from drivers.clock import SystemClock
+
+if TYPE_CHECKING:
+    from beamline.storage.writers.recon_file import ReconRecord
 
 
 def window_of(text: str) -> tuple[float, float]:
@@ -59,6 +59,9 @@ def export(
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
     Nothing is overwritten, and a failure leaves nothing.
     """
+    from beamline.storage.volumes.base import Pixels
+    from beamline.storage.volumes.files import format_of, opened_volume, write_volume
+
     refuse_shared({"VOLUME": volume, "--output": output})
     pixels = Pixels(int(bits), window)
     if pixels.bits == 32 and window is not None:
@@ -93,6 +96,8 @@ def export(
 
 def _suggestion(record: ReconRecord) -> str:
     """A window for the middle slice."""
+    import numpy as np
+
     middle = record.volume.grid.shape[0] // 2
     values = np.asarray(record.volume.data[middle : middle + 1], np.float32)
     low, high = np.percentile(values[np.isfinite(values)], (0.1, 99.9)) if np.isfinite(values).any() else (0.0, 1.0)

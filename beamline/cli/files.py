@@ -17,16 +17,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.text import count, printable, size, spans
-from beamline.scan.run_folder import SCAN
-from beamline.storage.archive import archive as archive_scan
-from beamline.storage.compressed_copy import CODECS
-from beamline.storage.describe import describe
-from beamline.storage.flag_legend import counted
-from beamline.storage.ingest import ingest as ingest_scan
-from beamline.storage.parts import JOINED
-from beamline.storage.readers.open import SourceOptions
-from beamline.storage.recover import recover as recover_scan
-from beamline.storage.rules.validate import validate as findings_of
+from beamline.storage.codecs import CODECS
 from drivers.clock import SystemClock
 
 _PATH = click.Path(path_type=Path)
@@ -38,6 +29,10 @@ _PATH = click.Path(path_type=Path)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
 def info(file: Path, as_json: bool, **said: Any) -> None:
     """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format."""
+    from beamline.storage.describe import describe
+    from beamline.storage.flag_legend import counted
+    from beamline.storage.readers.open import SourceOptions
+
     with json_events(as_json) as sinks:
         facts = dict(describe(SourceOptions(file, **said)))
         for sink in sinks:
@@ -79,6 +74,9 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
 
     Exit code: 0 no error (warnings may be), 5 errors.
     """
+    from beamline.storage.readers.open import SourceOptions
+    from beamline.storage.rules.validate import validate as findings_of
+
     clock = SystemClock()
     with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
         progress = counting("validate", fan_out(*(sinks or [terminal])), clock)
@@ -107,7 +105,10 @@ def recover(file: Path, as_json: bool) -> None:
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is. What changes is
     written to FILE.journal first, so that this can be run again after whatever stopped it; it says what room it needs.
     """
-    from beamline.scan.resume import recover_run  # here: no other command of this module needs a configuration
+    from beamline.scan.resume import recover_run
+    from beamline.scan.run_folder import SCAN
+    from beamline.storage.parts import JOINED
+    from beamline.storage.recover import recover as recover_scan
 
     def say(what: str) -> None:
         click.echo(what, err=True)
@@ -148,6 +149,9 @@ def ingest(
     IN: a multi-page TIFF, folder or .zip of TIFFs, .txrm, or HDF5 (--data-path where its layout is not known). Frames
     are copied one at a time, with statistics and a preview of each. Nothing is overwritten.
     """
+    from beamline.storage.ingest import ingest as ingest_scan
+    from beamline.storage.readers.open import SourceOptions
+
     clock = SystemClock()
     began = clock.now()
     with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
@@ -176,8 +180,8 @@ def ingest(
 @click.option("-o", "--output", metavar="FILE", type=_PATH, required=True, help="The archive to write.")
 @click.option(
     "--codec",
-    type=click.Choice([*CODECS]),
-    default=next(iter(CODECS)),
+    type=click.Choice(CODECS),
+    default=CODECS[0],
     show_default=True,
     help="Compressor, all lossless. blosc2: zstd after a bit shuffle. bitshuffle-lz4: fast, and most widely read.",
 )
@@ -190,6 +194,8 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
     SCAN is never deleted: the last line names the files that may be. Nothing is overwritten, and a failure leaves
     nothing.
     """
+    from beamline.storage.archive import archive as archive_scan
+
     clock = SystemClock()
     began = clock.now()
     with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:

@@ -10,9 +10,7 @@ import click
 
 from beamline.cli.json_output import terminated_like_interrupted
 from beamline.cli.options import POSITIVE, config_argument, set_option
-from beamline.config.load import load
 from beamline.core.errors import INTERRUPTED
-from beamline.instrument.connect import stage_alone
 from drivers.errors import DeviceError
 
 
@@ -29,6 +27,9 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
 
     Exit code: 0 done, 3 the stage has no reference or the search failed, 130 not confirmed or interrupted.
     """
+    from beamline.config.load import load
+    from beamline.instrument.connect import stage_alone
+
     config = load(file, overrides)
     stage_config = config.devices.stage
     if not yes:

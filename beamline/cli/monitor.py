@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,28 +14,15 @@ from beamline.cli.json_output import StopOnSignal, json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal, counting
-from beamline.config.load import load
-from beamline.config.monitor import configured_checks
-from beamline.config.references import reference_limits
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.text import spans
-from beamline.monitor.aside import Aside
-from beamline.monitor.check import Flag, Level
-from beamline.monitor.checks import CHECKS
-from beamline.projections.flagged_frames import worst_frames
-from beamline.projections.rendered import rendered
-from beamline.projections.replay import Kind, by_kind, counts_of, replay
-from beamline.report.contact_sheet import contact_sheet
-from beamline.storage.flag_legend import FrameFlags, counted
-from beamline.storage.readers.base import rows_replaced
-from beamline.storage.readers.open import SourceOptions
-from beamline.storage.rules.references import reference_groups
-from beamline.storage.rules.validate import altered_said
 from drivers.clock import SystemClock
 
-UNITS = {check.name: check.unit for check in CHECKS}
+if TYPE_CHECKING:
+    from beamline.monitor.check import Flag, Level
+    from beamline.projections.replay import Kind
 
 
 @click.command()
@@ -76,6 +63,22 @@ def monitor(
 
     Exit code: 0 no alarm, 4 stopped, 7 alarms, or darks or flats with a fault.
     """
+    from beamline.config.load import load
+    from beamline.config.monitor import configured_checks
+    from beamline.config.references import reference_limits
+    from beamline.monitor.aside import Aside
+    from beamline.monitor.check import Level
+    from beamline.monitor.checks import CHECKS
+    from beamline.projections.flagged_frames import worst_frames
+    from beamline.projections.rendered import rendered
+    from beamline.projections.replay import by_kind, counts_of, replay
+    from beamline.report.contact_sheet import contact_sheet
+    from beamline.storage.flag_legend import FrameFlags, counted
+    from beamline.storage.readers.base import rows_replaced
+    from beamline.storage.readers.open import SourceOptions
+    from beamline.storage.rules.references import reference_groups
+    from beamline.storage.rules.validate import altered_said
+
     if overrides and config is None:
         raise click.UsageError("--set changes a value of the configuration: give --config too.")
     if sheet is not None:
@@ -137,7 +140,9 @@ def monitor(
 
 def table(kinds: Iterable[Kind]) -> list[str]:
     """The flags for people, three lines a check and level."""
-    lines = []
+    from beamline.monitor.checks import CHECKS
+
+    units, lines = {check.name: check.unit for check in CHECKS}, []
     for kind in kinds:
         worst = kind.worst
         where = ""
@@ -146,7 +151,7 @@ def table(kinds: Iterable[Kind]) -> list[str]:
             where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
         lines += [
             f"{kind.level:<6}{kind.check:<12}{len(kind.frames)} frames: {spans(kind.frames)}",
-            f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {UNITS[kind.check]}, in frame {worst.frame}{where}",
+            f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {units[kind.check]}, in frame {worst.frame}{where}",
             f"{'':<18}{worst.advice}",
         ]
     return lines

@@ -9,30 +9,27 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
 import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
-from beamline.config.load import Config, load, plan_of
 from beamline.core.errors import AlarmError
 from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
 from beamline.core.stop import StopRequest
 from beamline.core.text import count
-from beamline.instrument.connect import describe
-from beamline.instrument.operator import ask_operator
-from beamline.scan.live_process import LiveCommand, finished_command, follow_command, live_plan
-from beamline.scan.preflight import dry_run, refuse_violations
-from beamline.scan.resume import NotJoined, ResumableRun, open_for_resume, recover_run
-from beamline.scan.run import RunResult, run_scan
-from beamline.scan.run_folder import RECON
-from beamline.storage.flag_legend import counted
 from drivers.clock import SystemClock
 from recon.base.choices import AUTO
 from recon.methods import streams
+
+if TYPE_CHECKING:
+    from beamline.config.load import Config
+    from beamline.scan.live_process import LiveCommand
+    from beamline.scan.resume import ResumableRun
+    from beamline.scan.run import RunResult
 
 _ENDING = (
     "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
@@ -81,6 +78,11 @@ def scan(
     error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, or darks or flats a
     fault, 130 aborted, or interrupted before the first frame.
     """
+    from beamline.config.load import load
+    from beamline.instrument.operator import ask_operator
+    from beamline.scan.resume import NotJoined, open_for_resume
+    from beamline.scan.run import run_scan
+
     if file is None and run is None:
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     if run is not None and (output is not None or (overrides and file is None)):
@@ -116,6 +118,8 @@ def scan(
 
 def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
     """Do what a run lacks that has all its frames, and say it as `beamline recover` does."""
+    from beamline.scan.resume import recover_run
+
     found, left_out = recover_run(run)
     for said in left_out:
         click.echo(f"Warning: {said}", err=True)
@@ -128,6 +132,8 @@ def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
 
 def _faults(result: RunResult) -> list[str]:
     """What is wrong with the frames of a complete scan, and what that means for it."""
+    from beamline.storage.flag_legend import counted
+
     said = []
     if result.alarmed_frames:
         verb = "has" if result.alarmed_frames == 1 else "have"
@@ -143,6 +149,8 @@ def _faults(result: RunResult) -> list[str]:
 
 
 def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sinks: Sequence[Sink]) -> None:
+    from beamline.scan.preflight import dry_run, refuse_violations
+
     worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.remaining)
     if not json_sinks:
         click.echo("\n".join(worked.lines()))
@@ -158,6 +166,10 @@ class _Commands(TypedDict, total=False):
 
 def _commands(config: Config, no_live: bool, series: ResumableRun | None) -> _Commands:
     """How the scan is reconstructed: while it runs, when it is complete, or not at all."""
+    from beamline.config.load import plan_of
+    from beamline.instrument.connect import describe
+    from beamline.scan.live_process import finished_command, follow_command, live_plan
+
     if no_live or not config.recon.live:
         return {}
     if config.recon.method == AUTO or not streams(config.recon.method):
@@ -212,6 +224,9 @@ def _say(text: str) -> None:
 
 
 def _results(result: RunResult) -> str:
+    from beamline.scan.run_folder import RECON
+    from beamline.storage.flag_legend import counted
+
     lines = [f"{'scan':<10}{result.path}", f"{'frames':<10}{result.n_frames}"]
     if result.flags:
         lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")

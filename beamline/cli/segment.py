@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,10 +14,11 @@ from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
-from beamline.segment.run import Segmented, SegmentOptions, settings_of
-from beamline.segment.run import segment as segment_volume
 from drivers.clock import SystemClock
-from recon.post.particles import NECK
+from recon.base.choices import NECK
+
+if TYPE_CHECKING:
+    from beamline.segment.run import Segmented, SegmentOptions
 
 _PERCENT = FiniteRange(min=0, max=100)
 
@@ -75,6 +76,9 @@ def segment(
     Writes the labels as HDF5, a table of particles (volume, equivalent diameter, centroid) as CSV, and a picture of
     slices with labels. Look at the picture before you count. Nothing is overwritten.
     """
+    from beamline.segment.run import SegmentOptions, settings_of
+    from beamline.segment.run import segment as segment_volume
+
     if view and importlib.util.find_spec("napari") is None:
         raise ConfigError("--napari: napari is not installed. Install it with: pip install 'napari[all]'")
     output = output or Path(f"{volume.name.split('.')[0]}_particles.h5")

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,26 +18,16 @@ from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
+from beamline.core.shipped import shipped_scenes
 from beamline.core.text import size
-from beamline.simulate.figure import sheet
-from beamline.simulate.labels import labels_path
-from beamline.simulate.scene_file import (
-    MOST_FRAMES,
-    Scan,
-    SceneFile,
-    cost_table,
-    exposure_errors,
-    frame_cost,
-    open_scene,
-    scan_of,
-    shipped_scenes,
-)
-from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
-from beamline.simulate.write import Simulated, check_output, write_scan
 from drivers.clock import Clock, SystemClock
 
+if TYPE_CHECKING:
+    from beamline.simulate.scene_file import Scan, SceneFile
+    from beamline.simulate.write import Simulated
+
 _OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
-_VIEWS = click.IntRange(1, MOST_FRAMES)
+_VIEWS = click.IntRange(1)
 _SEED = click.IntRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -85,6 +75,10 @@ def simulate(
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
+    from beamline.simulate.figure import sheet
+    from beamline.simulate.scene_file import exposure_errors, open_scene, scan_of
+    from beamline.simulate.write import check_output
+
     clock = SystemClock()
     with terminated_like_interrupted(), json_events(as_json) as sinks, exposure_errors(scene):
         if not (explains or out or truth or picture):
@@ -120,6 +114,8 @@ def simulate(
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
     """Refuse output files that exist. Raises ConfigError: two outputs are the same file; DataError: one exists."""
+    from beamline.simulate.labels import labels_path
+
     named = {"the scan": out, "its labels": out and labels_path(out), "the truth": truth, "the picture": picture}
     seen: dict[Path, str] = {}
     for what, path in named.items():
@@ -149,6 +145,8 @@ class _Output:
 
 
 def _explain(scan: Scan, output: _Output) -> None:
+    from beamline.simulate.scene_file import cost_table, frame_cost
+
     found, where = frame_cost(scan, time.perf_counter), machine()
     costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
     output.event("explain", asdict(found) | {"costs": costs, "machine": where})
@@ -156,6 +154,8 @@ def _explain(scan: Scan, output: _Output) -> None:
 
 
 def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict[str, object]:
+    from beamline.simulate.truth import binning_of, memory_of, truth_of, write_truth
+
     n = binning or binning_of(scan.detector)
     try:
         needed, free = memory_of(scan.detector, n), free_memory()
@@ -174,6 +174,8 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict
 
 
 def _scan(scene: SceneFile, scan: Scan, out: Path, output: _Output, sink: Sink) -> Simulated:
+    from beamline.simulate.write import write_scan
+
     ending = StopOnSignal("Stopping after this frame. Ctrl-C again stops at once.")
     with ending() as stopped, Terminal(sys.stderr) as terminal:
         written = write_scan(scene, scan, out, fan_out(terminal, sink), SystemClock(), stopped)

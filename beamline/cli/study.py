@@ -16,12 +16,10 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
-from beamline.study.run import StudyOptions, run_study
 from beamline.study.studies import STUDIES
-from beamline.study.table import text
 from drivers.clock import SystemClock
+from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names
-from recon.voxels.fbp import Filter
 
 
 @click.command(cls=Repeatable)
@@ -87,6 +85,9 @@ def study(
     the scan has is left out. Writes a folder with study.csv, study.json, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
+    from beamline.study.run import StudyOptions, run_study
+    from beamline.study.table import text
+
     methods = tuple(dict.fromkeys(methods))
     settings = row_settings(methods, values)
     source, selection = chosen(file, seed, values)

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Self, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from beamline.core.events import Event, Sink
 from beamline.core.narration import sentence
@@ -49,6 +49,7 @@ class Terminal:
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
             TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
             console=self._console,
             transient=True,
             disable=not self._console.is_terminal,
@@ -89,6 +90,8 @@ class Terminal:
             self._show("frames", event.data["n"], event.data["of"], rate_text(event.data))
         elif event.event == "progress" and event.data.get("stage") == "archive":
             self._show("written and compared", event.data["n"], event.data["of"], rate_text(event.data, "MB"))
+        elif event.event == "progress" and event.data.get("stage") == "phase":
+            self._show(event.data["phase"], event.data["n"], event.data["of"], phase_text(event.data))
         elif event.event == "progress" and event.data.get("stage") == "axes":
             self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
         elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:
@@ -158,6 +161,12 @@ def rates(data: Mapping[str, Any]) -> str:
 def rate_text(data: Mapping[str, Any], what: str = "frames") -> str:
     """n/N, frames/s and the time left, of a `progress` event of a copy, an energy scan or trials of axes."""
     return f"{data['n']}/{data['of']}  {data['per_s']:.1f} {what}/s  {_clock_time(data['eta_s'])} left"
+
+
+def phase_text(data: Mapping[str, Any]) -> str:
+    """n/N, rate and time left, of a `progress` event of a phase; that it has begun where that is all that is known."""
+    known = data["of"] and data["per_s"] and data["eta_s"] is not None
+    return rate_text(data, "views") if known else "begun"
 
 
 def trials(data: Mapping[str, Any], what: str = "trials") -> str:

@@ -15,8 +15,6 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
-from beamline.tradeoff.report import text
-from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from drivers.clock import SystemClock
 from recon.methods import names
 
@@ -74,6 +72,9 @@ def tradeoff(
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
+    from beamline.tradeoff.report import text
+    from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
+
     source, selection = chosen(file, seed, values)
     options = TradeoffOptions(
         source=source,

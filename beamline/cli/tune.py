@@ -13,13 +13,9 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
 from beamline.cli.scan import stop_signals
 from beamline.cli.terminal import Terminal
-from beamline.config.load import load
 from beamline.core.errors import QualityError
 from beamline.core.events import Announcer, Event, Sink
 from beamline.core.stop import StopRequest
-from beamline.instrument.connect import connect
-from beamline.instrument.operator import ask_operator
-from beamline.scan.tune import tune as tune_exposure
 
 
 @click.command()
@@ -36,6 +32,11 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
 
     Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the darks or flats would stop a scan.
     """
+    from beamline.config.load import load
+    from beamline.instrument.connect import connect
+    from beamline.instrument.operator import ask_operator
+    from beamline.scan.tune import tune as tune_exposure
+
     with json_events(as_json) as json_sinks:
         config = load(file, overrides)
         stop = StopRequest()

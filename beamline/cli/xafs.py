@@ -8,10 +8,9 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
-import numpy as np
-from numpy.typing import NDArray
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, SEED, FiniteRange
@@ -21,12 +20,15 @@ from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.stop import StopRequest
-from beamline.xafs.contrast import Curve
-from beamline.xafs.edge import LEAST, find_edge
-from beamline.xafs.measured import FileOptions, open_series
-from beamline.xafs.results import XafsResult, left_out, lines, refuse_existing_results, table_beside, write
-from beamline.xafs.series import Series, SeriesResult, run_series
 from drivers.clock import SystemClock
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from beamline.xafs.contrast import Curve
+    from beamline.xafs.results import XafsResult
+    from beamline.xafs.series import Series, SeriesResult
 
 Box = tuple[int, int, int, int]
 
@@ -101,6 +103,12 @@ def xafs(
     Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6: no edge was found;
     picture and table are written, too.
     """
+    from beamline.xafs.contrast import Curve
+    from beamline.xafs.edge import LEAST
+    from beamline.xafs.measured import FileOptions, open_series
+    from beamline.xafs.results import lines, refuse_existing_results, table_beside, write
+    from beamline.xafs.series import SeriesResult, run_series
+
     target = output or Path(f"{Path(source).stem}_xafs.png")
     if target.suffix.lower() != ".png":
         raise click.BadParameter(f"{str(target)!r} is not a picture; give a .png file", param_hint="--output")
@@ -148,6 +156,9 @@ def xafs(
 
 def _result(title: str, run: SeriesResult) -> XafsResult:
     """The edge of a curve. Raises ScanStopped or DataError, with nothing written, where it has too few energies."""
+    from beamline.xafs.edge import LEAST, find_edge
+    from beamline.xafs.results import XafsResult, left_out
+
     n, lost = run.curve.energies.size, run.curve.left_out
     if n < LEAST:
         why = f" Left out: {left_out(run.curve)}." if lost.size else ""
@@ -161,6 +172,10 @@ def _result(title: str, run: SeriesResult) -> XafsResult:
 
 def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.float64]:
     """Energies from low to high, keV. Raises UsageError: a limit is missing, or energies are too few or many."""
+    import numpy as np
+
+    from beamline.xafs.edge import LEAST
+
     if low is None or high is None:
         raise click.UsageError("A scene needs a range of energies: --from 8.30 --to 8.42, in keV.")
     n = math.floor((high - low) / step * (1 + 1e-9) + 1e-9) + 1

@@ -27,17 +27,12 @@ from beamline.config.models import (
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
+from beamline.core.shipped import config_folder
 from beamline.core.version import version
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, ScanPlan
 
 __all__ = ["Config", "config_folder", "load", "plan_of", "resolved_yaml", "scene_mapping", "schema"]
-
-
-def config_folder() -> Path:
-    """The folder of the configurations that come with the package: installed, or beside the checkout's packages."""
-    installed = Path(__file__).parents[1] / "configs"
-    return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:

@@ -141,6 +141,12 @@ class ChildProcess:
         self._close_stdin()
         return ending
 
+    def tell(self, line: str) -> None:
+        """Write a line to the stdin of a process with a tether. OSError: it has ended."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(line + "\n")
+        self._process.stdin.flush()
+
     def end(self, grace: float = 0.0) -> None:
         """End the process if it still runs: it has `grace` real s before it is killed."""
         if self.running:
@@ -161,7 +167,8 @@ class ChildProcess:
 
     def _close_stdin(self) -> None:
         if self._process.stdin is not None:
-            self._process.stdin.close()
+            with suppress(OSError):  # a line that the process did not take
+                self._process.stdin.close()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
@@ -180,9 +187,9 @@ def with_our_path() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
-def last_line(log: Path) -> str:
-    """The last line that a process wrote to a file; "" where it wrote none."""
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+def last_line(log: Path, start: int = 0) -> str:
+    """The last line that a process wrote to a file, from byte `start` on; "" where it wrote none."""
+    lines = log.read_bytes()[start:].decode("utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else ""
 
 

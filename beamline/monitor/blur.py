@@ -12,11 +12,11 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import Scatter
@@ -178,12 +178,12 @@ def _loss(now: float, usual: Scatter) -> float:
     return 1 - now / usual.mean if usual.mean > 0 else 0.0
 
 
-@numba.njit(nogil=True, inline="always")
+@njit(nogil=True, inline="always")
 def _clipped(x, most):  # type: ignore[no-untyped-def]
     return min(max(x, -most), most)
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def _product(one, two):  # type: ignore[no-untyped-def]
     total = np.float32(0)
     for i in range(one.size):
@@ -191,7 +191,7 @@ def _product(one, two):  # type: ignore[no-untyped-def]
     return total
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def _contrasts(lines, dark, scale, strip, sums):  # type: ignore[no-untyped-def]  # numba infers the types
     """Fills `sums`: near and far along the rows, near and far along the columns."""
     rows, cols = lines.shape

@@ -15,9 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numba
 import numpy as np
 
+from beamline.core.jit import njit
 from beamline.monitor.view import Cells, Grid, View
 
 SPAN = 4  # views before, of which the velocity is the mean of three steps
@@ -83,7 +83,7 @@ def _steps(view: View, last: Sequence[View]) -> float | None:
     return steps if 0.5 < steps < MOST_STEPS + 0.5 else None
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers the types
     """Binomial 1 2 1 along both axes; the frame's edges are mirrors."""
     rows, cols = image.shape
@@ -99,7 +99,7 @@ def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers t
         target[cols - 1] = 0.75 * line[cols - 1] + 0.25 * line[max(cols - 2, 0)]
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _weigh(change, usual, weight, share, deviation):  # type: ignore[no-untyped-def]
     """Fills `share`, the Huber weights of changes about their usual value; `deviation` is scratch."""
     rows, cols = change.shape
@@ -116,7 +116,7 @@ def _weigh(change, usual, weight, share, deviation):  # type: ignore[no-untyped-
             share[row, col] = min(1.0, limit / max(share[row, col], 1e-12))
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _fit(now, one, two, four, weight, steps, residual, found):  # type: ignore[no-untyped-def]
     """Fills `residual` and `found`: minus gain, across and down in cells, turn in velocities, noise."""
     rows, cols = now.shape

@@ -12,10 +12,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
+
+from beamline.core.jit import njit
 
 ENTROPY_BINS = 256
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
@@ -147,7 +148,7 @@ def _entropy(histogram: NDArray[Any]) -> float:
     return max(0.0, float(-(p * np.log2(p)).sum()))
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers the types
     """Sums and largest values of `side` neighbours each, from those of `side` rows: pairs of pairs while `side` is even
     (and their sums fit into 32 bits), which the compiler makes vector instructions of."""
@@ -169,7 +170,7 @@ def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers t
     return parts, most
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: ignore[no-untyped-def]
     """(minimum, maximum, sum, sum of squares, pixels from `full` on, histogram of every k-th row).
 
@@ -219,7 +220,7 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: igno
     return int(least.min()), int(high), total, squares, saturated, histogram.sum(0).astype(np.int64)
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):  # type: ignore[no-untyped-def]
     """Range and moments of the valid pixels, block by block (Chan, Golub & LeVeque 1983), and preview and peaks."""
     rows, cols = image.shape
@@ -259,7 +260,7 @@ def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):  # type
     return n, low, high, mean, squares, sum_abs, saturated
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _count_reals(image, low, high, no_data):  # type: ignore[no-untyped-def]
     """Histogram of the valid pixels in ENTROPY_BINS equal bins over [low, high]."""
     histogram = np.zeros(ENTROPY_BINS, np.int64)

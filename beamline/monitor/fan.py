@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.jit import njit
 from beamline.monitor.view import Cells
 
 Reals = NDArray[np.float64]
@@ -88,7 +88,7 @@ def filters(lags: tuple[int, ...], clutter: Clutter, signals: Reals, speeds: Rea
     return Filters(np.ascontiguousarray(weights, np.float32), strength, speeds)
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def correlate(views, weights, out):  # type: ignore[no-untyped-def]  # numba infers the types
     """out[signal, row, col] of views [lag, row, col]; beyond the frame's edges it goes on as at the edge.
 

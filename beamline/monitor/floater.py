@@ -12,11 +12,11 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
-import numba
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.ndimage import convolve1d
 
+from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
@@ -162,10 +162,12 @@ def _designed(rim: float, noise: float) -> Filters:
 def _smooth(depth: Cells) -> Cells:
     """Matched along the columns to SIZE; white noise keeps its variance."""
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / SIZE) ** 2)
-    return convolve1d(depth, (kernel / np.sqrt((kernel**2).sum())).astype(np.float32), axis=0, mode="constant")
+    return scipy.ndimage.convolve1d(
+        depth, (kernel / np.sqrt((kernel**2).sum())).astype(np.float32), axis=0, mode="constant"
+    )
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _peaks(outputs, weight, light, usual, memory, least, peaks):  # type: ignore[no-untyped-def]  # numba infers the types
     """Fills `peaks` with (nothing, row, col, score) of the local maxima above `least`, until it is full: their number.
 

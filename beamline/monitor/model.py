@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
+import scipy
 from pydantic import Field
-from scipy.ndimage import label, uniform_filter
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -67,18 +67,18 @@ class Model:
             return Look(state)
         left = depth - expected[:rows, :cols]
         left = np.where(lit, (left - np.float32(np.median(left[lit]))) * np.sqrt(weight), 0) / np.float32(noise)
-        z = uniform_filter(left, BROAD) * BROAD
+        z = scipy.ndimage.uniform_filter(left, BROAD) * BROAD
         usual = np.maximum(z**2, 1) if state.usual is None else state.usual
         most = OUTLIER**2 * usual
         after = ModelState(state.views + 1, usual + np.float32(MEMORY) * (np.minimum(z**2, most) - usual))
         if state.views < CALIBRATION:
             return Look(after)
-        score = z / np.sqrt(np.maximum(uniform_filter(usual, BROAD), 1))
+        score = z / np.sqrt(np.maximum(scipy.ndimage.uniform_filter(usual, BROAD), 1))
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
         if abs(peak) <= self.warn:
             return Look(after)
-        parts, _ = label(score * math.copysign(1, peak) > EXTENT * self.warn)
+        parts, _ = scipy.ndimage.label(score * math.copysign(1, peak) > EXTENT * self.warn)
         there = np.nonzero(parts == parts[worst])
         top, below, first, last = (int(x) for x in (there[0].min(), there[0].max(), there[1].min(), there[1].max()))
         region = top * grid.cell, (below + 1) * grid.cell, first * grid.cell, (last + 1) * grid.cell

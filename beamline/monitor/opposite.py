@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import gaussian_filter
-from scipy.ndimage import shift as shifted
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
@@ -190,14 +189,17 @@ def lay_on(one: Kept, steps: float, view: View, grid: Grid, *, mirrored: bool) -
     if last - first < FEWEST:
         return None
     noise = cell_noise(view.depth[:, first:last], view.weight[:, first:last]) ** 2 * SMOOTHER
-    now, before = (gaussian_filter(depth[:, first:last].astype(np.float64), SMOOTH) for depth in (view.depth, expected))
+    now, before = (
+        scipy.ndimage.gaussian_filter(depth[:, first:last].astype(np.float64), SMOOTH)
+        for depth in (view.depth, expected)
+    )
     if mirrored:
         before = before[:, ::-1]
     weight = np.minimum(view.weight[:, first:last], np.exp(-before)).astype(np.float64)
     across, down, gain = float(_nearest(before, now)), 0.0, 0.0
     cols = now.shape[1]
     for _ in range(TURNS):
-        fitted = shifted(before, (down, across), order=3, mode="nearest")
+        fitted = scipy.ndimage.shift(before, (down, across), order=3, mode="nearest")
         cut = math.ceil(abs(across)) + 1
         inside = np.s_[:, max(1, cut if across > 0 else 1) : cols - max(1, cut if across < 0 else 1)]
         rows, columns = np.gradient(fitted) if len(now) > 1 else (np.zeros_like(fitted), np.gradient(fitted, axis=1))

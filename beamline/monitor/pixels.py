@@ -6,12 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
-import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy.ndimage import minimum_filter
 
+from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light
@@ -103,13 +103,13 @@ def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> Places:
     above = light(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above
-    around = minimum_filter(above, 3)  # at the edge of a shadow a dark pixel is none that is dead
+    around = scipy.ndimage.minimum_filter(above, 3)  # at the edge of a shadow a dark pixel is none that is dead
     limit = np.where(around > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * around, -np.inf)
     places = np.empty(frame.counts.size // 2, np.int64)
     return places[: _darker(frame.counts, limit.astype(np.float32), block, places)].copy()
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _darker(counts, limit, block, places):  # type: ignore[no-untyped-def]  # numba infers the types
     """Fills `places` with the pixels below the limit of their block, until it is full: their number."""
     n = 0

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.jit import njit
 from beamline.monitor.digest import FrameDigest, block_side
 from drivers.frame import Frame, FrameKind
 
@@ -58,7 +58,7 @@ def spots_of(
     return Spots(n, saturated)
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _isolated(peaks, means, before, dark, noises, places):  # type: ignore[no-untyped-def]  # numba infers the types
     """Number of blocks with a spot; the first of them go into `places`."""
     rows, cols = peaks.shape

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from beamline.core.jit import njit
 
 Peaks = NDArray[np.float64]
 """[peak, (view, row, col, score)] in cells; the score's sign is the peak's."""
@@ -77,7 +78,7 @@ def best_trail(older: Peaks, newer: Peaks, rules: Rules, middle: float, turn: fl
     return Trail(*(float(x) for x in found))
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _search(older, newer, rules, sample, found):  # type: ignore[no-untyped-def]  # numba infers the types
     least, share, enough, rows, cols, slack = rules
     middle, turn, radius = sample

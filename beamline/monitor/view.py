@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from beamline.core.jit import njit
 
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
@@ -161,7 +162,7 @@ def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[Cells, Cells, Ce
     return cells, row_mean, col_mean
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def _bin(preview, blocks, cells, row_mean, col_mean):  # type: ignore[no-untyped-def]  # numba infers the types
     rows, cols = preview.shape
     for row in range(rows):
@@ -182,7 +183,7 @@ def _bin(preview, blocks, cells, row_mean, col_mean):  # type: ignore[no-untyped
     col_mean /= np.float32(rows)
 
 
-@numba.njit(nogil=True, cache=True)
+@njit(nogil=True, cache=True)
 def _line_integrals(counts, dark, full, lit, scale, darkest, depth, weight):  # type: ignore[no-untyped-def]
     for row in range(counts.shape[0]):
         for col in range(counts.shape[1]):

@@ -81,17 +81,23 @@ class ScanCorrection:
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 
-    def at_once(self, frames: NDArray[np.int64], rows: slice | None = None) -> Projections:
+    def at_once(
+        self,
+        frames: NDArray[np.int64],
+        rows: slice | None = None,
+        told: Callable[[int, int], None] = lambda n, total: None,
+    ) -> Projections:
         """Line integrals of `frames` (rows of the file), without those that hold no finite pixel: see `view_ids`.
 
         Args:
             frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
+            told: how many of how many frames were read.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
         """
-        data, frames = self._read(frames, rows)
+        data, frames = self._read(frames, rows, told)
         if not frames.size:
             raise self._no_view()
         if self._references is None:
@@ -216,9 +222,14 @@ class ScanCorrection:
         """A correction of the same views by all references that are there now."""
         return ScanCorrection(self._source, self._selection, self._warn)
 
-    def _read(self, frames: NDArray[np.int64], rows: slice | None) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    def _read(
+        self,
+        frames: NDArray[np.int64],
+        rows: slice | None,
+        told: Callable[[int, int], None] = lambda n, total: None,
+    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one and are not damaged, and these frames."""
-        data = read_binned(self._source, frames, self._widened(rows)[0], self.binning)
+        data = read_binned(self._source, frames, self._widened(rows)[0], self.binning, told)
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             lost = frames[~alive]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection, Warn, resampling_of
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
@@ -178,6 +179,7 @@ def prepare_projections(
     warn: Warn,
     spill: Spill | None = None,
     check: Callable[[Geometry], object] | None = None,
+    phases: Phases | None = None,
 ) -> PreparedProjections:
     """Read, correct and align what `selection` asks for.
 
@@ -189,19 +191,24 @@ def prepare_projections(
             a direct method does it, and `shares` is None.
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
+        phases: is told what is done, one after the other.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
+    phases = phases or Phases()
+    phases.enter("flags and references")
     usable = checked_views(source, selection, warn)
     scan_frames = usable.frames
     pixel_size(source, selection)
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
+    phases.enter("tilt and references")
     selection, tilt = with_tilt(source, selection, scan_frames, warn)
     correction = ScanCorrection(source, selection, warn)
     warn_of_tilt(source, selection, correction, scan_frames, warn)
     axis_col, axis = selection.axis_col, None
+    phases.enter("rotation axis")
     if axis_col is None:
         if cone_of(source, selection) is not None:
             axis_col = stated_axis(source)
@@ -210,6 +217,7 @@ def prepare_projections(
             by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
             axis_col, axis = _axis_beside_jumps(source, by, usable, warn)
     check_axis(source, axis_col)
+    phases.enter("jumps")
     jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col)
     if jumps.said:
         warn(jumps.said)
@@ -220,10 +228,12 @@ def prepare_projections(
     if check is not None:
         ids = scan_frames[chosen]
         check(jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids))
+    phases.enter("correction")
     if spill is None:
-        projections = correction.at_once(scan_frames[chosen])
+        projections = correction.at_once(scan_frames[chosen], told=phases.told)
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
+    phases.enter("rings, views held out, hardening")
     taken, rings = remove_rings_in_place(projections.data, source.angles[projections.view_ids], selection.rings)
     regions = replace(usable.regions, resampling=resampling_of(source, selection))
     shares_of = None

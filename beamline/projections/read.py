@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -27,7 +27,13 @@ _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's 
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
-def read_binned(source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int) -> NDArray[Any]:
+def read_binned(
+    source: ScanSource,
+    frames: NDArray[np.int64],
+    rows: slice,
+    binning: int,
+    told: Callable[[int, int], None] = lambda n, total: None,
+) -> NDArray[Any]:
     """Frames [frame, row, col], binned by averaging while they are read; NaN stays out of the averages.
 
     Whole counts that are not binned keep their type (half the memory), everything else becomes float32. Trailing
@@ -43,6 +49,7 @@ def read_binned(source: ScanSource, frames: NDArray[np.int64], rows: slice, binn
         if binning > 1:
             raw = _mean_bins(raw[:, : height * binning, : width * binning].astype(np.float32), binning)
         out[start : start + batch] = raw
+        told(min(start + batch, len(frames)), len(frames))
     return out
 
 

@@ -1,13 +1,17 @@
-"""Batches: many scans by one recipe, each in a process of its own, and a table of what became of them."""
+"""Batches: many scans by one recipe, in a worker process that a failure ends, and a table of what became of them."""
 
 from __future__ import annotations
 
 import csv
+import json
 import sys
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Self, get_args
 
 from beamline.core.errors import DataError, QualityError
 from beamline.core.events import Event, Sink
@@ -19,9 +23,12 @@ from drivers.clock import Clock
 RowState = Literal["waiting", "done", "poor", "failed"]
 
 TABLE, RECIPE, VOLUME = "batch.csv", "recipe.yaml", "recon.h5"
+_WORKER_LOG = ".worker.txt"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
-COMMAND = (sys.executable, "-m", "beamline.cli.main", "recon")
-"""What reconstructs the scan that is named next."""
+COMMAND = (sys.executable, "-m", "beamline.cli.recon_worker")
+"""The worker, which reconstructs scan after scan: libraries are loaded and kernels compiled once."""
+_POLL = 0.2  # real s between two looks at the worker
+_SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
 _OURS = ("done", "failed")  # events of a scan that become its row
 
 
@@ -87,12 +94,84 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
         raise DataError(f"Another batch works in {folder}. Wait for its end, or name another folder.")
     lock = WriterLock(folder / RECIPE)
     try:
-        return _run_all(options, sink, clock)
+        with Worker(folder / _WORKER_LOG) as worker:
+            return _run_all(options, worker, sink, clock)
     finally:
         lock.release()
 
 
-def _run_all(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
+class Worker:
+    """A process that reconstructs one scan after the other; a context manager, which ends it.
+
+    After a scan without a volume the next one gets a new process: a crash, a lack of memory or what a failure left
+    behind takes no other scan along.
+
+    Args:
+        log: file for what it writes to stderr while it works on a scan.
+        command: of the process.
+        silence: real s without a line, after which a scan is taken to hang.
+    """
+
+    def __init__(self, log: Path, command: Sequence[str] = COMMAND, silence: float = _SILENCE) -> None:
+        self._log, self._command, self._silence = log, command, silence
+        self._running = ExitStack()
+        self._process: ChildProcess | None = None
+        self._on_line: Callable[[str], None] = lambda line: None
+        self._heard, self._code, self._ended = 0.0, 0, threading.Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.end()
+
+    def run(self, arguments: Sequence[str], on_line: Callable[[str], None]) -> tuple[int | None, str]:
+        """The exit code of `beamline` with these arguments, and the last line of its stderr."""
+        self._on_line = on_line
+        process = self._process or self._start()
+        self._ended.clear()
+        before = self._log.stat().st_size
+        self._heard = time.monotonic()
+        with suppress(OSError):  # it has ended since
+            process.tell(json.dumps(list(arguments)))
+        silent = False
+        while process.running and not silent and not self._ended.wait(_POLL):
+            silent = time.monotonic() - self._heard > self._silence
+        if not process.running:
+            process.wait()  # for its last lines
+        said = last_line(self._log, before)
+        if self._ended.is_set():
+            code: int | None = self._code
+        else:
+            code = None if silent else process.code
+            said = f"it hung: no word from it for {self._silence:g} s" if silent else said
+        if code not in _WITH_VOLUME:
+            self.end()
+        return code, said
+
+    def _start(self) -> ChildProcess:
+        stderr = self._running.enter_context(self._log.open("w", encoding="utf-8"))
+        started = ChildProcess(self._command, stderr, self._take, with_our_path(), tether=True)
+        self._process = self._running.enter_context(started)
+        return self._process
+
+    def end(self) -> None:
+        """End the process; the next scan gets another one."""
+        self._running.close()
+        self._process = None
+        self._log.unlink(missing_ok=True)
+
+    def _take(self, line: str) -> None:
+        self._heard = time.monotonic()
+        data = json_object(line) or {}
+        if data.get("event") == "ended":
+            self._code = int(data["exit_code"])
+            self._ended.set()
+        else:
+            self._on_line(line)
+
+
+def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> list[Row]:
     folder = options.folder
     rows = _rows(options.scans, _read(folder))
     _write(folder, rows)
@@ -102,7 +181,7 @@ def _run_all(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
         progress = {"stage": "batch", "n": tried, "of": len(waiting), "label": rows[n].scan}
         left = spent / tried * (len(waiting) - tried) if tried else None
         sink(Event("progress", clock.now(), {**progress, "eta_s": left, "per_min": 60 * tried / max(spent, 1e-9)}))
-        rows[n] = _one(rows[n], options, sink, clock)
+        rows[n] = _one(rows[n], options, worker, sink, clock)
         _write(folder, rows)
         row = rows[n]
         said = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
@@ -155,8 +234,8 @@ def _rows(scans: Sequence[Path], known: Sequence[Row]) -> list[Row]:
     return [*known, *(Row(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
 
 
-def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
-    """Reconstruct a scan in a process of its own, which has ended when this returns or raises."""
+def _one(row: Row, options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> Row:
+    """Reconstruct a scan."""
     began, last = clock.now(), dict[str, Any]()
 
     def pass_on(line: str) -> None:
@@ -175,11 +254,14 @@ def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
     try:
         with named_on_failure(work):
             work.mkdir()
-        code, stderr = _run(_command(options, row.scan, work), work / "stderr.txt", pass_on)
+        code, stderr = worker.run(_arguments(options, row.scan, work), pass_on)
         state = _WITH_VOLUME.get(code, "failed") if (work / VOLUME).is_file() else "failed"
         if state != "failed":
             with named_on_failure(place):
                 work.replace(place)
+    except BaseException:
+        worker.end()  # before its files are removed
+        raise
     finally:
         remove(work)
     residual = last.get("residual_held_out", last.get("residual"))
@@ -191,18 +273,9 @@ def _one(row: Row, options: BatchOptions, sink: Sink, clock: Clock) -> Row:
     )  # fmt: skip
 
 
-def _command(options: BatchOptions, scan: str, work: Path) -> list[str]:
+def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
     recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
-    return [*COMMAND, scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
-
-
-def _run(command: Sequence[str], log: Path, on_line: Callable[[str], None]) -> tuple[int | None, str]:
-    """The exit code of a command, and the last line of its stderr."""
-    with log.open("w", encoding="utf-8") as stderr, ChildProcess(command, stderr, on_line, with_our_path()) as process:
-        process.wait()
-    last = last_line(log)
-    log.unlink()
-    return process.code, last
+    return ["recon", scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
 
 
 def _read(folder: Path) -> list[Row]:

@@ -18,29 +18,18 @@ from recon.assess.plans import Choice, Speeds, best_steps, plans
 from recon.assess.time_model import duration_text
 from recon.auto import is_wider
 from recon.base.binning import bin_views
-from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
 from recon.base.volume import Grid
-from recon.calibrate import calibrate, sweep_seconds
+from recon.calibrate import calibrate
 from recon.methods import with_settings
 from recon.reconstruction import Reconstruction
-from recon.splatting.finish import SUBSETS, SWEEPS
 from recon.splatting.initialise import default_count, place
 from recon.splatting.r2 import R2
-from recon.splatting.splat import voxelize
 from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
-from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choice_cost
-from recon.voxels.ordered_fista import subsets_of
 
-_GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
 _RESERVE = 0.02  # of the budget, for what no part has measured
 _LATE = 0.1  # of the time used, when it is over, is what a volume of all pixels may take
-_SLAB = 16  # slices
-_FINISH_SHARE = 0.8  # of what is left after placing, at most: it adds more than most of the steps before it
-# What goes before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a
-# subset, projections and an FBP.
-_EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 # Of the time a trial may take so much by prediction, and in fact a quarter more.
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
@@ -184,7 +173,7 @@ def within(
     if over and math.isfinite(choice.gain):
         end = now() + choice.seconds
     if isinstance(method, R2):
-        result = _fitted(method, prepared, seed, end, speeds.step, control)
+        result = _fitted(method, prepared, seed, end, control)
     else:
         result = _run(method, prepared, seed, end, control)
     return Budgeted(result, prepared, choice, speeds, because, now() - begin)
@@ -234,28 +223,14 @@ def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, c
     return recon.reconstruct(data, geometry, method, seed=seed, use=use, control=control)
 
 
-def _fitted(
-    method: R2, prepared: PreparedProjections, seed: int, end: float, step: float, control: RunControl
-) -> Reconstruction:
-    """A fit from as many Gaussians as the method says, which ends, finished and filled, by `end`; `step`: s of one."""
+def _fitted(method: R2, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
+    """A fit from as many Gaussians as the method says, which ends, finished and filled, by `end`."""
     data, geometry, now = prepared.projections.data, prepared.geometry, control.now
     grid, field = Grid.matching(geometry), Grid.of_field(geometry, geometry.sample_pitch)
     assert isinstance(method.gaussians, int)
     placed = place(data, geometry, field, method.gaussians, np.random.default_rng(seed), kernel=method.fit.kernel)
-    before = now()
-    slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
-    voxelize(placed, slab)
-    end -= (now() - before) * grid.shape[0] / slab.shape[0] * _GROWTH
-    left, best = end - now(), best_steps(method.name)
-    sweeps, finishing = finish_within(_FINISH_SHARE * left, left - best * step, geometry, grid, now)
     data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    fit = replace(
-        method,
-        steps=best,
-        seconds=max(0.0, end - now() - finishing),
-        gaussians=placed,
-        finish=sweeps,
-    )
+    fit = replace(method, steps=best_steps(method.name), seconds=max(0.0, end - now()), gaussians=placed)
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
     control = replace(control, should_stop=_until(control, end))
     return recon.reconstruct(data, geometry, fit, grid=grid, seed=seed, use=use, control=control)
@@ -264,30 +239,6 @@ def _fitted(
 def _until(control: RunControl, end: float) -> Callable[[], bool]:
     """Stops with `control`, or when its clock shows `end`."""
     return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
-
-
-def finish_within(
-    seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Callable[[], float]
-) -> tuple[int | None, float]:
-    """Sweeps of a fit's finish that `seconds` suffice for, at most `SWEEPS`, and the seconds that they will take.
-
-    None: as many as views held out prefer, where the seconds `beside_steps` suffice for the most, and for the trials of
-    them. Fewer than two sweeps are none: what goes before them takes as long.
-    """
-    if seconds <= 0:
-        return 0, 0.0
-    sweep = sweep_seconds(geometry, grid, now)
-    if geometry.is_cone:
-        sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
-    eigenvalue = _EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS)
-    before = (eigenvalue + _FIRST_SWEEPS + choice_sweeps(geometry)) * sweep
-    asking = sweeps_choice_cost(geometry)
-    if asking and (most := before + (asking + MOST_SWEEPS) * sweep) <= min(seconds, beside_steps):
-        return None, most
-    if not before + 2 * sweep <= seconds:
-        return 0, 0.0
-    sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
-    return sweeps, before + sweeps * sweep
 
 
 def _named(choice: Choice, result: Reconstruction | None = None) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import recon
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, Warnings
+from beamline.core.phases import Phases
 from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import PreparedProjections
@@ -52,7 +53,8 @@ def reconstruct_file(
         ConfigError, DataError: with nothing written.
         ScanStopped: interrupted, with slabs to go on from.
     """
-    started = clock.now()
+    started, phases = clock.now(), Phases(sink, clock)
+    phases.enter("opening the scan")
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
     check_device(options.device)
@@ -71,7 +73,7 @@ def reconstruct_file(
                 )
             warn(f"The scan is unfinished: it still runs, or it died. The {n} frames that are there are used.")
         facts, options = facts_of(source), options.around_region(source)
-        prepared, slabs = prepare_within(source, options, sink, clock, warn)
+        prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
     selection = options.selection
     if options.cluster is not None and not slabs:
         warn("The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs.")
@@ -85,6 +87,7 @@ def reconstruct_file(
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
+    phases.enter("reconstruction")
     region = None if options.region is None else locate(options.region, selection, prepared.geometry)
     with keeping(options.partial_path) if slabs else nullcontext():
         # A direct method and a slab have no volume so far: a signal interrupts them.
@@ -109,6 +112,7 @@ def reconstruct_file(
             started,
             recipe=options.recipe,
             region=region,
+            phases=phases,
         )
         partial_volume = options.partial_path if slabs and options.becomes_output else None
         metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.phases import Phases
 from beamline.core.text import spans
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.projections.prepare import PreparedProjections
@@ -133,6 +134,7 @@ class ReportContext:
     recipe: str = ""
     region: RegionOfRows | None = None
     live_picture: str = ""  # file name of the last picture of a volume that grew with its scan
+    phases: Phases = field(default_factory=Phases)
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."

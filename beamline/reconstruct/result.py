@@ -107,7 +107,8 @@ def write_result(
     Raises:
         DataError: a result could not be written; none is left where one fails.
     """
-    region = context.region
+    region, phases = context.region, context.phases
+    phases.enter("measuring the volume")
     region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
 
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
@@ -131,6 +132,7 @@ def write_result(
         context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
     if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
+        phases.enter("FBP for comparison")
         before = clock.now()
         grid, out = made.volume.grid, None
         if isinstance(made.volume.data, np.memmap):
@@ -139,6 +141,7 @@ def write_result(
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     own = metrics[made.method]
+    phases.enter("report")
     parameters = parameters_of(made, prepared, context)
     if region is not None:
         volumes = {method: region.cut(volume) for method, volume in volumes.items()}
@@ -163,6 +166,7 @@ def write_result(
         if target.pdf is not None:
             write_logbook(target.pdf, page, record.volume, prepared.length_unit, clock.now(), replace=target.replace)
             pages.append(target.pdf)
+        phases.enter("writing the volume")
         if partial_volume is None:
             write_volume(target.output, record, replace=target.replace)
         else:
@@ -171,6 +175,7 @@ def write_result(
         for written in pages:
             remove(written)
         raise
+    phases.end()
     summary: dict[str, Any] = {
         "output": target.output,
         "report": target.report,
@@ -181,6 +186,7 @@ def write_result(
         "shape": record.volume.grid.shape,
         "units": f"1/{prepared.length_unit}",
         "elapsed": clock.now() - context.started,
+        "times": phases.seconds,
         **own,
     }
     summary |= {name: made.settings[name] for name in ("ended_early", "resumed_from") if name in made.settings}
@@ -237,6 +243,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "filter": made.filter,
         "seed": context.seed,
         **_flat("", made.settings),
+        **_flat("seconds_of", context.phases.seconds),
         "command": context.command,
         **({"recipe": context.recipe} if context.recipe else {}),
     }

@@ -13,6 +13,7 @@ import numpy as np
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
+from beamline.core.phases import Phases
 from beamline.core.text import size
 from beamline.projections.correction import Warn, resampling_of
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
@@ -240,7 +241,7 @@ def refuse_slabs(path: Path, slabs: Sequence[Slab], needs: Needs, memory: int) -
 
 
 def prepare_within(
-    source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn
+    source: ScanSource, options: ReconOptions, sink: Sink, clock: Clock, warn: Warn, phases: Phases | None = None
 ) -> tuple[PreparedProjections, list[Slab]]:
     """As `prepare_projections`, and the slabs if line integrals lie on disk; none: all at once."""
     began = clock.now()
@@ -257,7 +258,7 @@ def prepare_within(
     memory = memory_of(options)
     spill = spill_of(source, options, told, said)
     check = None if options.region is None else partial(locate, options.region, options.selection)
-    prepared = prepare_projections(source, options.selection, warn, spill, check)
+    prepared = prepare_projections(source, options.selection, warn, spill, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if spill is None:
         if options.partial is not None:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from beamline.config.load import config_folder
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
+from beamline.core.shipped import shipped_scenes
 from beamline.core.text import size
 from beamline.storage.volume_file import read_volume
 from simulators.frame.mapping import SceneError
@@ -21,14 +21,12 @@ from simulators.frame.shot import CannotExposeError
 from simulators.scenes.explain import FrameCost, explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
-from simulators.scenes.settings import MOST_FRAMES
 from simulators.scenes.shots import Scan
 
 if TYPE_CHECKING:
     from simulators.samples.voxels.volume import ReadVolume
 
 __all__ = [
-    "MOST_FRAMES",
     "Scan",
     "SceneFile",
     "cost_table",
@@ -36,7 +34,6 @@ __all__ = [
     "frame_cost",
     "open_scene",
     "scan_of",
-    "shipped_scenes",
     "volumes_beside",
 ]
 
@@ -52,11 +49,6 @@ class SceneFile:
     scene: Scene
     path: Path
     text: str
-
-
-def shipped_scenes() -> dict[str, Path]:
-    """The scenes that come with the package, by name."""
-    return {path.stem: path for path in sorted((config_folder() / "scenes").glob("*.yaml"))}
 
 
 def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:

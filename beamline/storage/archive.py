@@ -22,8 +22,8 @@ from beamline.core.files import whole_file
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import checksum_of
 from beamline.storage import hdf5
+from beamline.storage.codecs import filter_of
 from beamline.storage.compressed_copy import (
-    CODECS,
     CompressedCopy,
     ImageCounter,
     Progress,
@@ -68,7 +68,7 @@ def archive(
     The raw file is only read. The memory is that of a few frames.
 
     Args:
-        codec: a name in CODECS.
+        codec: a name in `codecs.CODECS`.
         keep_damaged: frames that differ from their stored checksum are copied as they are, and so is the checksum.
         progress: counts the MB of images twice, when they are written and when they are compared.
 
@@ -141,8 +141,12 @@ def _require_room(datasets: list[h5py.Dataset], out: Path, codec: str) -> None:
         for i, dataset in enumerate(datasets):
             rows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), _SAMPLES)).astype(int))
             kept = tried.create_dataset(
-                str(i), (rows.size, *dataset.shape[1:]), dataset.dtype, chunks=(1, *dataset.shape[1:]), **CODECS[codec]
-            )
+                str(i),
+                (rows.size, *dataset.shape[1:]),
+                dataset.dtype,
+                chunks=(1, *dataset.shape[1:]),
+                **filter_of(codec),
+            )  # fmt: skip
             for k, row in enumerate(rows):
                 kept[k] = dataset[row]
             wanted += len(dataset) * kept.id.get_storage_size() / max(rows.size, 1)

@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import h5py
-import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import checksum_of, has_checksum
 from beamline.storage import hdf5
+from beamline.storage.codecs import filter_of
 from beamline.storage.writers import layout
-
-CODECS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "blosc2": hdf5plugin.Blosc2("zstd", clevel=1, filters=hdf5plugin.Blosc2.BITSHUFFLE),
-        "bitshuffle-zstd": hdf5plugin.Bitshuffle(cname="zstd", clevel=3),
-        "bitshuffle-lz4": hdf5plugin.Bitshuffle(cname="lz4"),
-    }
-)
-"""Lossless compressors, the first being the default."""
 
 _IMAGE = 4096  # bytes from which a row of a dataset [frame, row, col] is an image
 
@@ -56,7 +46,7 @@ class CompressedCopy:
     """
 
     def __init__(self, codec: str, counter: ImageCounter, require_taken: Callable[[], None]) -> None:
-        self._codec, self._counter, self._require_taken = CODECS[codec], counter, require_taken
+        self._codec, self._counter, self._require_taken = filter_of(codec), counter, require_taken
         self._paths: dict[_Place, str] = {}
         self.checksums: dict[str, list[int]] = {}
         self.damaged = set[int]()

@@ -25,5 +25,11 @@ DEFAULT_STEPS = 400
 SHORT_STEPS = 200
 """Steps where the noise of the views hides what more would gain."""
 
+NECK = 0.8
+"""Two parts are one particle where the neck between them is at least so wide as the narrower part, as a share."""
+
+N_GAUSSIANS, SIDE = 50_000, 256
+"""Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view."""
+
 FEW_PHOTONS = 100
 """In a pixel of the open beam: below, counts are better than their logarithm (docs/exploration.md, "Few photons")."""

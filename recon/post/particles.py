@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon.base.choices import NECK as NECK
+
 Mask = NDArray[np.bool_]
 Labels = NDArray[np.int32]
 F32 = NDArray[np.float32]
 
-NECK = 0.8
-"""Two parts are one particle where the neck between them is at least so wide as the narrower part, as a share."""
 _GRID = 0.5
 """Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
 are parted, with it 1; of 40 pairs of touching balls 38 are parted, for 40."""

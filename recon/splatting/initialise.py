@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
+from recon.base.binning import bin_views
 from recon.base.choices import Start as Start
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
@@ -17,6 +18,7 @@ from recon.base.masks import masked
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.problem import binned_geometry
 from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
@@ -67,6 +69,7 @@ def place(
     start: Start = "fbp",
     rays: RayModel | None = None,
     kernel: Kernel = Kernel.GAUSSIAN,
+    factor: int = 1,
 ) -> Gaussians:
     """The starting point of a fit: Gaussians drawn from a first volume of the data [view, row, col], scaled to them.
 
@@ -77,6 +80,7 @@ def place(
         start: kind of first volume, see `first_volume`.
         rays: ray model of the fit.
         kernel: of the Gaussians.
+        factor: binning of the views for the first volume.
 
     Raises:
         ValueError: for a count below 1, and for data without matter or that are not line integrals.
@@ -84,7 +88,13 @@ def place(
     wanted = default_count(Grid.of_field(geometry, grid.voxel_size)) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
-    volume = first_volume(projections, geometry, grid, start)
+    if factor == 1:
+        volume = first_volume(projections, geometry, grid, start)
+    else:
+        nz, ny, nx = (-(-n // factor) for n in grid.shape)
+        pitch = None if grid.slice_pitch is None else factor * grid.slice_pitch
+        coarse = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
+        volume = first_volume(bin_views(projections, factor), binned_geometry(geometry, factor), coarse, start)
     radius = math.inf if leaves_the_field(projections, geometry) else geometry.reach
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
     return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
@@ -130,7 +140,7 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     straight ones here; the fit then uses the full geometry.
     """
     straight, projections = geometry.straightened(), without_wild_pixels(projections)
-    if start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles)):
+    if _swept(geometry, start):
         sweeps = OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True)
         return solve(sweeps, Projector(straight, grid), projections)
     if geometry.is_cone:
@@ -138,6 +148,15 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
     return Volume(fbp(projections, straight, grid, "hann") * whole, grid)
+
+
+def sweeps_of_start(geometry: Geometry, start: Start) -> float:
+    """About how many sweeps of FISTA-TV over all views take as long as the first volume and what is drawn from it."""
+    return 2 * _SWEEPS if _swept(geometry, start) else 1.0
+
+
+def _swept(geometry: Geometry, start: Start) -> bool:
+    return start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles))
 
 
 def sample_gaussians(

@@ -39,7 +39,9 @@ class R2:
     Attributes:
         steps: of the fit; 0 gives the starting point; None takes 400, or 200 where a finish follows and the noise of
             the views hides what more would gain (see `schedule.Schedule`), or as many as fit into `seconds`.
-        seconds: a time budget for the fit; the rates decay along it.
+        seconds: of the whole run, from the call to the volume: start, steps, which the rates decay along, finish and
+            volume; by the caller's clock, and with the time to compile where `warm_up` was not called. Where they do
+            not suffice for the start, a warning says so before it, and the start is made of binned views.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.assess.plans import best_steps
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
@@ -20,7 +23,8 @@ from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import leaves_the_field, place
+from recon.splatting.in_time import FINISH_SHARE, fill_seconds, finish_within, first_sweep_seconds
+from recon.splatting.initialise import leaves_the_field, place, sweeps_of_start
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, binned_geometry, coarser
 from recon.splatting.schedule import Schedule
@@ -30,8 +34,10 @@ from recon.voxels.projector import data_residual
 if TYPE_CHECKING:
     from recon.splatting.r2 import R2
 
+_TIMED = 3  # steps by which it is planned what a fit's seconds suffice for
 _LOOK = 50  # steps between two measurements of the views held out
 _BEST = "best."  # names of the best model's arrays in a checkpoint begin so
+_START_SHARE = 0.5  # of seconds that are too few, what a start from binned views may take
 _PATIENCE = 0.2  # of the steps planned, and at least six looks, may pass without a better one
 
 
@@ -99,8 +105,10 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     seen, known = geometry.select(used), None if weights is None else weights[used]
     field_grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))
     binned_geometry(seen, settings.coarse)  # refuses what cannot be binned before anything is computed
+    end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
-        state, n_start, unit = _first_state(data[used], seen, field_grid, method, problem.seed, backend)
+        factor = 1 if method.seconds is None else _factor_in_time(method, seen, field_grid, now, end)
+        state, n_start, unit = _first_state(data[used], seen, field_grid, method, problem.seed, backend, factor)
     else:
         state = _resumed(control.resume, geometry.n_views, backend)
         n_start, unit = state.n, state.unit
@@ -117,7 +125,10 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
     by_content = method.steps is None and method.seconds is None and sweeps > 0
-    schedule = Schedule(method.planned_steps, method.seconds, by_content)
+    wanted, planned, seconds = method.finish, sweeps == 0 or method.seconds is None, method.seconds
+    if seconds is not None:
+        seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
+    schedule = Schedule(method.planned_steps, seconds, by_content)
     schedule = Schedule.resumed(schedule, control.resume or {})
     history: list[Progress] = []
 
@@ -140,6 +151,11 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         fraction = schedule.fraction(state.step, spent)
         fit.step(state, rough if fraction < settings.coarse_until else fine, settings, fraction)
         done += 1
+        if not planned and done == _TIMED and schedule.seconds is not None:
+            spent = now() - fit_begin
+            left, step, planned = schedule.seconds - spent, spent / done, True
+            wanted, finishing = _finish_in_time(method, seen, problem.grid, now, left, step)
+            schedule.seconds = max(spent, schedule.seconds - finishing)
         schedule.look(state, fine)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             tracker.look(state, method.early_stop)
@@ -159,11 +175,15 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     if tracker.kept:
         state = state_from(tracker.kept, backend)
     volume, model = fit.volume_of(state, problem.grid, settings, backend), fit.gaussians_of(state, backend)
-    if control.should_stop is not None and control.should_stop():
+    if not planned:  # the fit has ended before
+        wanted, _ = _finish_in_time(method, seen, problem.grid, now, end - now(), 0.0)
+    if wanted == 0 or now() >= end or (control.should_stop is not None and control.should_stop()):
         sweeps = 0
     if sweeps:
+        if method.seconds is not None:
+            control = replace(control, should_stop=_until(control, end))
         fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
-        finished, sweeps = finish(volume, model, fitted, method.finish, settings, control)
+        finished, sweeps = finish(volume, model, fitted, wanted, settings, control)
         if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
             sweeps = 0
         else:
@@ -176,6 +196,43 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     }  # fmt: skip
     checkpoint = arrays_of(last, backend) | tracker.arrays() | schedule.arrays()
     return MethodResult(volume, record, tuple(history), model, checkpoint)
+
+
+def _factor_in_time(method: R2, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
+    """The binning of the views that a fit starts from, so that its seconds suffice for the start.
+
+    Warns:
+        UserWarning: where they do not suffice for that of all pixels.
+    """
+    if isinstance(method.gaussians, Gaussians):
+        return 1
+    needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
+    left = max(end - now(), 0.0)
+    if needed <= left:
+        return 1
+    factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
+    factor = next((n for n in factors if needed / n**3 <= _START_SHARE * left), factors[-1])
+    warnings.warn(
+        f"seconds={method.seconds:g} do not suffice for the start of the fit, which takes about {needed:.3g} s: it "
+        f"starts from views binned {factor} x {factor}, and ends with what is left of the time",
+        stacklevel=2,
+    )
+    return factor
+
+
+def _finish_in_time(
+    method: R2, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
+) -> tuple[int | None, float]:
+    """The sweeps of the finish as `finish_within` says, or those of the method where the time suffices for two, and
+    their seconds, of so many `left` after the first steps, each of which takes `step`."""
+    room = FINISH_SHARE * left
+    sweeps, seconds = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
+    return (sweeps, seconds) if method.finish is None or sweeps == 0 else (method.finish, room)
+
+
+def _until(control: RunControl, end: float) -> Callable[[], bool]:
+    """Stops with `control`, or when its clock shows `end`."""
+    return lambda: control.now() >= end or (control.should_stop is not None and control.should_stop())
 
 
 def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
@@ -211,15 +268,16 @@ def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[N
 
 
 def _first_state(
-    data: F32, geometry: Geometry, field_grid: Grid, method: R2, seed: int, backend: Backend[Any]
+    data: F32, geometry: Geometry, field_grid: Grid, method: R2, seed: int, backend: Backend[Any], factor: int = 1
 ) -> tuple[FitState, int, float]:
     """The state of a fresh fit, how many Gaussians it starts from, and their density unit."""
     start = method.gaussians
     if not isinstance(start, Gaussians):
         rng = np.random.default_rng(seed)
         start = place(
-            data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays, kernel=method.fit.kernel
-        )
+            data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays, kernel=method.fit.kernel,
+            factor=factor,
+        )  # fmt: skip
     return fit.init(start, seed, growth(method.fit), backend), start.n, start.density_unit
 
 

@@ -23,9 +23,9 @@ from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.base.volume import Grid
 from recon.bench import spheres
-from recon.calibrate import sweep_seconds
 from recon.methods import build, by_name
 from recon.splatting.finish import SWEEPS
+from recon.splatting.in_time import sweep_seconds
 from recon.splatting.initialise import default_count
 from recon.voxels.fbp import fbp
 from recon.voxels.held_out_weight import choice_sweeps

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from beamline.simulate.scene_file import open_scene, shipped_scenes
+from beamline.core.shipped import shipped_scenes
+from beamline.simulate.scene_file import open_scene
 from recon.base.volume import Grid
 from simulators.effects.catalogue import CATALOGUE
 from simulators.frame.detector import Detector

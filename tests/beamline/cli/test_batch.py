@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,8 +12,9 @@ import numpy as np
 import pytest
 
 from beamline.cli import batch as command
+from beamline.cli import recon_worker
 from beamline.reconstruct import batch
-from beamline.reconstruct.batch import COMMAND, BatchOptions, Row, names_of, run_batch
+from beamline.reconstruct.batch import BatchOptions, Row, Worker, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
@@ -30,13 +33,13 @@ def _table(folder: Path) -> dict[str, dict[str, str]]:
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scans are reconstructed without a process of their own, which takes seconds to start."""
 
-    def run(line: Sequence[str], log: Path, on_line: Callable[[str], None]) -> tuple[int, str]:
-        result = beamline(*line[len(COMMAND) - 1 :])
+    def run(worker: Worker, arguments: Sequence[str], on_line: Callable[[str], None]) -> tuple[int, str]:
+        result = beamline(*arguments)
         for text in result.stdout.splitlines():
             on_line(text)
         return result.exit_code, (result.stderr.splitlines() or [""])[-1]
 
-    monkeypatch.setattr(batch, "_run", run)
+    monkeypatch.setattr(Worker, "run", run)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -104,19 +107,56 @@ def test_a_stop_leaves_the_scans_that_are_done_and_nothing_half(folder: Path, mo
     write_exchange(folder / "second.h5", SCAN)
     done: list[str] = []
 
-    def run(line: Sequence[str], log: Path, on_line: object) -> tuple[int, str]:
+    def run(worker: Worker, arguments: Sequence[str], on_line: object) -> tuple[int, str]:
+        output = Path(arguments[arguments.index("--output") + 1])
         if done:
-            (log.parent / "recon.h5.partial").touch()
+            output.with_suffix(".h5.partial").touch()
             raise KeyboardInterrupt
-        done.append(line[len(COMMAND)])
-        (log.parent / "recon.h5").touch()
+        done.append(arguments[1])
+        output.touch()
         return 0, ""
 
-    monkeypatch.setattr(batch, "_run", run)
+    monkeypatch.setattr(Worker, "run", run)
     result = beamline("batch", "scan.h5", "second.h5", "-o", "out")
     assert result.exit_code == 4
     assert {name: row["state"] for name, row in _table(folder / "out").items()} == {"scan": "done", "second": "waiting"}
     assert left(folder / "out") == {"batch.csv", "recipe.yaml", "scan"}
+
+
+WORKS = """
+import json, os, sys, time
+for line in sys.stdin:
+    (what,) = json.loads(line)
+    print(json.dumps({"event": "at work", "pid": os.getpid()}), flush=True)
+    if what == "crash":
+        print("out of memory", file=sys.stderr, flush=True)
+        os.abort()
+    if what == "hang":
+        time.sleep(600)
+    print(json.dumps({"event": "ended", "exit_code": int(what)}), flush=True)
+"""
+
+
+def test_a_worker_takes_scan_after_scan_and_another_one_follows_a_failure(tmp_path: Path) -> None:
+    lines: list[str] = []
+    given, log = ("0", "0", "6", "0", "5", "0", "crash", "0", "hang", "0"), tmp_path / "log.txt"
+    with Worker(log, (sys.executable, "-c", WORKS), silence=1.5) as worker:
+        found = [worker.run([what], lines.append) for what in given]
+    codes = [code for code, _ in found]
+    assert codes[:6] == [0, 0, 6, 0, 5, 0]
+    assert (codes[6] not in (0, 5, 6), codes[7:]) == (True, [0, None, 0])
+    assert found[6][1] == "out of memory"
+    assert "it hung" in found[8][1]
+    pids = [json.loads(line)["pid"] for line in lines]
+    changes = [n for n in range(1, len(given)) if pids[n] != pids[n - 1]]
+    assert changes == [5, 7, 9]  # after a failure, a crash, a scan that hung
+    assert not log.exists()
+
+
+def test_the_worker_gives_the_exit_codes_of_the_command(tmp_path: Path) -> None:
+    assert recon_worker.run(["info", str(tmp_path / "none.h5")]) == 5
+    assert recon_worker.run(["info", "--no-such-option"]) == 2
+    assert recon_worker.run(["config", "init"]) == 0
 
 
 def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_kept_and_named(folder: Path) -> None:

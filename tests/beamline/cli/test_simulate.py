@@ -16,9 +16,10 @@ from click.testing import CliRunner, Result
 
 from beamline.cli import simulate as module
 from beamline.cli.main import main
+from beamline.core.shipped import shipped_scenes
 from beamline.simulate import figure, write
 from beamline.simulate.labels import read_labels
-from beamline.simulate.scene_file import open_scene, scan_of, shipped_scenes
+from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.storage.readers.open import open_scan
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry

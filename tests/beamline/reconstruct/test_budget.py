@@ -80,7 +80,7 @@ def test_the_time_is_used_and_not_exceeded(
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr(module, "finish_within", lambda *_: (0, 0.0))  # its seconds are not ticks
+    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: (0, 0.0))  # its seconds are not ticks
     done = _spend(prepared, budget, Ticking(0.01))
     assert done.choice.is_gaussian_fit
     assert 0.9 * budget < done.seconds <= budget
@@ -104,17 +104,6 @@ def test_iterations_on_voxels_take_no_sample_that_is_wider_than_the_field(
     for data, taken in ((prepared, True), (narrow, False)):
         done = within(4.0, data, methods, 0, RunControl(now=Ticking(0.01)), lambda said: None, 1)
         assert ("fista-tv" in done.because) is taken and done.choice.binning == 1
-
-
-def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for(prepared: PreparedProjections) -> None:
-    views, grid = prepared.geometry, Grid.matching(prepared.geometry)
-    # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6
-    # and three trials of 8 over seven of eight views.
-    found = [module.finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 141.0, 146.0, 165.0, 1e3)]
-    assert found == [(0, 0.0), (0, 0.0), (2, 145.0), (6, 165.0), (8, 175.0)]
-    # As many as views held out prefer, where time is left for 24, and for eight trials of 8 over seven of eight views.
-    found = [module.finish_within(1e3, spare, views, grid, Ticking(1.0)) for spare in (534.0, 535.0)]
-    assert found == [(8, 175.0), (None, 535.0)]
 
 
 def test_a_slow_machine_takes_fbp_of_binned_pixels(
@@ -172,7 +161,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
 ) -> None:
     """More steps than were best on other scans follow the noise."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr(module, "finish_within", lambda *_: (0, 0.0))
+    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: (0, 0.0))
     monkeypatch.setattr(module, "best_steps", lambda method: 7)
     done = _spend(prepared, 60.0, Ticking(0.1), methods=(R2(),))
     assert done.result.history[-1].step == 7 and done.seconds < 30

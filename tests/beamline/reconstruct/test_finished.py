@@ -61,6 +61,35 @@ def _names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+class Ticking:
+    """A clock that each look at it moves on by a tenth of a second."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+
+    def now(self) -> float:
+        self.time += 0.1
+        return self.time
+
+
+def test_the_times_of_all_phases_are_told_and_add_up_to_the_time_that_it_took(tmp_path: Path) -> None:
+    events: list[Event] = []
+    options = _options(tmp_path, method=build(by_name("sirt"), {"iterations": 2}))
+    options = replace(options, target=replace(options.target, report=tmp_path / "out.html"))
+    reconstruct_file(options, events.append, Ticking())
+    done = events[-1].data
+    assert sum(done["times"].values()) == pytest.approx(done["elapsed"], abs=0.35)  # three looks beside the phases
+    assert list(done["times"]) == [
+        "opening the scan", "flags and references", "tilt and references", "rotation axis", "jumps", "correction",
+        "rings, views held out, hardening", "reconstruction", "measuring the volume", "FBP for comparison", "report",
+        "writing the volume",
+    ]  # fmt: skip
+    begun = [event.data["phase"] for event in events if event.data.get("stage") == "phase" and event.data["n"] == 0]
+    assert begun == list(done["times"])
+    recorded = read_reconstruction(tmp_path / "out.h5").parameters
+    assert recorded["seconds_of_correction"] == pytest.approx(done["times"]["correction"])
+
+
 def test_fbp_is_the_object_in_inverse_millimetres(tmp_path: Path) -> None:
     events: list[Event] = []
     metrics = reconstruct_file(_options(tmp_path), events.append, SystemClock())

@@ -20,7 +20,7 @@ from beamline.monitor.digest import digest
 from beamline.storage import archive as module
 from beamline.storage import compressed_copy
 from beamline.storage.archive import archive
-from beamline.storage.compressed_copy import CODECS
+from beamline.storage.codecs import CODECS
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate

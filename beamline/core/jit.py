@@ -1,0 +1,37 @@
+"""njit: numba's, loaded with a kernel's first call: a command that calls none starts sooner."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """As `numba.njit(**options)`; the function is compiled, or read from numba's cache, when it is first used."""
+
+    def decorate(function: Callable[..., Any]) -> _Kernel:
+        return _Kernel(function, options)
+
+    return decorate
+
+
+class _Kernel:
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self._function, self._options = function, options
+
+    @cached_property
+    def _dispatcher(self) -> Any:
+        import numba
+
+        around = self._function.__globals__
+        for name in self._function.__code__.co_names:  # numba calls from a kernel only kernels of its own
+            if isinstance(kernel := around.get(name), _Kernel) and kernel is not self:
+                around[name] = kernel._dispatcher
+        return numba.njit(**self._options)(self._function)
+
+    def __call__(self, *args: Any) -> Any:
+        return self._dispatcher(*args)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._dispatcher, name)

@@ -1,0 +1,53 @@
+"""Phases: what a long work does at the moment, told as it begins, and the seconds of each; together all of them."""
+
+from __future__ import annotations
+
+import math
+
+from beamline.core.events import Event, Sink
+from drivers.clock import Clock, SystemClock
+
+_SAY_EVERY = 0.2  # s between events on how far a phase is
+
+
+class Phases:
+    """One phase follows the other without a gap, so that their seconds add up to the time since the start.
+
+    Args:
+        sink: gets an event `progress` of the stage "phase" as each begins, and some of how far it is.
+        clock: that they are timed by.
+
+    Attributes:
+        seconds: of each phase that has ended; of one that came again, in all.
+    """
+
+    def __init__(self, sink: Sink = lambda event: None, clock: Clock | None = None) -> None:
+        self._sink, self._clock = sink, clock or SystemClock()
+        self._name, self._begun, self._said = "", self._clock.now(), -math.inf
+        self.seconds: dict[str, float] = {}
+
+    def enter(self, name: str) -> None:
+        """The phase before has ended; this one begins."""
+        self.end()
+        self._name, self._said = name, -math.inf
+        self._say({"phase": name, "n": 0, "of": 0, "per_s": None, "eta_s": None})
+
+    def told(self, n: int, total: int) -> None:
+        """So much of the phase is done."""
+        now = self._clock.now()
+        if now - self._said >= _SAY_EVERY or n == total:
+            self._said = now
+            rate = n / max(now - self._begun, 1e-9)
+            left = (total - n) / rate if rate > 0 else None
+            self._say({"phase": self._name, "n": n, "of": total, "per_s": rate, "eta_s": left})
+
+    def end(self) -> None:
+        """The last phase has ended, now."""
+        now = self._clock.now()
+        if self._name:
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + now - self._begun
+            self._begun = now
+        self._name = ""
+
+    def _say(self, data: dict[str, object]) -> None:
+        self._sink(Event("progress", self._clock.now(), {"stage": "phase", **data}))

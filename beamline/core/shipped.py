@@ -1,0 +1,16 @@
+"""What comes with the package beside its code: configurations and scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def config_folder() -> Path:
+    """The folder of the configurations that come with the package: installed, or beside the checkout's packages."""
+    installed = Path(__file__).parents[1] / "configs"
+    return installed if installed.is_dir() else Path(__file__).parents[2] / "configs"
+
+
+def shipped_scenes() -> dict[str, Path]:
+    """The scenes that come with the package, by name."""
+    return {path.stem: path for path in sorted((config_folder() / "scenes").glob("*.yaml"))}

@@ -1,0 +1,91 @@
+"""In time: what of a fit's seconds goes to its start, its steps, its finish on voxels, and its volume."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import voxelize
+from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choice_cost
+from recon.voxels.ordered_fista import subsets_of
+from recon.voxels.projector import Projector
+from recon.voxels.tv import TotalVariationProx, difference_weights
+
+Clock = Callable[[], float]
+
+FINISH_SHARE = 0.8
+"""Of what is left after the first steps, at most: a finish adds more than most of the steps before it."""
+
+_GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
+_SLAB = 16  # slices that are filled to measure it
+_SWEPT_VIEWS = 8
+_COLS = 96  # of binned pixels, by which the time of a start is guessed
+# What goes before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a
+# subset, projections and an FBP.
+_EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
+
+
+def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
+    """Time of a sweep of FISTA-TV over all views; infinite for rolled or tilted ones, which voxels do not take.
+
+    A few views are projected there and back, and one proximal step of total variation is taken, to measure it.
+    """
+    if not geometry.is_straight:
+        return math.inf
+    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
+    projector = Projector(some, grid)
+    begin = now()
+    x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
+    projected = now()
+    TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
+    parts = subsets_of(geometry, SUBSETS)
+    return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
+
+
+def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
+    """The same of straight views, guessed before anything else from binned pixels, in little time."""
+    straight = geometry.straightened()
+    factor = max(1, min(straight.detector_shape[1] // _COLS, straight.detector_shape[0]))
+    coarse = straight.binned(factor)
+    box = Grid.of_field(coarse, coarse.sample_pitch)
+    share = math.prod(grid.shape) / math.prod(box.shape)
+    return sweep_seconds(coarse, box, now) * share
+
+
+def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
+    """Time to fill the grid at the end of a fit that starts from these Gaussians, measured on a slab."""
+    slab = replace(grid, shape=(min(_SLAB, grid.shape[0]), *grid.shape[1:]))
+    begin = now()
+    voxelize(gaussians, slab)
+    return (now() - begin) * grid.shape[0] / slab.shape[0] * _GROWTH
+
+
+def finish_within(
+    seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock
+) -> tuple[int | None, float]:
+    """Sweeps of a fit's finish that `seconds` suffice for, at most `SWEEPS`, and the seconds that they will take.
+
+    None: as many as views held out prefer, where the seconds `beside_steps` suffice for the most, and for the trials of
+    them. Fewer than two sweeps are none: what goes before them takes as long.
+    """
+    if seconds <= 0:
+        return 0, 0.0
+    sweep = sweep_seconds(geometry, grid, now)
+    if geometry.is_cone:
+        sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
+    eigenvalue = _EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS)
+    before = (eigenvalue + _FIRST_SWEEPS + choice_sweeps(geometry)) * sweep
+    asking = sweeps_choice_cost(geometry)
+    if asking and (most := before + (asking + MOST_SWEEPS) * sweep) <= min(seconds, beside_steps):
+        return None, most
+    if not before + 2 * sweep <= seconds:
+        return 0, 0.0
+    sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
+    return sweeps, before + sweeps * sweep
