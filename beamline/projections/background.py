@@ -18,9 +18,8 @@ from recon.voxels.projector import Projector
 F32 = NDArray[np.float32]
 
 _COLS, _VIEWS = 96, 180  # of the volume that tells where the sample is
-_ROUNDS = 2  # the second with the background of the first taken off
+_RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
 _AT_ONCE = 64  # views
-_RIM = 0.95  # of the circle that all views see: nearer to it a volume is not sure of its level
 _LEAST_VIEWS = 8
 
 
@@ -96,15 +95,16 @@ def _found(views: _Views, order: int | None) -> tuple[Background | None, tuple[M
     numbers = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(np.intp))
     some, grid = geometry.select(numbers), Grid.matching(geometry)
     _, y, x = grid.coordinates()
-    inside = np.hypot(y[:, None], x) <= _RIM * geometry.reach
+    away = np.hypot(y[:, None], x)
     measured = views.binned(numbers)
     found = None
-    for last in range(_ROUNDS):
+    for last, rim in enumerate(_RIMS):
         levelled = measured.copy()
         if found is not None:
             found.remove(levelled, factor=views.factor)
+        inside = away <= geometry.reach - rim * grid.voxel_size
         sample = matter(first_volume(levelled, some, grid).data, inside)
-        found = views.sums(sample, grid, np.arange(n) if last == _ROUNDS - 1 else numbers).fit(order)
+        found = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)
         if found is None:
             break
     return found, (sample, grid)
