@@ -97,14 +97,19 @@ def distortion_of(ctx: click.Context, param: click.Parameter, value: Path | None
         raise click.BadParameter(f"{value}: {error}") from error
 
 
-def air_columns(ctx: click.Context, param: click.Parameter, value: str) -> str | tuple[int, int]:
-    """Which columns at the detector's edges show air: auto, none, or counts `left,right`."""
-    match = re.fullmatch(r"(\d+),(\d+)", value)
-    if match is not None:
-        return int(match[1]), int(match[2])
-    if value not in ("auto", "none"):
-        raise click.BadParameter(f"{value!r} is none of auto, none, LEFT,RIGHT (numbers of columns, e.g. 12,12)")
-    return value
+def air_of(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str | tuple[int, int], str | int]:
+    """Which columns at the detector's edges show air, and the surface that is taken off; see `Selection`."""
+    if match := re.fullmatch(r"(\d+),(\d+)", value):
+        return (int(match[1]), int(match[2])), "none"
+    if match := re.fullmatch(r"surface:([0-3])", value):
+        return "auto", int(match[1])
+    models = {"auto": ("auto", "auto"), "columns": ("auto", "none"), "none": ("none", "none")}
+    if value not in models:
+        raise click.BadParameter(
+            f"{value!r} is none of auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12), surface:ORDER (0 "
+            "to 3)"
+        )
+    return models[value]
 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -127,6 +132,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
     if rest["axis"] is not None and not isinstance(rest["axis"], float):
         raise click.UsageError("--axis try is for beamline recon.")
     pixel_size_um, tilt = rest.pop("pixel_size_um"), rest.pop("tilt")
+    columns, surface = rest.pop("air")
     selection = Selection(
         views=rest.pop("views"),
         rows=rest.pop("rows"),
@@ -134,7 +140,8 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
         axis_col=rest.pop("axis"),
         pixel_size_mm=None if pixel_size_um is None else pixel_size_um * 1e-3,
         cone=rest.pop("cone"),
-        correction=CorrectionSettings(air=rest.pop("air")),
+        correction=CorrectionSettings(air=columns),
+        surface=surface,
         seed=seed,
         use_flags=rest["flags"] != "ignore",
         judge=rest.pop("flags") == "judge",
@@ -280,11 +287,13 @@ _AFTER = (
     ),
     click.option(
         "--air",
-        callback=air_columns,
-        metavar="auto|none|LEFT,RIGHT",
+        callback=air_of,
+        metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
         default="auto",
         show_default=True,
-        help="Number of columns at the left and right edge that show air in every view.",
+        help="What is taken off each view so that its air is at zero. columns: the line through the air at the left "
+        "and right edge; LEFT,RIGHT: of so many columns; surface:0 to 3: also a polynomial through all rays that miss the "
+        "sample; auto: that where the views confirm it, and says so.",
     ),
     click.option(
         "--flags",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
+from beamline.projections.background import without_background
 from beamline.projections.correction import ScanCorrection, Warn, resampling_of
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
@@ -71,6 +72,7 @@ class PreparedProjections:
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
+        background: what was done about the background of the beam; empty where nothing was asked.
         rings: what was done about rings; empty where nothing was asked.
         flats: what was done about changes of the beam; empty where nothing was asked.
         phase: what was done about phase; empty where nothing was asked.
@@ -96,6 +98,7 @@ class PreparedProjections:
     measured: NDArray[np.bool_] | None = None
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
+    background: str = ""
     rings: str = ""
     flats: str = ""
     phase: str = ""
@@ -233,30 +236,35 @@ def prepare_projections(
         projections = correction.at_once(scan_frames[chosen], told=phases.told)
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
-    phases.enter("rings, views held out, hardening")
-    taken, rings = remove_rings_in_place(projections.data, source.angles[projections.view_ids], selection.rings)
-    regions = replace(usable.regions, resampling=resampling_of(source, selection))
-    shares_of = None
-    if spill is not None:
-        rows, ids = rows_of(source, selection), projections.view_ids
-        if regions.mark(ids):
-            shares_of = partial(_shares_of, regions, ids, rows, selection.binning, projections.data.shape[2])
-        usable = replace(usable, regions=Regions())
+    phases.enter("background, rings, views held out, hardening")
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
-    held_out = None
+    others, held_out = None, None
     if rest.size:
         others = correction.at_once(scan_frames[spread(rest, _HELD_OUT_VIEWS)])
         unseen = geometry_of(source, selection, axis_col, source.angles[others.view_ids])
-        others.data[...] -= taken
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
+    ids = projections.view_ids
+    geometry = jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids)
+    background = without_background(projections.data, geometry, selection.surface, held_out)
+    taken, rings = remove_rings_in_place(projections.data, source.angles[ids], selection.rings)
+    if others is not None:
+        others.data[...] -= taken
+    regions = replace(usable.regions, resampling=resampling_of(source, selection))
+    shares_of = None
+    if spill is not None:
+        rows = rows_of(source, selection)
+        if regions.mark(ids):
+            shares_of = partial(_shares_of, regions, ids, rows, selection.binning, projections.data.shape[2])
+        usable = replace(usable, regions=Regions())
     found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
     found = replace(
         found,
-        geometry=jumps.corrected(found.geometry, projections.view_ids),
+        geometry=geometry,
         jumps=jumps.said,
         noise=correction.noise,
         flats=correction.flats,
         phase=correction.phase,
+        background=background,
         rings=rings,
         tilt=tilt,
         shares_of=shares_of,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,9 @@ from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.correct import CorrectionSettings
 from recon.prep.resample import Distortion
+
+Surface = Literal["auto", "none"] | int
+"""The surface that is taken off as the background of the beam: by its order, or "auto" where the views confirm it."""
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
 
@@ -66,6 +70,7 @@ class Selection:
         pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
         correction: of counts to line integrals.
+        surface: see `beamline.projections.background`.
         seed: of random view selections.
         use_flags: views with an alarm of the monitor are left out, those with a warning weigh less.
         judge: the monitor looks at the frames of the file now, and its flags count in place of the file's.
@@ -93,6 +98,7 @@ class Selection:
     pixel_size_mm: float | None = None
     cone: tuple[float, float] | None = None
     correction: CorrectionSettings = field(default_factory=CorrectionSettings)
+    surface: Surface = "auto"
     seed: int = 0
     use_flags: bool = True
     judge: bool = False

@@ -122,7 +122,8 @@ def reconstruct_file(
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Send the event `recon_started`; before it, what was done to the views on request."""
-    done = {name: getattr(prepared, name) for name in ("tilt", "flats", "noise", "phase", "rings", "hardening")}
+    steps = "tilt", "flats", "noise", "phase", "background", "rings", "hardening"
+    done = {name: getattr(prepared, name) for name in steps}
     corrections_done(done, sink, clock)
     data = {
         "file": options.source.path,

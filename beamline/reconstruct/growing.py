@@ -12,6 +12,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
+from beamline.projections.background import without_background
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.jumps import frames_text
@@ -293,7 +294,8 @@ class ScanFollower:
             )
         assert self._correction is not None
         self._correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
-        prepared = self._prepared(self.axis_col, usable)
+        background = self._without_background(self.axis_col)
+        prepared = self._prepared(self.axis_col, usable, background)
         self._sink(
             Event(
                 "state",
@@ -342,7 +344,22 @@ class ScanFollower:
             self._batches = [merge_and_empty(self._batches)]
         return self._batches[0]
 
-    def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
+    def _without_background(self, axis_col: float) -> str:
+        """Take the background of the beam off all views, now that all are there; what was done, in words."""
+        assert self._fit is not None
+        views, selection = self._joined(), self._options.selection
+        geometry = geometry_of(self.source, selection, axis_col, self.source.angles[views.view_ids])
+        try:
+            said = without_background(views.data, geometry, selection.surface)
+        except DataError as error:  # nobody throws the volume of a scan away for this
+            self._warn(str(error))
+            return ""
+        if said:
+            corrections_done({"background": said}, self._sink, self._clock)
+            self._fit.replace_views(views.data)
+        return said
+
+    def _prepared(self, axis_col: float, usable: UsableViews, background: str) -> PreparedProjections:
         projections = self._joined()
         assert self._correction is not None
         found = assemble(
@@ -350,4 +367,4 @@ class ScanFollower:
         )
         done, degrees = self._correction, self._options.selection.tilt_deg
         tilt = turned_text(degrees) if degrees else ""
-        return replace(found, noise=done.noise, phase=done.phase, flats=done.flats, tilt=tilt)
+        return replace(found, noise=done.noise, phase=done.phase, flats=done.flats, tilt=tilt, background=background)

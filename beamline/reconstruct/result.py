@@ -235,6 +235,8 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         **({} if selection.distortion is None else _flat("distortion", asdict(selection.distortion))),
         "phase": prepared.phase or "not retrieved",
         "hardening": prepared.hardening or "not corrected",
+        "surface": selection.surface,
+        "background": prepared.background or "none taken off",
         "rings": selection.rings,
         **({"rings_removed": prepared.rings} if prepared.rings else {}),
         "floored_fraction": float(prepared.projections.floored),

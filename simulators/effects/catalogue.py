@@ -33,7 +33,7 @@ class Entry:
     reason: str = ""
 
 
-_BEAM = frozenset({"beam_profile", "narrow_field"})
+_BEAM = frozenset({"beam_profile", "beam_bend", "narrow_field"})
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
 CATALOGUE: Mapping[str, Entry] = MappingProxyType(
     {
@@ -56,6 +56,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
         "harmonics": Entry(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
         "beam_hardening": Entry(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
         "beam_profile": Entry(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
+        "beam_bend": Entry(Domain.PHOTONS, "the open beam of the views is not that of the flats"),
         "ring_current": Entry(Domain.PHOTONS, "the ring current decays and is topped up"),
         "ghost": Entry(Domain.PHOTONS, "a fog-like change of the light crosses the frame in a few views"),
         "black_band": Entry(Domain.PHOTONS, "a slit darkens a band at the left side"),

@@ -25,6 +25,7 @@ PARAMETERS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "harmonics": {"share": 0.1},
         "beam_hardening": {"weights": [1.0, 1.0], "ratios": [1.0, 2.0]},
         "beam_profile": {"sigma": [1.0, 1.0]},
+        "beam_bend": {"curvature": [0.1, 0.0]},
         "ring_current": {"lifetime": 100.0},
         "scatter": {"ratio": 0.1},
         "scintillator_blur": {"fwhm_um": 40.0},

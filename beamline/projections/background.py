@@ -1,0 +1,110 @@
+"""Background of the beam: found on the rays that miss the sample, and taken off where the views confirm it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.projections.selection import Surface
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.masks import masked
+from recon.base.volume import Grid
+from recon.prep.background import AirSums, Background, Mask, matter
+from recon.splatting.initialise import first_volume
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+
+_COLS, _VIEWS = 96, 180  # of the volume that tells where the sample is
+_RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
+_AT_ONCE = 64  # views
+_LEAST_VIEWS = 8
+
+
+class _Views:
+    """Line integrals [view, row, col] with their geometry, which are taken binned and finite, so many at a time."""
+
+    def __init__(self, data: F32, geometry: Geometry) -> None:
+        self.data, (rows, cols) = data, geometry.detector_shape
+        self.factor = max(1, min(round(cols / _COLS), rows))
+        self.geometry = geometry.binned(self.factor)
+
+    def binned(self, numbers: NDArray[np.intp]) -> F32:
+        return np.concatenate([bin_views(masked(self.data[k : k + 1])[0], self.factor) for k in numbers])
+
+    def sums(self, sample: Mask, grid: Grid, numbers: NDArray[np.intp]) -> AirSums:
+        """Sums over the rays of some views that miss the sample, which is a mask on a grid."""
+        sums, volume = AirSums(self.data.shape[1:], self.factor), sample.astype(np.float32)
+        for part in np.array_split(numbers, max(1, numbers.size // _AT_ONCE)):
+            paths = Projector(self.geometry.select(part), grid).forward(volume)
+            for view, path in zip(self.binned(part), paths, strict=True):
+                sums.add(view, path <= 0)
+        return sums
+
+
+def without_background(
+    data: F32, geometry: Geometry, wanted: Surface, others: tuple[F32, Geometry] | None = None
+) -> str:
+    """Take the background of the beam off views [view, row, col], in place; what was done, in words; empty: nothing.
+
+    Args:
+        wanted: "auto": where the views confirm it; a number: polynomials of this order.
+        others: further views and their geometry, which lose their background, too.
+
+    Raises:
+        DataError: polynomials were asked for, and too few rays miss the sample.
+    """
+    if wanted == "none":
+        return ""
+    order = None if wanted == "auto" else wanted
+    views = _Views(data, geometry)
+    found, where = _found(views, order) if len(data) >= _LEAST_VIEWS else (None, None)
+    if found is None or where is None:
+        if order is None:
+            return ""
+        raise DataError(
+            "--air surface: too few rays miss the sample, so that no surface can be fitted. Give --air columns or none."
+        )
+    if order is None and not found.confirmed:
+        return ""
+    seen = (
+        f"the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by the "
+        f"{found.air:.0%} of the rays that miss the sample (order {found.order})"
+    )
+    if order is None and found.may_be_matter:
+        return (
+            f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: none "
+            f"taken off. If that is air, give --air surface:{found.order}."
+        )
+    if others is not None:
+        more = _Views(*others)
+        unseen = more.sums(*where, np.arange(len(more.data))).fit(found.order)
+        if unseen is not None:
+            unseen.remove(more.data)
+    found.remove(data)
+    return (
+        f"Background of the beam: {seen}; taken off. Air was {found.before:.2g} off nothing and is {found.after:.2g}."
+    )
+
+
+def _found(views: _Views, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
+    """The background of all views, by where a first volume of some of them has matter; and that."""
+    n, geometry = len(views.data), views.geometry
+    numbers = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(np.intp))
+    some, grid = geometry.select(numbers), Grid.matching(geometry)
+    _, y, x = grid.coordinates()
+    away = np.hypot(y[:, None], x)
+    measured = views.binned(numbers)
+    found = None
+    for last, rim in enumerate(_RIMS):
+        levelled = measured.copy()
+        if found is not None:
+            found.remove(levelled, factor=views.factor)
+        inside = away <= geometry.reach - rim * grid.voxel_size
+        sample = matter(first_volume(levelled, some, grid).data, inside)
+        found = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)
+        if found is None:
+            break
+    return found, (sample, grid)

@@ -1,0 +1,241 @@
+"""Background of the beam: the smooth surface that each view shows where its rays miss the sample.
+
+The open beam of the views may differ from the flats: it bends, moves or fades between them. Line integrals then have a
+smooth surface beside the sample's. What of it is negative, a volume without negative densities cannot hold, and takes
+from weak matter instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.signal import find_peaks
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HIGHEST = 3
+"""Order of the polynomials in column and row, at most."""
+
+LEAST_SIZE = 0.005
+"""Root mean square of the surfaces, in line integrals, from which on they are taken where nobody asked for them."""
+
+_SMOOTH = 1.5  # voxels: weak matter stands out of the noise when it is smoothed
+_SIGMAS, _MARGIN = 5.0, 4  # of the smoothed air; voxels around matter that count as matter
+_SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
+_MAD, _CLIPPED, _ROUNDS = 1.4826, 4.0, 20  # normal standard deviation over median deviation; such deviations; rounds
+_GROWTH = 4.0  # of the spread of air over what is below its commonest value
+_BLOCK = 8  # pixels a side: every other block of air is predicted from those between
+_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # of the rays of a view; of the views
+_WINDOWS = (45, 15, 5, 1)  # views that share a surface
+_BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75  # of the mean square left: fewer views, or a higher order, must pay
+_BETTER = 0.99  # so must any surface
+_FARTHEST = 1000.0  # largest variance of a surface over that of a constant: beyond it extrapolates
+_ROWS_A_POWER = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """A polynomial of column and row for each view.
+
+    Attributes:
+        order: of the polynomials.
+        coefficients: float64 [view, term], of `powers`.
+        shape: (rows, cols) of the detector.
+        size: root mean square of the surfaces.
+        lowest, highest: of the mean surface over the views.
+        before, after: root mean square of binned air, in blocks that the surface was not fitted on.
+        air: share of the rays that miss the sample.
+        level: mean of that air before.
+    """
+
+    order: int
+    coefficients: F64
+    shape: tuple[int, int]
+    size: float
+    lowest: float
+    highest: float
+    before: float
+    after: float
+    air: float
+    level: float
+
+    @property
+    def confirmed(self) -> bool:
+        """It is no chance and not too small: blocks of air that it was not fitted on are nearer to nothing by it."""
+        return self.size >= LEAST_SIZE and self.after**2 < _BETTER * self.before**2
+
+    @property
+    def may_be_matter(self) -> bool:
+        """It is positive: weak matter all around the sample looks like this, and a volume can hold it."""
+        return self.level > 0
+
+    def of(self, view: int) -> F32:
+        """The surface [row, col] of a view."""
+        return self._surface(coordinate(self.shape[0]), coordinate(self.shape[1]), view)
+
+    def remove(self, views: F32, first: int = 0, factor: int = 1) -> None:
+        """Subtract the surfaces from views [view, row, col], in place.
+
+        Args:
+            first: number of the first of them.
+            factor: by which their pixels are binned.
+        """
+        v, u = (coordinate(n, factor) for n in self.shape)
+        for n, view in enumerate(views):
+            view -= self._surface(v, u, first + n)
+
+    def _surface(self, v: F64, u: F64, view: int) -> F32:
+        across = np.zeros((HIGHEST + 1, u.size))  # for each power of the row
+        for c, (i, j) in zip(self.coefficients[view], powers(HIGHEST), strict=True):
+            across[j] += c * u**i
+        return (np.vander(v, HIGHEST + 1, increasing=True) @ across).astype(np.float32)
+
+
+def coordinate(n: int, factor: int = 1) -> F64:
+    """-1 to 1 across n pixels, at the centres of bins of so many."""
+    return (2 * np.arange(n // factor) * factor + factor - n) / n
+
+
+def powers(order: int) -> list[tuple[int, int]]:
+    """(power of the column, power of the row) of each term, lower orders first."""
+    return [(total - j, j) for total in range(order + 1) for j in range(total + 1)]
+
+
+def matter(volume: F32, inside: Mask) -> Mask:
+    """bool [z, y, x]: voxels near matter, which stands out of the air of the smoothed volume by five of its deviations.
+
+    Args:
+        inside: bool [y, x], voxels that all views see, without the rim of that circle.
+    """
+    smooth = gaussian_filter(volume, [min(_SMOOTH, n / 8) for n in volume.shape], mode="nearest")
+    level, noise = air_level(smooth[:, inside])
+    return np.asarray(binary_dilation((smooth - level > _SIGMAS * noise) & inside, iterations=_MARGIN))
+
+
+def air_level(values: F32) -> tuple[float, float]:
+    """The level of air among the values of a volume, and its standard deviation.
+
+    The lowest value that many voxels have; from there the values within four deviations, until these stay. Where air
+    is uneven, its deviation is up to four times that of the values below the first.
+    """
+    values = values.ravel()
+    values = values[:: max(1, values.size // _SAMPLED)]
+    low, high = np.percentile(values, (0.05, 99.95))
+    if not high > low:
+        return float(low), 0.0
+    counts, edges = np.histogram(values, _BINS, (low, high))
+    smooth = np.concatenate(([0], gaussian_filter(counts.astype(np.float64), 2), [0]))
+    least = _PEAK * smooth.max()
+    peaks, _ = find_peaks(smooth, height=least, prominence=least / 2)
+    level = float(edges[peaks[0] - 1] + edges[peaks[0]]) / 2
+    below = level - values[values < level]
+    first = noise = _MAD * float(np.median(below)) if below.size else 0.0
+    for _ in range(_ROUNDS):
+        near = values[np.abs(values - level) <= _CLIPPED * noise]
+        if not near.size:  # all that is below is the same
+            break
+        level = float(np.median(near))
+        noise = min(_MAD * float(np.median(np.abs(near - level))), _GROWTH * first)
+    return level, noise
+
+
+class AirSums:
+    """Sums of views over their air, by which polynomials of any order are fitted to any number of views."""
+
+    def __init__(self, shape: tuple[int, int], factor: int) -> None:
+        """For views of a detector (rows, cols), binned by a factor."""
+        rows, cols = shape[0] // factor, shape[1] // factor
+        v, u = coordinate(shape[0], factor), coordinate(shape[1], factor)
+        odd = (np.arange(rows)[:, None] // _BLOCK + np.arange(cols) // _BLOCK) % 2
+        self._shape, self._half = shape, odd.astype(bool)
+        self._terms = np.stack([np.outer(v**j, u**i) for i, j in powers(HIGHEST)], -1)
+        self._squares: list[list[F64]] = []  # [view][half] of [term, term]
+        self._products: list[list[F64]] = []  # [view][half] of [term]
+        self._totals: list[list[tuple[float, float, float]]] = []  # [view][half]: rays, sum and sum of squares
+
+    def add(self, view: F32, air: Mask) -> None:
+        """A view [row, col], binned, and which of its rays miss the sample."""
+        air = self._without_outliers(view, air)
+        parts = []
+        for half in (self._half, ~self._half):
+            t, p = self._terms[air & half], view[air & half].astype(np.float64)
+            parts.append((t.T @ t, t.T @ p, (float(p.size), float(p.sum()), float(p @ p))))
+        squares, products, totals = zip(*parts, strict=True)
+        self._squares.append([*squares])
+        self._products.append([*products])
+        self._totals.append([*totals])
+
+    def fit(self, order: int | None = None) -> Background | None:
+        """The surfaces that predict blocks of air best that they were not fitted on; None where air is too little.
+
+        Neighbouring views share a surface as long as that predicts as well; a higher order has to pay.
+
+        Args:
+            order: None: up to 3, as far as it pays and extrapolates little.
+        """
+        squares, products, totals = (np.array(x) for x in (self._squares, self._products, self._totals))
+        rays, n_views = totals[..., 0], len(totals)
+        share = rays.sum(axis=1) / self._half.size
+        if (share >= _LEAST_AIR).mean() < _LEAST_VIEWS:
+            return None
+        count = rays.sum()
+        before = totals[..., 2].sum() / count
+        best: tuple[float, int, F64] | None = None
+        for n in range(HIGHEST + 1) if order is None else (order,):
+            some = [
+                k for k, (i, j) in enumerate(powers(HIGHEST)) if i + j <= n and j * _ROWS_A_POWER <= len(self._half)
+            ]
+            g, b = squares[..., some, :][..., some], products[..., some]
+            if order is None and self._farthest(g.sum(axis=1), some) > _FARTHEST:
+                break
+            for width in (w for w in _WINDOWS if w <= max(n_views, 1)):
+                wide_g, wide_b = _around(g, width), _around(b, width)
+                c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # of each half by the other one
+                left = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
+                error = float(left.sum() / count)
+                if best is None or error < best[0] * (_BETTER_WINDOW if n == best[1] else _BETTER_ORDER):
+                    found = np.zeros((n_views, len(powers(HIGHEST))))
+                    found[:, some] = _solved(wide_g.sum(axis=1), wide_b.sum(axis=1))
+                    best = error, n, found
+        if best is None:
+            return None
+        error, n, found = best
+        terms = self._terms.reshape(-1, self._terms.shape[-1])
+        size, mean = float(np.sqrt(np.mean(np.square(terms @ found.T)))), terms @ found.mean(axis=0)
+        return Background(
+            order=n, coefficients=found, shape=self._shape, size=size, lowest=float(mean.min()),
+            highest=float(mean.max()), before=float(before) ** 0.5, after=max(error, 0.0) ** 0.5,
+            air=float(share.mean()), level=float(totals[..., 1].sum() / count),
+        )  # fmt: skip
+
+    def _farthest(self, squares: F64, some: list[int]) -> float:
+        """The largest variance of a surface of these terms anywhere, over that of a constant, in a typical view."""
+        g = np.median(squares, axis=0)
+        terms = self._terms.reshape(-1, self._terms.shape[-1])[:, some]
+        return float(np.einsum("ri,ij,rj->r", terms, np.linalg.pinv(g, hermitian=True), terms).max() * g[0, 0])
+
+    def _without_outliers(self, view: F32, air: Mask) -> Mask:
+        """Air without rays that stand out of a surface of the second order."""
+        t, p = self._terms[air][:, :6], view[air].astype(np.float64)
+        if p.size < 2 * t.shape[1]:
+            return air
+        left = view - self._terms[..., :6] @ _solved(t.T @ t, t.T @ p)
+        spread = _MAD * float(np.median(np.abs(left[air])))
+        return np.asarray(air & (np.abs(left) <= _CLIPPED * max(spread, 1e-12)))
+
+
+def _around(values: F64, width: int) -> F64:
+    """Sums over so many views around each [view, ...]; at both ends over the first and the last of them."""
+    total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, axis=0)))
+    first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
+    return np.asarray(total[first + width] - total[first])
+
+
+def _solved(squares: F64, products: F64) -> F64:
+    """Least squares [..., term]; terms that no ray tells are 0."""
+    return np.asarray(np.einsum("...ij,...j", np.linalg.pinv(squares, hermitian=True), products))
