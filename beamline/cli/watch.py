@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import click
 
@@ -20,9 +20,6 @@ from beamline.core.events import Event
 from beamline.core.process import ChildProcess
 from beamline.scan.control import running
 from beamline.scan.run_folder import EVENTS
-
-if TYPE_CHECKING:
-    from beamline.page.serve import Addresses
 
 LOOPBACK, PORT = "127.0.0.1", 8642
 LOOK, ACT = "watch", "control"
@@ -45,24 +42,22 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
     from beamline.page.run_files import Reader, watched  # they load HDF5 and the server, which `scan -h` needs not
-    from beamline.page.serve import open_port, serve
+    from beamline.page.serve import open_port, start
 
     reader = Reader(watched(path or _newest(Path(Storage.model_fields["folder"].default))))
-
-    def say(addresses: Addresses) -> None:
-        click.echo(f"{LOOK:<8}{addresses.look}")
-        if addresses.act is not None:
-            click.echo(f"{ACT:<8}{addresses.act}")
+    try:
+        server = start(reader, open_port(bind, port), control=control, log=_log)
+        click.echo(f"{LOOK:<8}{server.addresses.look}")
+        if server.addresses.act is not None:
+            click.echo(f"{ACT:<8}{server.addresses.act}")
         sys.stdout.flush()
         click.echo("Ctrl-C ends the page, not the scan.", err=True)
         if browse:
-            webbrowser.open(addresses.act or addresses.look)
-
-    if tethered:
-        threading.Thread(target=_end_with_stdin, daemon=True).start()
-    try:
+            webbrowser.open(server.addresses.act or server.addresses.look)
+        if tethered:
+            threading.Thread(target=_end_with_stdin, daemon=True).start()
         with suppress(KeyboardInterrupt):
-            serve(reader, open_port(bind, port), control=control, say=say, log=_log)
+            server.run()
     finally:
         reader.close()
 

@@ -189,8 +189,8 @@ class _Server:
         row, first = _number(request, "row"), _number(request, "first")
 
         def read() -> Response:
-            lines, views = self._reader.do(lambda file: file.sinogram(row, first))
-            return _tile(lines, {"views": views.tolist()})
+            lines, views, factor = self._reader.do(lambda file: file.sinogram(row, first))
+            return _tile(lines, {"views": views.tolist(), "bin": factor})
 
         return await run_in_threadpool(read)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import Region, bin_mean
+from beamline.page.tiles import MOST, Region, bin_mean
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
 from beamline.storage.writers import layout
@@ -127,26 +127,33 @@ class Recording:
         rows, cols = slice(region.first_row, region.last_row), slice(region.first_col, region.last_col)
         factor = region.binning()
         self._data.refresh()
-        pixels = bin_mean(self._data[frame, rows, cols], factor)
+        pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
         if corrected and (found := self._references(frames)) is not None:
-            dark, flat = (bin_mean(mean[rows, cols], factor) for mean in found)
+            dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in found)
             with np.errstate(divide="ignore", invalid="ignore"):
                 pixels = (pixels - dark) / (flat - dark)
         return pixels, region, factor
 
-    def sinogram(self, row: int, first: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-        """Means of blocks of pixels of a detector row in the projections from frame `first` on.
+    def sinogram(self, row: int, first: int) -> tuple[NDArray[np.float32], NDArray[np.int64], int]:
+        """A detector row in the projections from frame `first` on; of a compressed file, means of the preview's blocks.
 
         Returns:
-            [view, col / bin] and the frames.
+            [view, col / bin] of at most 1024 columns, the frames, and the binning.
         """
         kinds = np.array(self._column(layout.KIND, 0, self.progress().frames), int)
         views = np.flatnonzero(kinds == FrameKind.PROJECTION)
         views = views[views >= first]
-        at = min(max(row // self.preview_bin, 0), self._preview.shape[1] - 1)
-        self._preview.refresh()
-        lines = [self._preview[int(view), at] for view in views]
-        return np.array(lines, np.float32).reshape(len(lines), self._preview.shape[2]), views
+        packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost a whole frame
+        source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
+        at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
+        source.refresh()
+        factor = max(1, -(-source.shape[2] // MOST))
+        lines = [bin_mean(source[int(view), at : at + 1], (1, factor)) for view in views]
+        return (
+            np.concatenate([np.empty((0, -(-source.shape[2] // factor)), np.float32), *lines]),
+            views,
+            bin_of_source * factor,
+        )
 
     def trace(self, region: Region, first: int) -> list[float]:
         """Mean counts of a region, to whole blocks of the preview, in the frames from `first` on."""

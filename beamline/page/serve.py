@@ -53,31 +53,39 @@ def open_port(bind: str, port: int) -> socket.socket:
     raise ConfigError(f"The page finds no port at {bind} from {port} on ({reason}). Name another by --port.")
 
 
-def serve(
-    reader: Reader,
-    listening: socket.socket,
-    *,
-    control: bool,
-    say: Callable[[Addresses], None],
-    log: Callable[[str], None],
-) -> None:
-    """Serve until Ctrl-C.
+class PageServer:
+    """A server that is ready to run; its addresses are known before."""
+
+    def __init__(self, reader: Reader, listening: socket.socket, access: Access, log: Callable[[str], None]) -> None:
+        self._listening = listening
+        root = f"http://{access.hosts[0]}/?token={access.look}"
+        self.addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                page(reader, access, log), log_level="warning", access_log=False, lifespan="off",
+                timeout_graceful_shutdown=1, limit_concurrency=200, server_header=False,
+            )
+        )  # fmt: skip
+
+    def run(self) -> None:
+        """Serve until `stop`, or Ctrl-C in the main thread."""
+        with closing(self._listening):
+            asyncio.run(self._server.serve(sockets=[self._listening]))
+
+    def stop(self) -> None:
+        """End `run`, from any thread."""
+        self._server.should_exit = True
+
+
+def start(reader: Reader, listening: socket.socket, *, control: bool, log: Callable[[str], None]) -> PageServer:
+    """A server with new tokens.
 
     Args:
         control: verbs may be sent from the page, by who holds the address for acting.
-        say: is told the addresses when the server listens.
         log: takes a line for each verb.
     """
     access = Access(_names(listening), act=secrets.token_hex(16) if control else None)
-    root = f"http://{access.hosts[0]}/?token={access.look}"
-    addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
-    settings = uvicorn.Config(
-        page(reader, access, log), log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1,
-        limit_concurrency=200, server_header=False,
-    )  # fmt: skip
-    with closing(listening):
-        say(addresses)
-        asyncio.run(uvicorn.Server(settings).serve(sockets=[listening]))
+    return PageServer(reader, listening, access, log)
 
 
 def _names(listening: socket.socket) -> list[str]:

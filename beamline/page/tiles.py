@@ -38,14 +38,14 @@ class Region:
         return max(1, -(-max(self.shape) // most))
 
 
-def bin_mean(pixels: NDArray[Any], factor: int) -> NDArray[np.float32]:
-    """Means of factor x factor pixels; those left over at the last row and column are means of fewer."""
-    if factor == 1:
+def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float32]:
+    """Means of blocks of pixels, rows x columns; those left over at the last row and column are means of fewer."""
+    if factors == (1, 1):
         return pixels.astype(np.float32)
-    rows, cols = (np.arange(0, n, factor) for n in pixels.shape)
-    sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float32), rows, 0), cols, 1)
-    heights, widths = (np.minimum(factor, n - starts) for n, starts in zip(pixels.shape, (rows, cols), strict=True))
-    return np.asarray(sums / np.outer(heights, widths), np.float32)
+    starts = [np.arange(0, n, factor) for n, factor in zip(pixels.shape, factors, strict=True)]
+    sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float32), starts[0], 0), starts[1], 1)
+    counts = [np.minimum(factor, n - first) for n, factor, first in zip(pixels.shape, factors, starts, strict=True)]
+    return np.asarray(sums / np.outer(*counts), np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,7 +66,7 @@ class ShownVolume:
         with hdf5.readable(self.file.path):
             values = np.asarray(self._values[tuple(place)], np.float32)
         factor = Region(0, values.shape[0], 0, values.shape[1]).binning(MOST)
-        return bin_mean(values, factor), factor
+        return bin_mean(values, (factor, factor)), factor
 
     def _facts(self) -> dict[str, Any]:
         """Shape, mm of a voxel (null: unknown), unit of the values, views, method, and a grey window."""

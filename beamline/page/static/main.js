@@ -77,7 +77,7 @@ async function fetchFlags() {
 let strip = { row: null, lines: [], views: [], cols: 0, busy: false };
 const sinogram = new Picture($("sinogram"), {
   stretch: true,
-  point: (view, col, value) => { $("sinogram-value").textContent = view === null || strip.views[view] === undefined ? "" : `view ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * facts.preview_bin}: ${value.toPrecision(5)}`; },
+  point: (view, col, value) => { $("sinogram-value").textContent = view === null || strip.views[view] === undefined ? "" : `view ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * strip.bin}: ${value.toPrecision(5)}`; },
 });
 
 async function fetchSinogram() {
@@ -88,7 +88,7 @@ async function fetchSinogram() {
   const mine = strip;
   try {
     const first = strip.views.length ? strip.views[strip.views.length - 1] + 1 : 0, tile = await fetchTile(`/api/sinogram?row=${row}&first=${first}`);
-    mine.cols = tile.shape[1];
+    mine.cols = tile.shape[1]; mine.bin = tile.bin;
     for (let i = 0; i < tile.shape[0]; i++) mine.lines.push(Float32Array.from(tile.numbers.subarray(i * mine.cols, (i + 1) * mine.cols), (number) => tile.offset + tile.scale * number));
     mine.views.push(...tile.views);
     if (mine.views.length) {
