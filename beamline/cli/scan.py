@@ -16,6 +16,7 @@ import click
 from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
+from beamline.cli.watch import PageBeside
 from beamline.core.errors import AlarmError
 from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
@@ -45,6 +46,7 @@ _SAID_WITHIN = 0.2  # s
     "--dry-run", "dry", is_flag=True, help="Print the timeline, limits and free disk space. No device is touched."
 )
 @set_option
+@click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
 @click.option("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
 @json_option
 @click.option(
@@ -64,6 +66,7 @@ def scan(
     file: Path | None,
     dry: bool,
     overrides: tuple[str, ...],
+    page: bool,
     no_live: bool,
     as_json: bool,
     output: Path | None,
@@ -104,8 +107,8 @@ def scan(
             _dry_run(config, output, series, json_sinks)
             return
         stop = StopRequest()
-        with stop_signals(stop), Terminal(sys.stderr) as terminal:
-            sinks: list[Sink] = [terminal, *json_sinks]
+        with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
+            sinks: list[Sink] = [terminal, *json_sinks, *([beside] if page else [])]
             result = run_scan(
                 config, series or output, sinks, stop, **_commands(config, no_live, series),
                 ask=lambda request: terminal.ask(request, ask_operator),

@@ -83,6 +83,11 @@ class Terminal:
         with self._lock, _closed_terminal_ignored():
             self._take(event)
 
+    def say(self, text: str) -> None:
+        """Print a line that is no event."""
+        with self._lock, _closed_terminal_ignored():
+            self._console.print(printable(text))
+
     def _take(self, event: Event) -> None:
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))

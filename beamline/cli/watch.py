@@ -1,0 +1,114 @@
+"""`beamline watch`: a page in the browser that shows a run while it goes on, and afterwards."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Self
+
+import click
+
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event
+from beamline.core.files import EVENTS
+from beamline.core.process import ChildProcess
+
+LOOPBACK, PORT = "127.0.0.1", 8642
+LOOK, ACT = "watch", "control"
+"""What an address is for: the first word of its line."""
+
+
+@click.command()
+@click.argument("path", metavar="[RUN|FILE]", required=False, type=click.Path(path_type=Path, exists=True))
+@click.option("--control", is_flag=True, help="A second address, from which the scan can be paused and ended.")
+@click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="Or the next free one.")
+@click.option("--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all.")
+@click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
+@click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
+def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
+    """Show the run in the folder RUN, or a scan FILE, as a page in the browser: views, flags, volume, states, log.
+
+    Without RUN: the running scan of ./runs, else its newest run. The page only reads; it cannot slow the scan down or
+    harm it. It is served to this machine alone: from elsewhere use an ssh tunnel, or --bind (not encrypted).
+
+    Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
+    """
+    from beamline.config.models import Storage
+    from beamline.page.run_files import Reader, watched  # they load HDF5 and the server, which `scan -h` needs not
+    from beamline.page.serve import open_port, start
+
+    reader = Reader(watched(path or _newest(Path(Storage.model_fields["folder"].default))))
+    try:
+        server = start(reader, open_port(bind, port), control=control, log=_log)
+        click.echo(f"{LOOK:<8}{server.addresses.look}")
+        if server.addresses.act is not None:
+            click.echo(f"{ACT:<8}{server.addresses.act}")
+        sys.stdout.flush()
+        click.echo("Ctrl-C ends the page, not the scan.", err=True)
+        if browse:
+            webbrowser.open(server.addresses.act or server.addresses.look)
+        if tethered:
+            threading.Thread(target=_end_with_stdin, daemon=True).start()
+        with suppress(KeyboardInterrupt):
+            server.run()
+    finally:
+        reader.close()
+
+
+class PageBeside:
+    """A sink that serves the page of a run from a process of its own, as long as the context lasts.
+
+    Args:
+        tell: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell, self._held = tell, ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._held.close()
+
+    def __call__(self, event: Event) -> None:
+        if event.event != "run_started":
+            return
+        page = ["watch", str(event.data["folder"]), "--control", "--until-stdin-ends"]
+        command = [sys.executable, "-P", "-m", "beamline.cli.main", *page]
+        try:
+            nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
+            self._held.enter_context(ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True))
+        except OSError as error:
+            self._tell(f"There is no page ({error}). The scan is not affected.")
+
+    def _pass_on(self, line: str) -> None:
+        what, _, address = line.strip().partition(" ")
+        if what in (LOOK, ACT):
+            self._tell(f"Page, to {what}: {address.strip()}")
+
+
+def _end_with_stdin() -> None:
+    """End this process when whoever started it has died."""
+    sys.stdin.read()
+    os._exit(0)
+
+
+def _log(line: str) -> None:
+    click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
+
+
+def _newest(runs: Path) -> Path:
+    """The running scan of a folder, else its newest run."""
+    from beamline.scan.control import running
+
+    found = running(runs) or sorted(run for run in runs.glob("*/") if (run / EVENTS).is_file())
+    if not found:
+        raise ConfigError(f"There is no run in {runs}. Name the folder of a run, or a scan file.")
+    return found[-1]

@@ -1,0 +1,265 @@
+"""The page's server: files of the page, the feed of events, tiles, and verbs for who may act.
+
+A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
+host that is ours and carries the token for looking (a cookie). What acts is a POST of our own origin with the token for
+acting in a header. Nothing that comes from a client reaches the file system.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.resources import files
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from beamline.core.errors import BeamlineError, user_message
+from beamline.page.run_files import PICTURE, Reader
+from beamline.page.tiles import Region, pack
+from beamline.scan.control import Verb, tell
+
+COOKIE = "splatline_look"
+ACT_HEADER = "x-act-token"
+_PERIOD = 0.5  # s between two looks at the file for the feed
+_KEPT = 64  # tiles that the next client may want, too
+_HEADERS = {
+    b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
+    b"form-action 'none'; frame-ancestors 'none'",
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"no-referrer",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"cache-control": b"no-store",
+}
+
+
+@dataclass(frozen=True)
+class Access:
+    """Who may do what.
+
+    Attributes:
+        hosts: what a browser may call this server, each with the port, as in `localhost:8642`.
+        look: the token for looking.
+        act: the token for verbs to the scan; None: nobody may act from the page.
+    """
+
+    hosts: Sequence[str]
+    look: str = field(default_factory=partial(secrets.token_hex, 16))
+    act: str | None = None
+
+
+class Guard:
+    """Sets the headers of every answer, and refuses requests to another host, or without the token for looking."""
+
+    def __init__(self, app: ASGIApp, access: Access) -> None:
+        self._app, self._access = app, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_with_headers(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                given = [(name, value) for name, value in message["headers"] if name.lower() not in _HEADERS]
+                message = {**message, "headers": [*given, *_HEADERS.items()]}
+            await send(message)
+
+        request = Request(scope)
+        if request.headers.get("host") not in self._access.hosts:  # a name of somebody else's that leads here
+            await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
+        elif _same(request.cookies.get(COOKIE, ""), self._access.look):
+            await self._app(scope, receive, send_with_headers)
+        elif request.url.path == "/" and _same(request.query_params.get("token", ""), self._access.look):
+            answer: Response = RedirectResponse("/", 303)
+            answer.set_cookie(COOKIE, self._access.look, httponly=True, samesite="strict")
+            await answer(scope, receive, send_with_headers)
+        else:
+            text = "This page needs the token in the address that `beamline watch` printed.\n"
+            await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
+
+
+def _same(given: str, expected: str) -> bool:
+    return secrets.compare_digest(given.encode(), expected.encode())
+
+
+def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
+    """The application.
+
+    Args:
+        log: takes a line for each verb that was sent, with the client's address.
+    """
+    server = _Server(reader, access, log)
+    static = files("beamline.page") / "static"
+    routes = [
+        Route("/", lambda request: FileResponse(str(static / "index.html"))),
+        Mount("/static", StaticFiles(directory=str(static))),
+        Route("/api/facts", server.facts),
+        Route("/api/feed", server.feed),
+        Route("/api/columns", server.columns),
+        Route("/api/flags", server.flags),
+        Route("/api/frame/{frame:int}", server.frame),
+        Route("/api/sinogram", server.sinogram),
+        Route("/api/trace", server.trace),
+        Route("/api/volume", server.volume),
+        Route("/api/slice/{axis:int}/{index:int}", server.cut),
+        Route("/api/model.png", server.model),
+        Route("/api/verb/{verb}", server.verb, methods=["POST"]),
+    ]
+    return Starlette(
+        routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers={BeamlineError: _refused}
+    )
+
+
+def _refused(request: Request, error: Exception) -> Response:
+    return JSONResponse({"message": user_message(error)}, 404)
+
+
+class _Server:
+    def __init__(self, reader: Reader, access: Access, log: Callable[[str], None]) -> None:
+        self._reader, self._access, self._log = reader, access, log
+        self._tiles: dict[object, Response] = {}
+        self._state: dict[str, Any] = {}
+        self._looked = 0.0
+        self._looking = asyncio.Lock()
+
+    async def facts(self, request: Request) -> Response:
+        facts = await run_in_threadpool(self._reader.do, lambda recording: recording.facts())
+        return JSONResponse({**facts, "run": self._reader.what.name, "may_act": self._access.act is not None})
+
+    async def feed(self, request: Request) -> Response:
+        """Server-sent events: each event of the run with its number as id, and `state` whenever it changes."""
+        last = request.headers.get("last-event-id", "")
+        return StreamingResponse(self._feed(int(last) + 1 if last.isdecimal() else 0), media_type="text/event-stream")
+
+    async def _feed(self, first: int) -> AsyncIterator[str]:
+        said = ""
+        while True:
+            state = await self._now()
+            lines = self._reader.events.lines
+            for number in range(first, len(lines)):
+                yield f"id: {number}\nevent: run\ndata: {lines[number]}\n\n"
+            first = max(first, len(lines))
+            now = json.dumps(state)
+            if now != said:
+                said = now
+                yield f"event: state\ndata: {now}\n\n"
+            await asyncio.sleep(_PERIOD)
+
+    async def _now(self) -> dict[str, Any]:
+        """The state, looked at once for all clients."""
+        async with self._looking:
+            if time.monotonic() - self._looked > _PERIOD / 2:
+                self._state = await run_in_threadpool(self._reader.state)
+                self._looked = time.monotonic()
+        return self._state
+
+    async def columns(self, request: Request) -> Response:
+        first = _number(request, "first")
+        return JSONResponse(await run_in_threadpool(self._reader.do, lambda recording: recording.columns(first)))
+
+    async def flags(self, request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(self._reader.do, lambda recording: recording.flags()))
+
+    async def frame(self, request: Request) -> Response:
+        frame, corrected = int(request.path_params["frame"]), request.query_params.get("corrected") == "1"
+        region = _region(request)
+
+        def read() -> Response:
+            values, shown, factor = self._reader.do(lambda file: file.picture(frame, region, corrected=corrected))
+            edges = [shown.first_row, shown.last_row, shown.first_col, shown.last_col]
+            return _tile(values, {"frame": frame, "region": edges, "bin": factor})
+
+        return await self._kept(("frame", frame, region, corrected), read)
+
+    async def sinogram(self, request: Request) -> Response:
+        row, first = _number(request, "row"), _number(request, "first")
+
+        def read() -> Response:
+            lines, views, factor = self._reader.do(lambda file: file.sinogram(row, first))
+            return _tile(lines, {"views": views.tolist(), "bin": factor})
+
+        return await run_in_threadpool(read)
+
+    async def trace(self, request: Request) -> Response:
+        region, first = _region(request), _number(request, "first")
+        values = await run_in_threadpool(self._reader.do, lambda recording: recording.trace(region, first))
+        return JSONResponse({"first": first, "values": values})
+
+    async def volume(self, request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(self._reader.on_volume, lambda volume: volume.facts))
+
+    async def cut(self, request: Request) -> Response:
+        axis, index = int(request.path_params["axis"]), int(request.path_params["index"])
+
+        def read() -> Response:
+            values, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index))
+            return _tile(values, {"axis": axis, "index": index, "bin": factor})
+
+        return await run_in_threadpool(read)
+
+    async def model(self, request: Request) -> Response:
+        """The live picture: newest view, the volume seen from there, their difference in noise."""
+        folder = self._reader.what.folder
+        try:
+            picture = b"" if folder is None else await run_in_threadpool((folder / PICTURE).read_bytes)
+        except OSError:
+            picture = b""
+        return Response(picture, media_type="image/png") if picture else Response(status_code=404)
+
+    async def verb(self, request: Request) -> Response:
+        folder, act = self._reader.what.folder, self._access.act
+        name, client = request.path_params["verb"], request.client.host if request.client else "?"
+        ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
+        if act is None or request.headers.get("origin") != ours or not _same(request.headers.get(ACT_HEADER, ""), act):
+            self._log(f"refused: {name} from {client}, without the token for acting")
+            return JSONResponse({"message": "Only who holds the address for acting may do this."}, 403)
+        if folder is None or name not in [str(verb) for verb in Verb]:
+            return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
+        self._log(f"{name}, asked for from {client}")
+        state = await run_in_threadpool(tell, folder, Verb(name))
+        return JSONResponse({"state": str(state)})
+
+    async def _kept(self, key: object, read: Callable[[], Response]) -> Response:
+        """What another client asked for before, too: pixels of a frame never change."""
+        if key not in self._tiles:
+            answer = await run_in_threadpool(read)
+            while len(self._tiles) >= _KEPT:
+                del self._tiles[next(iter(self._tiles))]
+            self._tiles[key] = answer
+        return self._tiles[key]
+
+
+def _tile(values: Any, facts: dict[str, Any]) -> Response:
+    """A header in JSON, its length before it as u4, and the numbers of `tiles.Packed`."""
+    packed = pack(values)
+    head = json.dumps({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
+    padded = head.encode() + b" " * (-len(head.encode()) % 4)
+    body = len(padded).to_bytes(4, "little") + padded + packed.numbers.tobytes()
+    return Response(body, media_type="application/octet-stream")
+
+
+def _number(request: Request, name: str) -> int:
+    given = request.query_params.get(name, "0")
+    return int(given) if given.isdecimal() and len(given) < 10 else 0
+
+
+def _region(request: Request) -> Region:
+    """`region=first_row,last_row,first_col,last_col`; the whole picture where it is not that."""
+    edges = request.query_params.get("region", "").split(",")
+    if len(edges) == 4 and all(edge.isdecimal() and len(edge) < 10 for edge in edges):
+        return Region(*map(int, edges))
+    return Region(0, 10**9, 0, 10**9)

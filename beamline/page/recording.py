@@ -1,0 +1,190 @@
+"""Recording: what the page shows of a scan file, also of one that grows. All calls come from one thread (HDF5)."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.page.tiles import MOST, Region, bin_mean
+from beamline.storage import hdf5
+from beamline.storage.flag_legend import read_flags, read_legend
+from beamline.storage.writers import layout
+from drivers.frame import FrameKind
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a scan file is.
+
+    Attributes:
+        frames: that are whole in it.
+        status: `running`, `complete`, `stopped` or `failed`.
+    """
+
+    frames: int
+    status: str
+
+
+class Recording:
+    """A scan file of ours, opened for reading while it may still be written.
+
+    Raises:
+        NotReadyError: the file is just being made.
+        DataError: no scan of ours.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = hdf5.open_hdf5(path, follow=True)
+        try:
+            with hdf5.readable(path):
+                if layout.COMMITTED not in self._file:
+                    raise DataError(f"{path} is no scan of this program: `beamline ingest` makes one of it.")
+                self._data: h5py.Dataset = self._file[layout.DATA]
+                self._preview: h5py.Dataset = self._file[layout.PREVIEW]
+                self.shape = (int(self._data.shape[1]), int(self._data.shape[2]))
+                self.preview_bin = int(self._preview.attrs["bin"])
+        except BaseException:
+            self.close()
+            raise
+        self._dark_and_flat: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+
+    def close(self) -> None:
+        with suppress(RuntimeError, OSError, ValueError):
+            self._file.close()
+
+    def progress(self) -> Progress:
+        committed = self._file[layout.COMMITTED]
+        committed.refresh()
+        finished = self._file[layout.FINISHED]
+        finished.refresh()
+        status = self._file[layout.STATUS]
+        status.refresh()
+        return Progress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
+
+    def facts(self) -> dict[str, Any]:
+        """What does not change: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
+        pixel = hdf5.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", hdf5.LENGTH_UNITS)
+        axis = hdf5.dataset(self._file, layout.AXIS_COL)
+        return {
+            "sample": hdf5.text(self._file["/entry/sample/name"][()]),
+            "title": hdf5.text(self._file["/entry/title"][()]),
+            "shape": self.shape,
+            "preview_bin": self.preview_bin,
+            "pixel_mm": pixel,
+            "axis_col": None if axis is None else float(axis[()]),
+            "checks": [{"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in self._legend()],
+        }
+
+    def columns(self, first: int) -> dict[str, Any]:
+        """Kind, angle (deg), time (s) and mean counts of the frames from `first` on."""
+        frames = self.progress().frames
+        names = {"kind": layout.KIND, "angle": layout.ANGLE, "time": layout.TIME, "mean": "/entry/digest/mean"}
+        return {"first": first, **{name: self._column(path, first, frames) for name, path in names.items()}}
+
+    def flags(self) -> list[dict[str, Any]]:
+        """Each flag of each frame: frame, check, whether it is an alarm, score, region [row, row, col, col] or null."""
+        found = read_flags(self._file, self.progress().frames)
+        listed = []
+        for frame in np.flatnonzero(found.flagged):
+            bits = int(found.bits[frame])
+            for i, check in enumerate(found.legend):
+                if not bits >> check.bit & 1:
+                    continue
+                score = float(found.scores[frame, i]) if found.scores is not None else np.nan
+                region = [int(edge) for edge in found.regions[frame, i]] if found.regions is not None else [-1]
+                listed.append(
+                    {
+                        "frame": int(frame),
+                        "check": check.name,
+                        "alarm": bool(bits >> check.alarm_bit & 1),
+                        "score": score if np.isfinite(score) else None,
+                        "region": None if region[0] < 0 else region,
+                    }
+                )
+        return listed
+
+    def picture(self, frame: int, region: Region, *, corrected: bool) -> tuple[NDArray[np.float32], Region, int]:
+        """Part of a frame, binned to a tile: counts, or the share of the light that the sample lets through.
+
+        Returns:
+            Values, the region that they show, and their binning. Where references are missing `corrected` gives counts.
+
+        Raises:
+            DataError: the file has no such frame, or does not give it.
+        """
+        frames = self.progress().frames
+        if not 0 <= frame < frames:
+            raise DataError(f"Frame {frame} is not in the file, which holds {frames}.")
+        region = region.inside(self.shape)
+        rows, cols = slice(region.first_row, region.last_row), slice(region.first_col, region.last_col)
+        factor = region.binning()
+        self._data.refresh()
+        pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
+        if corrected and (found := self._references(frames)) is not None:
+            dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in found)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                pixels = (pixels - dark) / (flat - dark)
+        return pixels, region, factor
+
+    def sinogram(self, row: int, first: int) -> tuple[NDArray[np.float32], NDArray[np.int64], int]:
+        """A detector row in the projections from frame `first` on; of a compressed file, means of the preview's blocks.
+
+        Returns:
+            [view, col / bin] of at most 1024 columns, the frames, and the binning.
+        """
+        kinds = np.array(self._column(layout.KIND, 0, self.progress().frames), int)
+        views = np.flatnonzero(kinds == FrameKind.PROJECTION)
+        views = views[views >= first]
+        packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost a whole frame
+        source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
+        at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
+        source.refresh()
+        factor = max(1, -(-source.shape[2] // MOST))
+        lines = [bin_mean(source[int(view), at : at + 1], (1, factor)) for view in views]
+        return (
+            np.concatenate([np.empty((0, -(-source.shape[2] // factor)), np.float32), *lines]),
+            views,
+            bin_of_source * factor,
+        )
+
+    def trace(self, region: Region, first: int) -> list[float]:
+        """Mean counts of a region, to whole blocks of the preview, in the frames from `first` on."""
+        block = Region(*(edge // self.preview_bin for edge in (region.first_row, region.last_row,
+                                                             region.first_col, region.last_col)))  # fmt: skip
+        block = block.inside((self._preview.shape[1], self._preview.shape[2]))
+        rows, cols = slice(block.first_row, block.last_row), slice(block.first_col, block.last_col)
+        self._preview.refresh()
+        return [float(self._preview[frame, rows, cols].mean()) for frame in range(first, self.progress().frames)]
+
+    def _legend(self) -> Any:
+        return read_legend(self._file)
+
+    def _column(self, path: str, first: int, frames: int) -> list[Any]:
+        column = self._file[path]
+        column.refresh()
+        values = column[first:frames]
+        return [None if value != value else value.item() for value in values]  # NaN has no place in JSON
+
+    def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Means of the first darks and flats, at most eight each; None until there are some of both."""
+        if self._dark_and_flat is None:
+            kinds = np.array(self._column(layout.KIND, 0, frames), int)
+            darks, flats = (np.flatnonzero(kinds == kind)[:8] for kind in (FrameKind.DARK, FrameKind.FLAT))
+            if darks.size == 0 or flats.size == 0:
+                return None
+            self._dark_and_flat = self._mean(darks), self._mean(flats)
+        return self._dark_and_flat
+
+    def _mean(self, rows: NDArray[np.intp]) -> NDArray[np.float32]:
+        total = np.zeros(self.shape, np.float32)
+        for row in rows:
+            total += self._data[int(row)]
+        return total / np.float32(rows.size)

@@ -1,0 +1,155 @@
+"""What is watched: a run folder, or a scan file alone; its events, and one thread that reads HDF5."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from beamline.core.errors import DataError
+from beamline.core.files import EVENTS, parts_of
+from beamline.page.recording import Recording
+from beamline.page.volume import ShownVolume, newest
+from beamline.scan.run_folder import RECON, SCAN
+from beamline.storage.hdf5 import NotReadyError
+
+SNAPSHOT, PICTURE = "recon.snapshot.h5", "recon.live.png"
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class Watched:
+    """Paths of what is watched.
+
+    Attributes:
+        scan: the scan file.
+        folder: of the run (of its newest part); None: a scan file alone.
+    """
+
+    scan: Path
+    folder: Path | None
+
+    @property
+    def name(self) -> str:
+        return self.scan.name if self.folder is None else self.folder.resolve().name
+
+    @property
+    def volumes(self) -> tuple[Path, ...]:
+        """Where a volume of it may be, the best first."""
+        return () if self.folder is None else (self.folder / RECON, self.folder / SNAPSHOT)
+
+
+def watched(path: Path) -> Watched:
+    """By a run folder, or a scan file. DataError where there is neither."""
+    if path.is_dir():
+        folder = parts_of(path)[-1]
+        if not (folder / EVENTS).is_file():
+            raise DataError(f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file.")
+        return Watched(folder / SCAN, folder)
+    if not path.is_file():
+        raise DataError(f"{path} is not there.")
+    return Watched(path, path.parent if path.name == SCAN and (path.parent / EVENTS).is_file() else None)
+
+
+class EventLog:
+    """The events of a run as lines of JSON, numbered from 0 in the order of the file; those of a line half written
+    come with the next look."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._path = None if folder is None else folder / EVENTS
+        self._at = 0
+        self.lines: list[str] = []
+
+    def refresh(self) -> None:
+        """Take up what was added."""
+        if self._path is None or not self._path.is_file():
+            return
+        with self._path.open("rb") as file:
+            file.seek(self._at)
+            added = file.read()
+        whole = added[: added.rfind(b"\n") + 1]
+        self._at += len(whole)
+        for line in whole.decode("utf-8", "replace").splitlines():
+            if _is_event(line):
+                self.lines.append(line)
+
+
+def _is_event(line: str) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False
+
+
+class Reader:
+    """Opens scan and volume when they are there, and does all reading of HDF5 in one thread."""
+
+    def __init__(self, what: Watched) -> None:
+        self.what, self.events = what, EventLog(what.folder)
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reader")
+        self._recording: Recording | None = None
+        self._volume: ShownVolume | None = None
+        self._seen = 0, time.time()
+        self._lock = threading.Lock()
+
+    def close(self) -> None:
+        def close_files() -> None:
+            for file in (self._recording, self._volume):
+                if file is not None:
+                    file.close()
+
+        self._thread.submit(close_files)
+        self._thread.shutdown()
+
+    def do(self, read: Callable[[Recording], _Result]) -> _Result:
+        """The result of `read`, called in the reading thread. NotReadyError, DataError: the file gives nothing."""
+        return self._thread.submit(lambda: read(self._open())).result()
+
+    def on_volume(self, read: Callable[[ShownVolume], _Result]) -> _Result:
+        """Likewise of the newest volume. DataError where there is none."""
+        return self._thread.submit(lambda: read(self._newest_volume())).result()
+
+    def state(self) -> dict[str, Any]:
+        """Frames in the file, its status, seconds since the last frame, free bytes, name of the newest volume."""
+        self.events.refresh()
+        try:
+            progress = self.do(Recording.progress)
+            frames, status = progress.frames, progress.status
+        except NotReadyError:
+            frames, status = 0, "preparing"
+        now = time.time()
+        with self._lock:
+            if frames != self._seen[0]:
+                self._seen = frames, now
+            age = now - self._seen[1]
+        volume = newest(self.what.volumes)
+        return {
+            "frames": frames,
+            "status": status,
+            "age_s": round(age, 1),
+            "free": shutil.disk_usage(self.what.scan.parent).free,
+            "volume": None if volume is None else f"{volume.path.name} {volume.changed_ns}",
+            "now": now,
+        }
+
+    def _open(self) -> Recording:
+        if self._recording is None:
+            self._recording = Recording(self.what.scan)
+        return self._recording
+
+    def _newest_volume(self) -> ShownVolume:
+        file = newest(self.what.volumes)
+        if file is None:
+            raise DataError("There is no volume yet.")
+        if self._volume is None or self._volume.file != file:
+            before, self._volume = self._volume, None
+            if before is not None:
+                before.close()
+            self._volume = ShownVolume(file)
+        return self._volume

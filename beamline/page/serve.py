@@ -1,0 +1,101 @@
+"""Serving the page: on this machine alone unless told otherwise, with new tokens at each start."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import secrets
+import socket
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+
+import psutil
+import uvicorn
+
+from beamline.core.errors import ConfigError
+from beamline.page.app import Access, page
+from beamline.page.run_files import Reader
+
+
+@dataclass(frozen=True)
+class Addresses:
+    """What to open in a browser: to look, and to act as well (None: nobody may)."""
+
+    look: str
+    act: str | None
+
+
+def open_port(bind: str, port: int) -> socket.socket:
+    """A listening socket at a port, or at the next free one of the ten after it.
+
+    Raises:
+        ConfigError: not an address of this machine, or no port is free.
+    """
+    try:
+        family = socket.AF_INET6 if ipaddress.ip_address(bind).version == 6 else socket.AF_INET
+    except ValueError as error:
+        raise ConfigError(f"--bind is {bind!r}; expected an IP address of this machine, such as 127.0.0.1.") from error
+    reason = ""
+    for candidate in range(port, min(port + 10, 65536)):
+        listening = socket.socket(family, socket.SOCK_STREAM)
+        if sys.platform != "win32":
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((bind, candidate))
+            listening.listen()
+        except OSError as error:
+            listening.close()
+            reason = error.strerror or str(error)
+        else:
+            return listening
+    raise ConfigError(f"The page finds no port at {bind} from {port} on ({reason}). Name another by --port.")
+
+
+class PageServer:
+    """A server that is ready to run; its addresses are known before."""
+
+    def __init__(self, reader: Reader, listening: socket.socket, access: Access, log: Callable[[str], None]) -> None:
+        self._listening = listening
+        root = f"http://{access.hosts[0]}/?token={access.look}"
+        self.addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                page(reader, access, log), log_level="warning", access_log=False, lifespan="off",
+                timeout_graceful_shutdown=1, limit_concurrency=200, server_header=False,
+            )
+        )  # fmt: skip
+
+    def run(self) -> None:
+        """Serve until `stop`, or Ctrl-C in the main thread."""
+        with closing(self._listening):
+            asyncio.run(self._server.serve(sockets=[self._listening]))
+
+    def stop(self) -> None:
+        """End `run`, from any thread."""
+        self._server.should_exit = True
+
+
+def start(reader: Reader, listening: socket.socket, *, control: bool, log: Callable[[str], None]) -> PageServer:
+    """A server with new tokens.
+
+    Args:
+        control: verbs may be sent from the page, by who holds the address for acting.
+        log: takes a line for each verb.
+    """
+    access = Access(_names(listening), act=secrets.token_hex(16) if control else None)
+    return PageServer(reader, listening, access, log)
+
+
+def _names(listening: socket.socket) -> list[str]:
+    """What a browser may call the server at this socket, with the port; the first is the one to print."""
+    host, port = listening.getsockname()[:2]
+    address = ipaddress.ip_address(host)
+    if address.is_unspecified:
+        found = {entry.address for entries in psutil.net_if_addrs().values() for entry in entries}
+        numbers = sorted(each for each in found if each.count(".") == 3)
+        names = [socket.gethostname(), "localhost", *numbers]
+    else:
+        names = [host, "localhost"] if address.is_loopback else [host]
+    return [f"[{name}]:{port}" if ":" in name else f"{name}:{port}" for name in names]

@@ -1,0 +1,295 @@
+// The page of a run: it follows the feed, and fetches pictures as they are needed.
+import { Picture, fetchTile, usualWindow, windowSliders } from "./picture.js";
+import { Timeline } from "./flags.js";
+
+const $ = (id) => document.getElementById(id);
+const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "invalid" };
+const COLOURS = { done: "good", complete: "good", paused: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad" };
+const columns = { kind: [], angle: [], time: [], mean: [] };
+const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] } };
+let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 };
+
+// --- frame -------------------------------------------------------------------------------------------------------
+const frameWindows = {};  // of a kind of frame, so that flats and views each keep theirs
+let frameBusy = false, frameWanted = null;
+const windowKey = () => `${columns.kind[current]} ${$("corrected").checked}`;
+const setFrameWindow = windowSliders($("frame-window"), (window) => { frameWindows[windowKey()] = window; frame.setWindow(window); });
+const frame = new Picture($("frame"), {
+  point: (row, col, value, bin) => { $("frame-value").textContent = row === null ? "" : `row ${row}, column ${col}${lengths(row, col)}: ${value.toPrecision(5)}${bin > 1 ? ` (mean of ${bin} x ${bin} pixels)` : ""}`; },
+  region: (chosen) => { region = chosen; curves.trace = { x: [], y: [] }; $("curve").value = "trace"; fetchTrace(); },
+  moved: debounce(() => showFrame(current), 150),
+  draw: (context, place) => { for (const flag of flags) if (flag.frame === current && flag.region) frame.box(context, place, flag.region, flag.alarm ? "#ff7b72" : "#d29922", flag.check); },
+});
+
+function lengths(row, col) {
+  if (!facts.pixel_mm) return "";
+  return ` (${(row * facts.pixel_mm).toFixed(3)} mm, ${(col * facts.pixel_mm).toFixed(3)} mm)`;
+}
+
+async function showFrame(index) {
+  frameWanted = index;
+  if (frameBusy || !frames) return;
+  frameBusy = true;
+  while (frameWanted !== null) {
+    const wanted = Math.min(frameWanted, frames - 1);
+    frameWanted = null;
+    frame.extent = facts.shape;
+    const part = frame.zoom > 1 ? `&region=${frame.seen().join(",")}` : "";
+    try {
+      const tile = await fetchTile(`/api/frame/${wanted}?corrected=${$("corrected").checked ? 1 : 0}${part}`);
+      current = wanted;
+      const chosen = frameWindows[windowKey()] ??= usualWindow(tile), spread = chosen[1] - chosen[0];
+      if (frame.window !== chosen) { frame.window = chosen; setFrameWindow([chosen[0] - spread / 2, chosen[1] + spread / 2], chosen); }
+      frame.show(tile, facts.shape, tile.region);
+      nameFrame();
+    } catch (error) { $("frame-name").textContent = `${wanted}: ${error.message}`; }
+  }
+  frameBusy = false;
+}
+
+function nameFrame() {
+  const angle = columns.angle[current], time = columns.time[current], kind = KINDS[columns.kind[current]] || "";
+  $("frame-name").textContent = `${current}, ${kind}${angle === null || angle === undefined ? "" : `, ${angle.toFixed(3)}°`}${time ? `, ${new Date(1000 * time).toLocaleTimeString()}` : ""}`;
+  $("frame-slider").value = current;
+  $("frame-flags").replaceChildren(...flags.filter((flag) => flag.frame === current).map((flag) => {
+    const check = facts.checks.find((each) => each.name === flag.check) || { meaning: "", unit: "" };
+    return element("li", `${flag.check}${flag.alarm ? " (alarm)" : ""}: ${check.meaning}${flag.score === null ? "" : `; ${flag.score.toPrecision(3)} ${check.unit}`}`, flag.alarm ? "alarm" : "flag");
+  }));
+  timeline.show(flags, planned || frames, current);
+}
+
+$("frame-slider").addEventListener("input", (event) => { $("newest").checked = false; showFrame(Number(event.target.value)); });
+$("newest").addEventListener("change", () => { if ($("newest").checked) showFrame(frames - 1); });
+$("corrected").addEventListener("change", () => showFrame(current));
+
+// --- flags -------------------------------------------------------------------------------------------------------
+const timeline = new Timeline($("flags"), { go: (index) => { $("newest").checked = false; showFrame(index); } });
+
+async function fetchFlags() {
+  flags = await (await fetch("/api/flags")).json();
+  const marked = new Set(flags.map((flag) => flag.frame)).size;
+  $("flag-count").textContent = `${marked} of ${frames} frames`;
+  nameFrame();
+  frame.redraw();
+}
+
+// --- sinogram ----------------------------------------------------------------------------------------------------
+let strip = { row: null, lines: [], views: [], cols: 0, busy: false };
+const sinogram = new Picture($("sinogram"), {
+  stretch: true,
+  point: (view, col, value) => { $("sinogram-value").textContent = view === null || strip.views[view] === undefined ? "" : `view ${view} (frame ${strip.views[view]}, ${(columns.angle[strip.views[view]] ?? NaN).toFixed(2)}°), column ${col * strip.bin}: ${value.toPrecision(5)}`; },
+});
+
+async function fetchSinogram() {
+  if (!facts || strip.busy) return;
+  const row = Number($("sinogram-row").value);
+  if (strip.row !== row) strip = { row, lines: [], views: [], cols: 0, busy: false };
+  strip.busy = true;
+  const mine = strip;
+  try {
+    const first = strip.views.length ? strip.views[strip.views.length - 1] + 1 : 0, tile = await fetchTile(`/api/sinogram?row=${row}&first=${first}`);
+    mine.cols = tile.shape[1]; mine.bin = tile.bin;
+    for (let i = 0; i < tile.shape[0]; i++) mine.lines.push(Float32Array.from(tile.numbers.subarray(i * mine.cols, (i + 1) * mine.cols), (number) => tile.offset + tile.scale * number));
+    mine.views.push(...tile.views);
+    if (mine.views.length) {
+      const packed = packLines(mine.lines, mine.cols);
+      sinogram.window = usualWindow(packed);
+      sinogram.show(packed, [mine.lines.length, mine.cols]);
+    }
+    $("sinogram-name").textContent = `of row ${row}, ${mine.views.length} views`;
+  } catch (error) { $("sinogram-name").textContent = error.message; }
+  mine.busy = false;
+}
+
+function packLines(lines, cols) {
+  let low = Infinity, high = -Infinity;
+  for (const line of lines) for (const value of line) { low = Math.min(low, value); high = Math.max(high, value); }
+  const scale = (high - low) / 65534 || 1, numbers = new Uint16Array(lines.length * cols);
+  lines.forEach((line, i) => line.forEach((value, k) => { numbers[i * cols + k] = Math.round((value - low) / scale); }));
+  return { numbers, shape: [lines.length, cols], offset: low, scale, bin: 1 };
+}
+$("sinogram-row").addEventListener("input", debounce(fetchSinogram, 100));
+
+// --- volume ------------------------------------------------------------------------------------------------------
+const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]];
+const setVolumeWindow = windowSliders($("volume-window"), (window) => slices.forEach((slice) => slice.setWindow(window)));
+const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
+  flip: axis > 0,  // z upwards
+  point: (row, col, value) => { $("volume-value").textContent = row === null ? "" : `${place(axis, row, col)}: ${value.toPrecision(5)} ${volume.unit}`; },
+}));
+
+function place(axis, row, col) {
+  const index = [0, 0, 0];
+  index[axis] = Number($(`at${axis}`).value); index[PLANES[axis][0]] = row; index[PLANES[axis][1]] = col;
+  return index.map((value, i) => `${NAMES[i]} ${position(i, value)}`).join(", ");
+}
+
+const position = (axis, index) => volume.voxel ? `${((index - (volume.shape[axis] - 1) / 2) * volume.voxel).toFixed(3)} ${volume.length_unit}` : `${index}`;
+
+async function fetchVolume() {
+  const answer = await fetch("/api/volume");
+  if (!answer.ok) return;
+  const first = volume === null, before = volume;
+  volume = await answer.json();
+  $("volume-name").textContent = `${volume.name}: ${volume.method}${volume.views ? `, views 1 to ${volume.views}` : ""}, ${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}`;
+  const changed = !before || before.shape.join() !== volume.shape.join();
+  for (let axis = 0; axis < 3; axis++) {
+    $(`at${axis}`).max = volume.shape[axis] - 1;
+    if (changed) $(`at${axis}`).value = Math.floor(volume.shape[axis] / 2);
+  }
+  if (first) { const [low, high] = volume.window; setVolumeWindow([low - (high - low), high + (high - low)], volume.window); slices.forEach((slice) => { slice.window = volume.window; }); }
+  await Promise.all([0, 1, 2].map(showSlice));
+  fetchModel();
+}
+
+async function showSlice(axis) {
+  if (!volume) return;
+  const index = Number($(`at${axis}`).value);
+  $(`where${axis}`).textContent = position(axis, index);
+  try {
+    const tile = await fetchTile(`/api/slice/${axis}/${index}`);
+    if (Number($(`at${axis}`).value) === index) slices[axis].show(tile, [volume.shape[PLANES[axis][0]], volume.shape[PLANES[axis][1]]]);
+  } catch (error) { $("volume-value").textContent = error.message; }
+}
+for (let axis = 0; axis < 3; axis++) $(`at${axis}`).addEventListener("input", debounce(() => showSlice(axis), 40));
+
+async function fetchModel() {
+  const answer = await fetch("/api/model.png");
+  $("model").hidden = !answer.ok;
+  if (!answer.ok) return;
+  const before = $("model-picture").src;
+  $("model-picture").src = URL.createObjectURL(await answer.blob());
+  if (before) URL.revokeObjectURL(before);
+}
+
+// --- curves ------------------------------------------------------------------------------------------------------
+const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts of the region"], rate: ["frame", "frames/s"], beam: ["reading, s", "beam"], residual: ["views", "residual"] };
+
+async function fetchTrace() {
+  if (!region) return;
+  const line = curves.trace, chosen = region;
+  const found = await (await fetch(`/api/trace?region=${chosen.join(",")}&first=${line.y.length}`)).json();
+  if (chosen !== region || found.first !== line.y.length) return;
+  found.values.forEach((value) => { line.x.push(line.y.length); line.y.push(value); });
+  drawCurve();
+}
+
+function drawCurve() {
+  const kind = $("curve").value, data = kind === "light" ? { x: columns.mean.map((_, i) => i), y: columns.mean } : curves[kind];
+  const style = getComputedStyle(document.body), colour = style.getPropertyValue("--faint"), line = style.getPropertyValue("--line");
+  const axis = (label) => ({ label, stroke: colour, grid: { stroke: line, width: 1 }, ticks: { stroke: line } });
+  const unit = kind === "beam" && curves.beam.unit ? `beam, ${curves.beam.unit}` : LABELS[kind][1];
+  if (!plot || plot.kind !== kind) {
+    if (plot) plot.destroy();
+    plot = new uPlot({ width: $("plot").clientWidth, height: 260, scales: { x: { time: false } }, axes: [axis(LABELS[kind][0]), axis(unit)], series: [{ label: LABELS[kind][0] }, { label: unit, stroke: style.getPropertyValue("--accent"), width: 1.5, points: { show: data.x.length < 60 } }] }, [data.x, data.y], $("plot"));
+    plot.kind = kind;
+  } else plot.setData([data.x, data.y]);
+}
+$("curve").addEventListener("change", drawCurve);
+new ResizeObserver(() => { if (plot) plot.setSize({ width: $("plot").clientWidth, height: 260 }); }).observe($("plot"));
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { if (plot) { plot.destroy(); plot = null; drawCurve(); } });
+
+// --- events ------------------------------------------------------------------------------------------------------
+function onRun(event) {
+  const data = JSON.parse(event.data), live = data.source === "recon";
+  switch (data.event) {
+    case "run_started": planned = data.n_frames; log(data, `Scan of ${data.sample}: ${data.n_frames} frames planned`); break;
+    case "state": if (!live) { state = data.state; $("message").textContent = data.message; } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
+    case "frame": rate = data; ledger.exposed = Math.max(ledger.exposed, data.n); curves.rate.x.push(data.n); curves.rate.y.push(data.frames_per_s); break;
+    case "flag": log(data, `${data.check} (${data.level}), frame ${data.frame}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning"); break;
+    case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;
+    case "progress": if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
+    case "enough": log(data, `${data.n_views} of ${data.planned} views are enough: the others would add ${data.mean.toFixed(2)} dB (${data.low.toFixed(2)} to ${data.high.toFixed(2)})`); break;
+    case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
+    case "warning": log(data, data.message, "warning"); break;
+    case "failed": log(data, data.message, "failed"); break;
+    case "scan_done": rate = null; log(data, `Scan ${data.status}: ${data.n_frames} frames in ${data.seconds.toFixed(0)} s, ${data.missing.length} missing`); break;
+    case "recon_done": log(data, `Volume ${data.shape.join(" x ")} of ${data.n_views} views`); break;
+  }
+}
+
+/** The newest value for a number of views, which several steps share. */
+function point(line, x, y) {
+  if (line.x.length && line.x[line.x.length - 1] === x) line.y[line.y.length - 1] = y;
+  else { line.x.push(x); line.y.push(y); }
+}
+
+function log(data, text, kind = "") {
+  const item = element("li", "", kind), time = element("time", new Date(1000 * data.time).toLocaleTimeString());
+  item.append(time, element("span", text));
+  $("log").prepend(item);
+  while ($("log").children.length > 300) $("log").lastChild.remove();
+}
+
+let fetched = 0, flagsFetched = 0;
+async function onState(event) {
+  const now = JSON.parse(event.data);
+  lastSeen = Date.now();
+  if (!facts) { if (!now.frames) { header(now); return; } await begin(); }
+  const grew = now.frames !== frames, ended = now.status !== "running" && now.status !== "preparing";
+  frames = now.frames;
+  header(now);
+  if (grew) {
+    $("frame-slider").max = Math.max(0, frames - 1);
+    const added = await (await fetch(`/api/columns?first=${columns.kind.length}`)).json();
+    if (added.first === columns.kind.length) for (const name of Object.keys(columns)) columns[name].push(...added[name]);
+    if ($("newest").checked) showFrame(frames - 1); else nameFrame();
+    fetchSinogram();
+    if ($("curve").value === "trace") fetchTrace();
+  }
+  if (grew || (ended && flagsFetched !== frames)) { if (Date.now() - fetched > 1500 || ended) { fetched = Date.now(); flagsFetched = frames; fetchFlags(); } }
+  if (grew || ended) drawCurve();
+  if (now.volume !== volumeKey) { volumeKey = now.volume; if (now.volume) fetchVolume(); }
+}
+
+function header(now) {
+  const word = state || now.status, chip = $("state");
+  chip.textContent = word; chip.className = `chip ${COLOURS[word] || ""}`;
+  $("done").value = planned ? now.frames / planned : now.status === "running" ? 0 : 1;
+  const shown = { frames: planned ? `${now.frames} stored, ${ledger.exposed || now.frames} exposed, ${planned} planned` : `${now.frames}` };
+  if (rate && now.status === "running") {
+    shown.rate = `${rate.frames_per_s.toFixed(1)} frames/s, ${rate.mb_per_s.toFixed(1)} MB/s`;
+    if (rate.eta_s !== null) shown.left = duration(rate.eta_s);
+  }
+  if (now.status === "running") shown["last frame"] = `${now.age_s.toFixed(0)} s ago`;
+  if (curves.beam.y.length) shown.beam = `${curves.beam.y[curves.beam.y.length - 1].toPrecision(4)} ${curves.beam.unit}`;
+  shown["free disk"] = `${(now.free / 1e9).toFixed(1)} GB`;
+  $("figures").replaceChildren(...Object.entries(shown).map(([name, value]) => { const box = element("div", ""); box.append(element("dt", name), element("dd", value)); return box; }));
+  const over = now.status !== "running" && now.status !== "preparing";
+  for (const button of document.querySelectorAll("#verbs button")) button.disabled = over || (button.dataset.verb === "resume" && word !== "paused") || (button.dataset.verb === "pause" && word === "paused");
+}
+
+async function begin() {
+  facts = await (await fetch("/api/facts")).json();
+  document.title = `${facts.sample} - splatline`;
+  $("run").textContent = facts.run;
+  $("sinogram-row").max = facts.shape[0] - 1; $("sinogram-row").value = Math.floor(facts.shape[0] / 2);
+  $("verbs").hidden = !(facts.may_act && act);
+}
+
+// --- verbs -------------------------------------------------------------------------------------------------------
+if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", "/"); }
+const act = sessionStorage.getItem("act");
+for (const button of document.querySelectorAll("#verbs button")) button.addEventListener("click", async () => {
+  const verb = button.dataset.verb;
+  if (verb === "abort" && !confirm("Abort the scan? The stage stops at once, and no further frame is taken.")) return;
+  $("said").textContent = `${verb}: sent`;
+  const answer = await fetch(`/api/verb/${verb}`, { method: "POST", headers: { "X-Act-Token": act } });
+  const data = await answer.json().catch(() => ({}));
+  $("said").textContent = answer.ok ? `${verb}: the scan is ${data.state}` : data.message || `${verb}: refused (${answer.status})`;
+});
+
+// --- feed --------------------------------------------------------------------------------------------------------
+const feed = new EventSource("/api/feed");
+feed.addEventListener("run", onRun);
+let handling = Promise.resolve();
+feed.addEventListener("state", (event) => { handling = handling.then(() => onState(event)).catch((error) => { $("said").textContent = error.message; }); });
+setInterval(() => {
+  const silent = (Date.now() - lastSeen) / 1000, lost = feed.readyState !== EventSource.OPEN;
+  document.body.classList.toggle("lost", lost && silent > 3);
+  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; }
+}, 1000);
+
+function debounce(call, ms) { let timer = 0; return (...values) => { clearTimeout(timer); timer = setTimeout(() => call(...values), ms); }; }
+function element(name, text, kind = "") { const made = document.createElement(name); made.textContent = text; if (kind) made.className = kind; return made; }
+function duration(seconds) { return seconds < 90 ? `${seconds.toFixed(0)} s` : seconds < 5400 ? `${(seconds / 60).toFixed(0)} min` : `${(seconds / 3600).toFixed(1)} h`; }

@@ -1,0 +1,89 @@
+"""What the page reads of a scan file is what stands in it, also while it grows."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS
+from beamline.monitor.digest import digest
+from beamline.page.recording import Recording
+from beamline.page.tiles import Region
+from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.clock import SystemClock
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+SCAN = TwoCylinders()
+WHOLE = Region(0, 4, 0, 40)
+
+
+def test_a_view_over_the_flats_is_the_transmission(tmp_path: Path) -> None:
+    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+    values, region, factor = recording.picture(10, WHOLE, corrected=True)
+    recording.close()
+    assert (region, factor) == (WHOLE, 1)
+    np.testing.assert_allclose(values, np.exp(-SCAN.line_integrals()[6]), atol=2e-4)
+
+
+def test_without_correction_a_view_is_counts(tmp_path: Path) -> None:
+    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+    values, *_ = recording.picture(10, Region(1, 3, 5, 20), corrected=False)
+    recording.close()
+    np.testing.assert_array_equal(values, SCAN.counts()[6, 1:3, 5:20])
+
+
+def test_the_sinogram_is_a_row_of_the_views_alone(tmp_path: Path) -> None:
+    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+    lines, views, factor = recording.sinogram(2, first=14)
+    recording.close()
+    assert (factor, views.tolist()) == (1, list(range(14, 4 + SCAN.angles.size)))
+    np.testing.assert_array_equal(lines, SCAN.counts()[10:, 2])
+
+
+def test_a_region_s_trace_is_its_mean_in_each_frame(tmp_path: Path) -> None:
+    frames = frames_of(SCAN)
+    recording = Recording(write_flagged(tmp_path / "scan.h5", frames, {}))
+    trace = recording.trace(Region(0, 4, 8, 16), first=3)
+    recording.close()
+    np.testing.assert_allclose(trace, [frame.counts[:, 8:16].mean() for frame in frames[3:]], rtol=1e-5)
+
+
+def test_flags_have_score_level_and_region(tmp_path: Path) -> None:
+    flag = Flag(CHECKS[0].name, Level.ALARM, 12, 0.5, 0.1, "", region=(0, 2, 5, 9))
+    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {7: Level.WARN}, flags=[flag]))
+    found = recording.flags()
+    recording.close()
+    assert found == [
+        {"frame": 7, "check": CHECKS[0].name, "alarm": False, "score": 1.0, "region": None},
+        {"frame": 12, "check": CHECKS[0].name, "alarm": True, "score": 0.5, "region": [0, 2, 5, 9]},
+    ]
+
+
+def test_a_growing_file_shows_each_frame_as_it_is_committed(tmp_path: Path) -> None:
+    frames = frames_of(SCAN)
+    with NXtomoWriter(tmp_path / "scan.h5", ScanInfo("s"), SCAN.shape, clock=SystemClock()) as writer:
+        recording = Recording(tmp_path / "scan.h5")
+        for frame in frames:
+            writer.append(frame, digest(frame.counts))
+            assert recording.progress().frames == frame.index + 1
+            np.testing.assert_array_equal(
+                recording.picture(frame.index, WHOLE, corrected=False)[0], frame.counts.astype(np.float32)
+            )
+        assert len(recording.columns(3)["kind"]) == len(frames) - 3
+        assert recording.progress().status == "running"
+        recording.close()
+
+
+def test_a_frame_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
+    with pytest.raises(DataError, match="Frame 999 is not in the file"):
+        recording.picture(999, WHOLE, corrected=True)
+    recording.close()
+
+
+def test_a_scan_that_has_no_file_yet_is_not_ready(tmp_path: Path) -> None:
+    with pytest.raises(NotReadyError):
+        Recording(tmp_path / "scan.h5")
