@@ -26,7 +26,7 @@ from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
-from beamline.storage.writers.to_disk import to_disk
+from beamline.core.files import to_disk
 from drivers.frame import FrameKind
 
 JOINED = "joined.h5"

@@ -114,7 +114,6 @@ $("sinogram-row").addEventListener("input", debounce(fetchSinogram, 100));
 const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]];
 const setVolumeWindow = windowSliders($("volume-window"), (window) => slices.forEach((slice) => slice.setWindow(window)));
 const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
-  flip: axis > 0,  // z upwards
   point: (row, col, value) => { $("volume-value").textContent = row === null ? "" : `${place(axis, row, col)}: ${value.toPrecision(5)} ${volume.unit}`; },
 }));
 

@@ -30,10 +30,10 @@ export class Picture {
   /**
    * `extent`: [rows, cols] of the whole picture. Callbacks: `point(row, col, value)` under the pointer (null: outside),
    * `region([r0, r1, c0, c1])` chosen with Shift, `moved([r0, r1, c0, c1])` the part that is seen, `draw(context, place)` on top.
-   * `flip`: row 0 is at the bottom; `stretch`: rows and columns each fill the canvas.
+   * `stretch`: rows and columns each fill the canvas.
    */
-  constructor(canvas, { point = () => {}, region = null, moved = () => {}, draw = () => {}, flip = false, stretch = false } = {}) {
-    Object.assign(this, { canvas, point, region, moved, drawOver: draw, flip, stretch });
+  constructor(canvas, { point = () => {}, region = null, moved = () => {}, draw = () => {}, stretch = false } = {}) {
+    Object.assign(this, { canvas, point, region, moved, drawOver: draw, stretch });
     this.extent = [1, 1]; this.window = [0, 1]; this.zoom = 1; this.centre = [0.5, 0.5];
     this.image = document.createElement("canvas"); this.tile = null; this.dragged = null; this.pending = false;
     new ResizeObserver(() => this.redraw()).observe(canvas);
@@ -89,25 +89,22 @@ export class Picture {
     if (!this.tile) return;
     const [r0, r1, c0, c1] = this.shown;
     context.imageSmoothingEnabled = false;
-    const y = (row) => top + (this.flip ? this.extent[0] - row : row) * down, x = (col) => left + col * across;
-    if (this.flip) {
-      context.save(); context.translate(0, y(r0)); context.scale(1, -1);
-      context.drawImage(this.image, x(c0), 0, (c1 - c0) * across, (r1 - r0) * down); context.restore();
-    } else context.drawImage(this.image, x(c0), y(r0), (c1 - c0) * across, (r1 - r0) * down);
+    const y = (row) => top + row * down, x = (col) => left + col * across;
+    context.drawImage(this.image, x(c0), y(r0), (c1 - c0) * across, (r1 - r0) * down);
     this.drawOver(context, { x, y });
     if (this.chosen) this.box(context, { x, y }, this.chosen, "#3fb950");
   }
 
   box(context, { x, y }, [r0, r1, c0, c1], colour, label = "") {
     context.strokeStyle = colour; context.lineWidth = 2;
-    context.strokeRect(x(c0), Math.min(y(r0), y(r1)), x(c1) - x(c0), Math.abs(y(r1) - y(r0)));
-    if (label) { context.fillStyle = colour; context.font = "12px system-ui"; context.fillText(label, x(c0) + 2, Math.min(y(r0), y(r1)) - 4); }
+    context.strokeRect(x(c0), y(r0), x(c1) - x(c0), y(r1) - y(r0));
+    if (label) { context.fillStyle = colour; context.font = "12px system-ui"; context.fillText(label, x(c0) + 2, y(r0) - 4); }
   }
 
   /** Row and column under an event, as real numbers. */
   place(event) {
-    const { down, across, left, top, box } = this.layout(), row = (event.clientY - box.top - top) / down;
-    return [this.flip ? this.extent[0] - row : row, (event.clientX - box.left - left) / across];
+    const { down, across, left, top, box } = this.layout();
+    return [(event.clientY - box.top - top) / down, (event.clientX - box.left - left) / across];
   }
 
   seen() {
@@ -115,14 +112,13 @@ export class Picture {
     const clip = (value, most) => Math.max(0, Math.min(most, value));
     const first = clip(-top / down, rows), last = clip((box.height - top) / down, rows);
     const across = [Math.floor(clip(-left / wide, cols)), Math.ceil(clip((box.width - left) / wide, cols))];
-    return this.flip ? [Math.floor(rows - last), Math.ceil(rows - first), ...across] : [Math.floor(first), Math.ceil(last), ...across];
+    return [Math.floor(first), Math.ceil(last), ...across];
   }
 
   zoomBy(factor, about = null) {
     const before = about || [this.centre[0] * this.extent[0], this.centre[1] * this.extent[1]];
     const next = Math.max(1, Math.min(200, this.zoom * factor)), keep = this.zoom / next;
-    const at = this.flip ? [this.extent[0] - before[0], before[1]] : before;
-    this.centre = this.centre.map((centre, i) => { const p = at[i] / this.extent[i]; return p + (centre - p) * keep; });
+    this.centre = this.centre.map((centre, i) => { const p = before[i] / this.extent[i]; return p + (centre - p) * keep; });
     this.zoom = next;
     if (next === 1) this.centre = [0.5, 0.5];
     this.redraw(); this.moved(this.seen());
