@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import to_disk, whole_file
 from beamline.core.text import size
-from beamline.core.files import to_disk
 
 _FORMAT = "splatline journal 1"
 _BLOCK = 4096  # bytes, in which disks give room

@@ -21,12 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of, whole_file
+from beamline.core.files import EVENTS, parts_of, to_disk, whole_file
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
-from beamline.core.files import to_disk
 from drivers.frame import FrameKind
 
 JOINED = "joined.h5"
