@@ -14,6 +14,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,14 @@ from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
-from tests.beamline.storage.conftest import INFO, SHAPE, scan_frames
+from drivers.frame import FrameKind
+from tests.beamline.storage.conftest import INFO, scan_frames
 
 LAST = 100
-FRAMES = scan_frames(np.random.default_rng(5), 2, 3, 15)
+FRAMES = [
+    replace(frame, counts=np.tile(frame.counts, (4, 4))) for frame in scan_frames(np.random.default_rng(5), 2, 3, 15)
+]
+SHAPE = FRAMES[0].counts.shape
 DIGESTS = [digest(frame.counts) for frame in FRAMES]
 _DISK = ctypes.CDLL(os.environ["LD_PRELOAD"])
 _DISK.faulty_disk_count.restype = ctypes.c_long
@@ -50,12 +55,12 @@ class Rig:
     def __init__(self, folder: Path) -> None:
         self.scan, self._note, self._said = folder / "w" / "scan.h5", folder / "note", folder / "said"
 
-    def fresh(self, *kept: Path) -> None:
-        """Nothing is there but these files, by their names."""
+    def fresh(self, kept: Path | None = None) -> None:
+        """The scan is as in this file, or not there, and neither is anything else."""
         shutil.rmtree(self.scan.parent, ignore_errors=True)
         self.scan.parent.mkdir()
-        for path in kept:
-            shutil.copy(path, self.scan.parent)
+        if kept is not None:
+            shutil.copy(kept, self.scan)
 
     def do(
         self, what: Callable[[], Any], fault: Fault = NONE, limit: int | None = None, fast: bool = False
@@ -132,16 +137,33 @@ class Rig:
             n = int(source.image_key.size)
             assert source.finished
             assert all((source.read([i])[0] == FRAMES[i].counts).all() for i in range(n))
-            assert views in (0, sum(source.image_key == 0))
-        assert not [found for found in validate(self.scan) if found.severity == "error"]
+            assert views in (0, np.sum(source.image_key == FrameKind.PROJECTION))
+        assert not views or not [found for found in validate(self.scan) if found.severity == "error"]
         return [n, views]
 
-    def write(self) -> list[int]:
-        """A whole scan: its writes before the end, and the remarks."""
+    def write(self) -> int:
+        """A whole scan; its remarks."""
         writer = NXtomoWriter(self.scan, INFO, SHAPE, clock=SystemClock())
-        committed = self._note.with_name("committed")
-        with committed.open("w") as note:
-            for frame, about in zip(FRAMES, DIGESTS, strict=True):
+        self.go_on(writer, 0)
+        return len(writer.remarks)
+
+    def begin(self) -> NXtomoWriter:
+        """A writer of a file beside, which lacks the last frames."""
+        writer = NXtomoWriter(self._note.with_name("begun.h5"), INFO, SHAPE, clock=SystemClock())
+        for frame, about in zip(FRAMES[:-2], DIGESTS, strict=False):
+            writer.append(frame, about)
+        return writer
+
+    def end(self, writer: NXtomoWriter) -> list[int]:
+        """Go on with the scan that `begin` began, in a copy of its file: its writes before `close`, and the remarks."""
+        copy = os.open(self.scan, os.O_RDWR)
+        os.dup2(copy, writer._file.id.get_vfd_handle())
+        writer.path = self.scan
+        return [self.go_on(writer, writer.rows), len(writer.remarks)]
+
+    def go_on(self, writer: NXtomoWriter, first: int) -> int:
+        with self._note.with_name("committed").open("w") as note:
+            for frame, about in zip(FRAMES[first:], DIGESTS[first:], strict=True):
                 try:
                     writer.append(frame, about)
                 except DataError:
@@ -149,9 +171,9 @@ class Rig:
                     raise
                 note.write(f"{writer.committed}\n")
                 note.flush()
-        before = _DISK.faulty_disk_count()
+        before = int(_DISK.faulty_disk_count())
         writer.close()
-        return [before, len(writer.remarks)]
+        return before
 
     def committed(self) -> int:
         """Frames that the last `write` knew to be safe."""
@@ -182,13 +204,15 @@ def _short(said: dict[str, Any]) -> Any:
 
 
 def close(rig: Rig, fault: Callable[[int], Fault]) -> None:
-    rig.fresh()
-    whole = rig.do(rig.write)
+    writer = rig.begin()
+    rig.fresh(writer.path)
+    whole = rig.do(lambda: rig.end(writer))
     total = whole["writes"]
-    for n in range(total - LAST + 1, total + 1):
-        rig.fresh()
-        done = rig.do(rig.write, fault(n))
-        said(n, total, done, rig.judged() | {"committed": rig.committed(), "closing": n > whole["value"][0]})
+    for n in range(max(1, total - LAST + 1), total + 1):
+        rig.fresh(writer.path)
+        done = rig.do(lambda: rig.end(writer), fault(n))
+        said(n, total, done, rig.judged() | {"committed": max(rig.committed(), len(FRAMES) - 2)})
+    os._exit(0)  # without the end of the writer
 
 
 def recovering(rig: Rig, fault: Callable[[int], Fault]) -> None:
@@ -208,7 +232,8 @@ def cut(rig: Rig, fault: Callable[[int], Fault]) -> None:
     rig.fresh()
     rig.do(rig.write)
     size = rig.scan.stat().st_size
-    for limit in range(40_000, size, (size - 40_000) // 40):
+    pixels = sum(frame.counts.nbytes for frame in FRAMES)
+    for limit in range(size - pixels - 20_000, size, (pixels + 20_000) // 16):
         for bound in (limit, None):
             rig.fresh()
             done = rig.do(rig.write, limit=limit)
