@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -138,8 +139,14 @@ def never_close(file: h5py.File) -> None:
     """Keep a file open until the process ends, so that HDF5 changes nothing more on the disk.
 
     For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
-    object, and may leave it marked as one that nobody can open.
+    object, and may leave it marked as one that nobody can open. HDF5 closes it all the same when the process ends, and
+    crashes where the disk still fails: so its handle leads to memory from now on.
     """
+    if os.name == "posix":  # elsewhere the numbers of handles may be another library's
+        with suppress(OSError, RuntimeError, ValueError):
+            memory = os.memfd_create("closed") if sys.platform == "linux" else os.open(os.devnull, os.O_RDWR)
+            os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
+            os.close(memory)
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back
 

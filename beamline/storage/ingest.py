@@ -129,7 +129,7 @@ def _copy(
     file[layout.COMMITTED][()] = n
     file[layout.STATUS][()] = b"complete"
     file[layout.FINISHED][()] = 1
-    layout.state_field_of_view(file, layout.view_angles(file))
+    layout.state_field_of_view(file)
     add_exchange_view(file)
     return invalid
 

@@ -123,6 +123,7 @@ def finish(path: Path) -> bool:
 
 def _apply(changes: Changes, journal: Path) -> None:
     path, longer = changes.path, False
+    before = path.stat().st_size
     try:
         with path.open("r+b", buffering=0) as file:
             for change in changes.ranges:
@@ -141,6 +142,8 @@ def _apply(changes: Changes, journal: Path) -> None:
                 "beside it keeps that, and what reads the file here sees it whole. Mend the disk or make room, then "
                 "run `beamline recover` on it again."
             ) from error
+        with suppress(OSError):
+            os.truncate(path, before)
         with suppress(OSError):
             journal.unlink()
         raise DataError(f"{path} cannot be made longer ({_why(error)}). What was in it is as it was.") from error

@@ -234,7 +234,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     joined[layout.COMMITTED][()], joined[layout.FINISHED][()] = firsts[-1], 1
     _name_missing(files, joined)
     joined[layout.IMAGE_KEY_CONTROL] = joined[layout.KIND]
-    layout.state_field_of_view(joined, layout.view_angles(joined))
+    layout.state_field_of_view(joined)
     add_exchange_view(joined)
     return int(firsts[-1])
 

@@ -216,7 +216,8 @@ def _cut(file: h5py.File, committed: int, there: int) -> int:
     times = file[layout.TIME][()]
     if layout.END_TIME in file and not file[layout.END_TIME][()] and np.isfinite(times).any():
         file[layout.END_TIME][()] = layout.iso_time(float(np.nanmax(times))).encode()
-    layout.state_field_of_view(file, layout.view_angles(file), create=False)
+    if layout.FIELD_OF_VIEW in file:
+        layout.state_field_of_view(file)
     return frames
 
 

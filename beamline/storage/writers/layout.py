@@ -75,6 +75,7 @@ EXCHANGE = "/exchange"
 PARTS = "/entry/record/parts"
 END_TIME = "/entry/end_time"
 BEAM = "/entry/record/beam"
+BEAM_TIME, BEAM_VALUE = f"{BEAM}/time", f"{BEAM}/value"
 AXIS_COL = "/entry/record/axis_col"
 SOURCE_DISTANCE = "/entry/record/source_distance"
 """Of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes for cones."""
@@ -396,23 +397,20 @@ class Rows:
             dataset.id.set_extent((n, *shape[1:]))
 
 
-def state_field_of_view(file: h5py.File, angles: NDArray[np.float64], create: bool = True) -> None:
-    """Say whether a full turn sees half of the sample at a time, as far as angles (radians, of all views) tell.
-
-    Args:
-        create: also where `create` did not foresee it, which a growing file does not allow.
-    """
-    axis_col = float(file[AXIS_COL][()]) if AXIS_COL in file else None
-    field = _field_of_view(angles, file[DATA].shape[1:], axis_col)
+def state_field_of_view(file: h5py.File) -> None:
+    """Say whether a full turn saw half of the sample at a time, as far as its views tell."""
+    field = field_of_view(file)
     if field and FIELD_OF_VIEW in file:
         file[FIELD_OF_VIEW][()] = field.encode()
-    elif field and create:
+    elif field:
         _rewritable_text(file, FIELD_OF_VIEW, field, len(FULL))
 
 
-def view_angles(file: h5py.File) -> NDArray[np.float64]:
-    """Of the projections, in radians."""
-    return np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
+def field_of_view(file: h5py.File) -> str:
+    """`Half` where a full turn saw half of the sample at a time; "" where angles or the axis are not known."""
+    angles = np.radians(file[ANGLE][()][file[KIND][()] == FrameKind.PROJECTION])
+    axis_col = float(file[AXIS_COL][()]) if AXIS_COL in file else None
+    return _field_of_view(angles, file[DATA].shape[1:], axis_col)
 
 
 def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import h5py
 import numpy as np
@@ -36,6 +36,11 @@ from drivers.protocols import BeamReading
 __all__ = ["NXtomoWriter", "ScanInfo"]
 
 STATUSES = ("complete", "stopped", "failed")
+LAST = (
+    layout.STATUS, layout.FINISHED, layout.END_TIME, layout.FIELD_OF_VIEW, layout.MISSING, layout.BEAM_TIME,
+    layout.BEAM_VALUE,
+)  # fmt: skip
+"""What is written when a scan ends."""
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
 
 
@@ -107,6 +112,8 @@ class NXtomoWriter:
         self._table = layout.Rows(self._file)
         self._to_disk = ToDisk(self._file.id.get_vfd_handle())
         self._progress = self._file[layout.COMMITTED]
+        # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
+        self._last: dict[str, h5py.Dataset] = {path: self._file[path] for path in LAST if path in self._file}
 
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
         """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found, in rows before it too.
@@ -200,18 +207,25 @@ class NXtomoWriter:
 
     def _finish(self, status: str, missing: NDArray[np.int64], beam: Sequence[BeamReading]) -> None:
         self.flush()
-        series: dict[str, NDArray[Any]] = {layout.MISSING: missing}
-        if f"{layout.BEAM}/value" in self._file:
-            series[f"{layout.BEAM}/time"] = np.array([reading.time for reading in beam], np.float64)
-            series[f"{layout.BEAM}/value"] = np.array([reading.value for reading in beam], np.float64)
+        series = {
+            layout.MISSING: missing,
+            layout.BEAM_TIME: np.array([reading.time for reading in beam], np.float64),
+            layout.BEAM_VALUE: np.array([reading.value for reading in beam], np.float64),
+        }
         for path, values in series.items():
-            self._file[path].resize(values.size, 0)
-            self._file[path][...] = values
-        self._file[layout.END_TIME][()] = layout.iso_time(self._clock.now()).encode()
-        layout.state_field_of_view(self._file, layout.view_angles(self._file), create=False)
-        self._file[layout.STATUS][()] = status.encode()
+            if path in self._last:
+                self._last[path].resize(values.size, 0)
+                self._last[path][...] = values
+        texts = {
+            layout.END_TIME: layout.iso_time(self._clock.now()),
+            layout.FIELD_OF_VIEW: layout.field_of_view(self._file),
+            layout.STATUS: status,
+        }
+        for path, text in texts.items():
+            if text and path in self._last:
+                self._last[path][()] = text.encode()
         self._file.flush()
-        self._file[layout.FINISHED][()] = 1
+        self._last[layout.FINISHED][()] = 1
         self._file.flush()
         self._to_disk.finish(self._committed)
         self._file.close()
@@ -221,11 +235,12 @@ class NXtomoWriter:
 
         Readers see every frame committed.
         """
-        hdf5.never_close(self._file)
-        for path, value in ((layout.STATUS, b"failed"), (layout.FINISHED, 1)):
-            dataset = self._file[path]
-            dataset[()] = value
-            dataset.flush()
+        try:
+            for path, value in ((layout.STATUS, b"failed"), (layout.FINISHED, 1)):
+                self._last[path][()] = value
+                self._last[path].flush()
+        finally:
+            hdf5.never_close(self._file)
 
     def _check(self, frame: Frame, digest: FrameDigest) -> None:
         counts, wrong = frame.counts, ""

@@ -6,6 +6,7 @@ It is started under the library of tests/faulty_disk.py, forks once for each fau
 from __future__ import annotations
 
 import ctypes
+import gc
 import json
 import os
 import resource
@@ -14,6 +15,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +33,14 @@ from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.clock import SystemClock
-from tests.beamline.storage.conftest import INFO, SHAPE, scan_frames
+from drivers.frame import FrameKind
+from tests.beamline.storage.conftest import INFO, scan_frames
 
 LAST = 100
-FRAMES = scan_frames(np.random.default_rng(5), 2, 3, 15)
+FRAMES = [
+    replace(frame, counts=np.tile(frame.counts, (4, 4))) for frame in scan_frames(np.random.default_rng(5), 2, 3, 15)
+]
+SHAPE = FRAMES[0].counts.shape
 DIGESTS = [digest(frame.counts) for frame in FRAMES]
 _DISK = ctypes.CDLL(os.environ["LD_PRELOAD"])
 _DISK.faulty_disk_count.restype = ctypes.c_long
@@ -49,19 +55,22 @@ class Rig:
 
     def __init__(self, folder: Path) -> None:
         self.scan, self._note, self._said = folder / "w" / "scan.h5", folder / "note", folder / "said"
+        self.writer: NXtomoWriter | None = None
+        self._children = 0
 
-    def fresh(self, *kept: Path) -> None:
-        """Nothing is there but these files, by their names."""
+    def fresh(self, kept: Path | None = None) -> None:
+        """The scan is as in this file, or not there, and neither is anything else."""
         shutil.rmtree(self.scan.parent, ignore_errors=True)
         self.scan.parent.mkdir()
-        for path in kept:
-            shutil.copy(path, self.scan.parent)
+        if kept is not None:
+            shutil.copy(kept, self.scan)
 
     def do(
         self, what: Callable[[], Any], fault: Fault = NONE, limit: int | None = None, fast: bool = False
     ) -> dict[str, Any]:
         """In a child: what it returned or raised, its exit, its messages, and how many writes it made."""
         self._note.unlink(missing_ok=True)
+        self._children += not fast
         child = os.fork()
         if not child:
             messages = os.open(self._said, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
@@ -79,7 +88,12 @@ class Rig:
             self._note.write_text(json.dumps(said))
             if fast:
                 os._exit(0)
-            sys.exit()  # as a program ends: HDF5 closes what is open
+            if self._children % 20 == 0:
+                sys.exit()  # as a program ends: HDF5 closes what is open
+            self.writer = None  # the same without the end of Python, which takes seconds
+            gc.collect()
+            sys.stderr.flush()
+            ctypes.CDLL(None).exit(0)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         said = json.loads(self._note.read_text()) if self._note.exists() else {}
         return {"value": None} | said | {"exit": code, "stderr": self._said.read_text()[-2000:]}
@@ -132,16 +146,35 @@ class Rig:
             n = int(source.image_key.size)
             assert source.finished
             assert all((source.read([i])[0] == FRAMES[i].counts).all() for i in range(n))
-            assert views in (0, sum(source.image_key == 0))
-        assert not [found for found in validate(self.scan) if found.severity == "error"]
+            assert views in (0, np.sum(source.image_key == FrameKind.PROJECTION))
+        assert views < 2 or not [found for found in validate(self.scan) if found.severity == "error"]
         return [n, views]
 
-    def write(self) -> list[int]:
-        """A whole scan: its writes before the end, and the remarks."""
-        writer = NXtomoWriter(self.scan, INFO, SHAPE, clock=SystemClock())
-        committed = self._note.with_name("committed")
-        with committed.open("w") as note:
-            for frame, about in zip(FRAMES, DIGESTS, strict=True):
+    def write(self) -> int:
+        """A whole scan; its remarks."""
+        self.writer = NXtomoWriter(self.scan, INFO, SHAPE, clock=SystemClock())
+        return self.go_on(self.writer)
+
+    def begin(self) -> Path:
+        """A scan beside that lacks the last frames, its writer waiting."""
+        self.writer = NXtomoWriter(self._note.with_name("begun.h5"), INFO, SHAPE, clock=SystemClock())
+        for frame, about in zip(FRAMES[:-2], DIGESTS, strict=False):
+            self.writer.append(frame, about)
+        return self.writer.path
+
+    def end(self) -> int:
+        """Go on with the scan that `begin` began, in a copy of its file; its remarks."""
+        assert self.writer is not None
+        copy = os.open(self.scan, os.O_RDWR)
+        os.dup2(copy, self.writer._file.id.get_vfd_handle())
+        os.close(copy)
+        self.writer.path = self.scan
+        return self.go_on(self.writer)
+
+    def go_on(self, writer: NXtomoWriter) -> int:
+        first = writer.rows
+        with self._note.with_name("committed").open("w") as note:
+            for frame, about in zip(FRAMES[first:], DIGESTS[first:], strict=True):
                 try:
                     writer.append(frame, about)
                 except DataError:
@@ -149,9 +182,8 @@ class Rig:
                     raise
                 note.write(f"{writer.committed}\n")
                 note.flush()
-        before = _DISK.faulty_disk_count()
         writer.close()
-        return [before, len(writer.remarks)]
+        return len(writer.remarks)
 
     def committed(self) -> int:
         """Frames that the last `write` knew to be safe."""
@@ -182,13 +214,15 @@ def _short(said: dict[str, Any]) -> Any:
 
 
 def close(rig: Rig, fault: Callable[[int], Fault]) -> None:
-    rig.fresh()
-    whole = rig.do(rig.write)
-    total = whole["writes"]
-    for n in range(total - LAST + 1, total + 1):
-        rig.fresh()
-        done = rig.do(rig.write, fault(n))
-        said(n, total, done, rig.judged() | {"committed": rig.committed(), "closing": n > whole["value"][0]})
+    begun = rig.begin()
+    rig.fresh(begun)
+    total = rig.do(rig.end)["writes"]
+    for n in range(max(1, total - LAST + 1), total + 1):
+        rig.fresh(begun)
+        done = rig.do(rig.end, fault(n))
+        said(n, total, done, rig.judged() | {"committed": max(rig.committed(), len(FRAMES) - 2)})
+    sys.stdout.flush()
+    os._exit(0)  # without the end of the writer
 
 
 def recovering(rig: Rig, fault: Callable[[int], Fault]) -> None:
@@ -208,7 +242,8 @@ def cut(rig: Rig, fault: Callable[[int], Fault]) -> None:
     rig.fresh()
     rig.do(rig.write)
     size = rig.scan.stat().st_size
-    for limit in range(40_000, size, (size - 40_000) // 40):
+    pixels = sum(frame.counts.nbytes for frame in FRAMES)
+    for limit in range(size - pixels - 20_000, size, (pixels + 20_000) // 16):
         for bound in (limit, None):
             rig.fresh()
             done = rig.do(rig.write, limit=limit)
@@ -222,6 +257,7 @@ def said(n: int, total: int, done: dict[str, Any], found: dict[str, Any]) -> Non
 
 
 if __name__ == "__main__":
+    gc.freeze()
     _case, _kind, _number, _torn = sys.argv[2], sys.argv[3], int(sys.argv[4]), int(sys.argv[5])
     _place = {"kill": 0, "from": 1, "at": 2}[_kind]
     {"close": close, "recover": recovering, "cut": cut}[_case](

@@ -34,9 +34,10 @@ PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encodin
 SCAN = TwoCylinders(shape=(4, 40), pixel_size_mm=0.5)
 NOT_OF_EVERY_RUN = {
     "scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.live.png", "recon.log", "report.html", "watchdog.log",
-    "control/",
+    "control/", "scan.h5.journal",
 }  # fmt: skip
-"""Of simulated scans, the live reconstruction and the watchdog, whose own tests name them; and of a scan that runs."""
+"""Of simulated scans, the live reconstruction and the watchdog, whose own tests name them; and of a scan that runs or
+ends."""
 
 
 def rows(title: str) -> list[list[str]]:

@@ -1,0 +1,86 @@
+"""A scan file survives each of its last writes, and each write of `recover`: a kill there, or a disk that fails."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests import faulty_disk
+
+pytestmark = [faulty_disk.needed, pytest.mark.slow]
+
+Row = dict[str, Any]
+
+
+def _rows(folder: Path, case: str, fault: str = "kill", number: int = 0, torn: bool = False) -> list[Row]:
+    """What every_write.py finds: an object for each fault."""
+    command = [sys.executable, "-m", "tests.beamline.storage.every_write", folder, case, fault, number, int(torn)]
+    env = os.environ | faulty_disk.environment(f"{folder}/w/")
+    root = Path(__file__).parents[3]
+    done = subprocess.run([str(word) for word in command], env=env, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def _assert_all_is_there(rows: list[Row]) -> None:
+    """Every command takes the file, with every committed frame; recovered once, it is in order, alone in its folder."""
+    for row in rows:
+        taken = [row[command] for command in ("info", "resume", "recover")]
+        assert all(isinstance(n, int) and n >= row["committed"] for n in taken), row
+        assert row["after"] == [row["recover"], max(0, row["recover"] - 5)], row
+        assert (row["again"], row["left"]) == (False, ["scan.h5"]), row
+
+
+def _assert_said_in_a_sentence(rows: list[Row]) -> None:
+    """A failure is a refusal: no traceback, no crash, nothing from HDF5 on the terminal when the program ends."""
+    for row in rows:
+        assert not str(row["done"]).startswith(("Traceback", "exit")), row
+        assert row["stderr"] == "", row
+
+
+def test_killed_at_each_of_the_last_writes_of_a_scan(tmp_path: Path) -> None:
+    rows = _rows(tmp_path, "close")
+    assert len(rows) == 100
+    _assert_all_is_there(rows)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_the_disk_fails_from_each_of_the_last_writes_of_a_scan_on(tmp_path: Path, number: int) -> None:
+    rows = _rows(tmp_path, "close", "from", number)
+    assert len(rows) == 100
+    _assert_all_is_there(rows)
+    _assert_said_in_a_sentence(rows)
+
+
+@pytest.mark.parametrize("torn", [False, True])
+def test_recover_is_killed_at_each_write(tmp_path: Path, torn: bool) -> None:
+    rows = _rows(tmp_path, "recover", torn=torn)
+    assert len(rows) > 8
+    _assert_all_is_there(rows)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EFBIG])
+@pytest.mark.parametrize("fault", ["from", "at"])
+def test_the_disk_fails_at_each_write_of_recover(tmp_path: Path, fault: str, number: int) -> None:
+    rows = _rows(tmp_path, "recover", fault, number)
+    _assert_all_is_there(rows)
+    _assert_said_in_a_sentence(rows)
+
+
+def test_a_file_that_its_file_system_takes_no_longer(tmp_path: Path) -> None:
+    """`recover` gives the frames that the writer said are safe, under the same limit, too, then without the view."""
+    rows = _rows(tmp_path, "cut")
+    failed = [row for row in rows if "recover" in str(row["done"])]
+    assert len({row["committed"] for row in failed}) > 6
+    for row in failed:
+        assert f"first {row['committed']} frames are safe in it: `beamline recover`" in row["done"]
+        assert row["under"] == row["recover"] == row["committed"], row
+    _assert_said_in_a_sentence(rows)
+    _assert_all_is_there(rows)
