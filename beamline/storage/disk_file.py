@@ -95,10 +95,11 @@ class DiskFile:
 
     def require_taken(self) -> None:
         """Raise what went wrong so far: OSError where the disk refused."""
-        if isinstance(self._error, OSError):
-            self._error.filename = str(self._path)
-        if self._error is not None:
-            raise self._error
+        error = self._error
+        if isinstance(error, OSError):  # HDF5's own have no number
+            raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self._path)) from error
+        if error is not None:
+            raise error
 
     def finish(self) -> None:
         """Bring all of it to the disk, read it back, and compare. The memory is that of a block.

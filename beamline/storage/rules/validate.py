@@ -24,6 +24,7 @@ from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import volume_format
+from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_degrees
 
@@ -47,11 +48,14 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
         deep: every frame is read and compared with its checksum; is told how many of how many.
     """
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
+    if completion_cut_short(path):
+        said = f"Its writer was killed when it became the output; recon --resume {path} makes that of it."
+        return [Finding("error", "partial", said)]
     kind = volume_format(path)
     findings = _as_hdf5(path) if kind is None else []
     try:
         if kind is not None:
-            with kind.open(path) as record:
+            with kind.open(path) as record, hdf5.readable(path):
                 return [*volume_findings(record)]
         with open_scan(scan) as source:
             findings += source_findings(source)

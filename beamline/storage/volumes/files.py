@@ -19,6 +19,8 @@ from beamline.storage.volumes.plain import Npy, Nrrd
 from beamline.storage.volumes.tiff import TiffFile, TiffFolder
 from beamline.storage.writers.recon_file import ReconRecord
 
+_BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
+
 FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffFile(), TiffFolder(), Npy(), Nrrd(), OmeZarr())
 """Every format that volumes are written in."""
 
@@ -62,12 +64,18 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
     with whole_file(path, replace=replace) as partial:
         kind.write(partial, record, slices)
         bring_to_disk(partial)
-        with kind.open(partial) as written:
-            for z, known in enumerate(slices.checksums):
-                if checksum(written.volume.data[z : z + 1]) != known:
-                    raise OSError(errno.EIO, f"slice {z} that is read back is not what was written")
-        del written  # Windows renames no file that is mapped
+        _compare(kind, partial, slices)
     return slices.outside
+
+
+def _compare(kind: VolumeFormat, path: Path, slices: Slices) -> None:
+    """Raise OSError where a slice that is read back is not what was written."""
+    with kind.open(path) as written:
+        for first in range(0, len(slices.checksums), _BLOCK):
+            known = slices.checksums[first : first + _BLOCK]
+            for z, values in enumerate(written.volume.data[first : first + len(known)], first):
+                if checksum(values) != slices.checksums[z]:
+                    raise OSError(errno.EIO, f"slice {z} that is read back is not what was written")
 
 
 def volume_format(path: Path) -> VolumeFormat | None:

@@ -241,7 +241,7 @@ def is_partial(path: Path) -> bool:
     """Whether a file is a partial volume, by its content; also one whose completion was cut short."""
     if not path.is_file():
         return False
-    if _structure_of(path).is_file():
+    if completion_cut_short(path):
         return True
     if not hdf5.is_hdf5(path):
         return False
@@ -250,6 +250,11 @@ def is_partial(path: Path) -> bool:
             return isinstance(hdf5.resolve(file, _SLABS), h5py.Group)
     except (DataError, OSError):
         return False
+
+
+def completion_cut_short(path: Path) -> bool:
+    """Whether a partial volume is half of the output that it was to become; opening it to add slabs undoes that."""
+    return path.is_file() and _structure_of(path).is_file()
 
 
 def _shared(slab: Slab) -> list[int]:

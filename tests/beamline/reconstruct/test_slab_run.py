@@ -113,11 +113,20 @@ def test_a_volume_that_could_not_be_completed_is_resumed(
         patch.setattr(partial_volume, "rewrite_facts", fail)
         failed = beamline(*FISTA, "-o", "parts.h5")
     assert failed.exit_code == (5 if isinstance(error, OSError) else 4) and not Path("parts.h5").exists()
+    said = beamline("validate", "parts.partial.h5")
+    told = "96 of 96 slices" if isinstance(error, OSError) else "recon --resume parts.partial.h5"
+    assert said.exit_code == 5 and told in said.output and isinstance(said.exception, SystemExit)
     resumed = beamline(*FISTA, "-o", "parts.h5", "--resume", "parts.partial.h5")
     assert resumed.exit_code == 0 and "96 of 96 slices are there." in resumed.stderr, resumed.output
     assert left(folder) == {"scan.h5", "whole.h5", "parts.h5"}
     whole, parts = (read_reconstruction(Path(name)) for name in ("whole.h5", "parts.h5"))
     np.testing.assert_array_equal(parts.volume.data, whole.volume.data)
+
+
+def test_what_a_killed_call_left_beside_its_output_is_in_nobodys_way(folder: Path) -> None:
+    Path(".out.partial.h5.structure").write_bytes(bytes(100))  # its partial volume had become the output
+    assert beamline(*FISTA, "-o", "out.h5").exit_code == 0
+    assert left(folder) == {"scan.h5", "out.h5"} and beamline("validate", "out.h5").exit_code == 0
 
 
 def test_other_data_or_options_are_refused_and_nothing_is_touched(

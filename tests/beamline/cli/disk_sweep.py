@@ -1,0 +1,94 @@
+"""Runs a command again and again in forks of this process, each with another fault of the disk (tests.faulty_disk).
+
+    LD_PRELOAD=faulty_disk.so FAULTY_DISK_PATTERN=out/ python -m tests.beamline.cli.disk_sweep FOLDER POINTS COMMAND...
+
+FOLDER is the current directory of the command, which writes to FOLDER/out. One JSON line a run: fault, write, exit
+code, stderr, and the outputs by name with the SHA-256 of what does not change from run to run.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import hashlib
+import json
+import os
+import shutil
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+_FAULTS = {
+    "none": (0, 0, 0, 0),
+    "EIO once": (0, 0, 1, errno.EIO),
+    "ENOSPC": (0, 1, 0, errno.ENOSPC),
+    "kill": (1, 0, 0, 0),
+}
+_CHANGES = ("date", "elapsed", "start_time", "end_time", "seconds", "command", "time")
+
+
+def digest(path: Path) -> str:
+    """Of the content of a file or folder; of pages only whether they are there."""
+    found = hashlib.sha256()
+    if path.is_dir():
+        for part in sorted(path.rglob("*")):
+            found.update(f"{part.relative_to(path)} {digest(part) if part.is_file() else ''}".encode())
+    elif h5py.is_hdf5(path):
+        with h5py.File(path) as file:
+
+            def add(name: str, item: h5py.HLObject) -> None:
+                found.update(f"{name} {sorted((key, str(item.attrs[key])) for key in item.attrs)}".encode())
+                if isinstance(item, h5py.Dataset) and name.rsplit("/", 1)[-1] not in _CHANGES:
+                    value = np.asarray(item[()])
+                    found.update(str(value.tolist()).encode() if value.dtype.hasobject else value.tobytes())
+
+            file.visititems(add)
+    elif path.suffix in (".html", ".pdf"):
+        found.update(str(path.stat().st_size > 1000).encode())
+    else:
+        found.update(path.read_bytes())
+    return found.hexdigest()
+
+
+def main() -> None:
+    folder, points, command = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+    library = ctypes.CDLL(os.environ["LD_PRELOAD"])
+    cli = import_module("beamline.cli.main")
+    module = {"ingest": "files", "archive": "files"}.get(command[0], command[0])
+    import_module(f"beamline.cli.{module}")
+    os.chdir(folder)
+    out, counted, writes = Path("out"), Path("count"), 0
+
+    def run(fault: str, n: int) -> None:
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        child = os.fork()
+        if child == 0:
+            for number, name in ((1, "stdout"), (2, "stderr")):
+                os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
+            kill, begin, once, error = _FAULTS[fault]
+            library.faulty_disk_arm(*(ctypes.c_long(n * here) for here in (kill, begin, once)), error, 0)
+            sys.argv = ["beamline", *command]
+            try:
+                cli.run()
+            finally:
+                counted.write_text(str(library.faulty_disk_count()))
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        hidden = sum(path.name.startswith(".") for path in out.iterdir())
+        found = {path.name: digest(path) for path in sorted(out.iterdir()) if not path.name.startswith(".")}
+        said = Path("stderr").read_text()
+        line = {"fault": fault, "n": n, "code": code, "stderr": said, "outputs": found, "hidden": hidden}
+        print(json.dumps(line), flush=True)
+
+    run("none", 0)
+    writes = int(counted.read_text())
+    for fault in list(_FAULTS)[1:]:
+        for n in sorted(set(np.linspace(1, writes, min(points, writes)).astype(int).tolist())):
+            run(fault, n)
+
+
+if __name__ == "__main__":
+    main()

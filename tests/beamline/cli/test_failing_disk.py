@@ -1,0 +1,72 @@
+"""Every kind of output on a disk that fails at any write: it is right, or exit code 5 and nothing is there."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.storage.ingest import ingest
+from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
+from recon.base.volume import Grid, Volume
+from tests import faulty_disk
+from tests.beamline.cli.small_scan import SCAN
+from tests.beamline.scans import write_exchange
+
+pytestmark = [faulty_disk.needed, pytest.mark.slow]
+
+COMMANDS = {
+    "NXtomoproc": ("export volume.npy -o out/o.h5", {"o.h5"}),
+    "TIFF": ("export volume.h5 -o out/o.tif", {"o.tif"}),
+    "folder of TIFFs": ("export volume.h5 -o out/o", {"o"}),
+    "npy": ("export volume.h5 -o out/o.npy", {"o.npy"}),
+    "NRRD": ("export volume.h5 -o out/o.nrrd", {"o.nrrd"}),
+    "OME-Zarr": ("export volume.h5 -o out/o.zarr", {"o.zarr"}),
+    "ingested scan": ("ingest scan.h5 out/o.h5", {"o.h5"}),
+    "archive": ("archive ours.h5 -o out/o.h5", {"o.h5"}),
+    "reconstruction": ("recon scan.h5 -m fbp --no-report -o out/o.h5", {"o.h5"}),
+    "labels": ("segment volume.h5 --crop none -o out/o.h5", {"o.h5", "o.csv", "o.png"}),
+}
+POINTS = 6  # writes of each fault; there are up to 315
+
+
+@pytest.fixture
+def inputs(tmp_path: Path, rng: np.random.Generator) -> Path:
+    data = rng.normal(0, 0.05, (20, 24, 28)).astype(np.float32)
+    z, y, x = np.indices(data.shape)
+    for centre in ((6, 8, 8), (13, 15, 19)):
+        data[(z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2 < 20] += 1
+    record = ReconRecord(Volume(data, Grid(data.shape, 0.01)), "mm", "scan.h5", "t", "s", 0.0, {"method": "fbp"})
+    write_reconstruction(tmp_path / "volume.h5", record)
+    np.save(tmp_path / "volume.npy", data)
+    os.utime(tmp_path / "volume.npy", (0, 0))
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    ingest(tmp_path / "scan.h5", tmp_path / "ours.h5")
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", COMMANDS)
+def test_an_output_is_right_or_absent(inputs: Path, kind: str) -> None:
+    command, outputs = COMMANDS[kind]
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.beamline.cli.disk_sweep", inputs, str(POINTS), *command.split()],
+        env=os.environ | faulty_disk.environment("/out/") | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=600, check=True,
+    )  # fmt: skip
+    clean, *runs = [json.loads(line) for line in done.stdout.splitlines()]
+    assert clean["code"] == 0 and set(clean["outputs"]) == outputs, clean
+    assert len(runs) >= 3 * 4
+    for run in runs:
+        right = run["outputs"] == clean["outputs"]
+        assert "Traceback" not in run["stderr"] and "ignored" not in run["stderr"], run
+        if run["fault"] == "kill":  # of several outputs some may be there, and these are right
+            assert run["code"] == -9 and run["outputs"].items() <= clean["outputs"].items(), run
+            continue
+        said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
+        assert (run["code"], len(said)) in ((0, 0), (5, 1)) and run["hidden"] == 0, run
+        assert right if run["code"] == 0 else not run["outputs"], run
