@@ -68,7 +68,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             problems.append(str(error))
             continue
         try:
-            require_harmless(file)
+            with readable(path):
+                require_harmless(file)
         except BaseException:
             file.close()
             raise

@@ -192,5 +192,5 @@ def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path
 
 
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"cannot be read: Is a directory|denied"):
+    with pytest.raises(ConfigError, match=r"cannot be read: It is a folder"):
         load(tmp_path)
