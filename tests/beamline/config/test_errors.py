@@ -20,7 +20,7 @@ FAULTS = {
     ),
     "missing": (
         ("exposure_s: 0.01", "settle_s: 0"),
-        "my.yaml:2: scan.exposure_s is missing; expected a number > 0 and <= 1000000",
+        "my.yaml:2: scan.exposure_s is missing; expected a number > 0 and <= 1e+06",
     ),
     "choice": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {method: r3}"),

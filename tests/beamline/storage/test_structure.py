@@ -89,3 +89,14 @@ def test_a_dataset_that_claims_what_no_file_holds(tmp_path: Path) -> None:
         file.create_dataset("claimed", (2**40, 2, 2), "f8", chunks=(64, 2, 2))
     with pytest.raises(DataError, match=r"claimed claims 3\.52e\+04 GB, of which 0 bytes are there"):
         open_hdf5(tmp_path / "a.h5")
+
+
+def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(
+    write: Callable[[list[Frame]], Path], frames: list[Frame]
+) -> None:
+    path = write(frames)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"OHDR") + 20] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"damaged|cannot be read as HDF5"):
+        open_hdf5(path)
