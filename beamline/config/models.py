@@ -90,21 +90,24 @@ Angles = Annotated[
 ]
 
 
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
+
+
 class Fields(Section):
     """Darks or flats: how many at each place, and their own exposure (null: the scan's)."""
 
     count: Annotated[int, Field(ge=0, le=1_000_000)] = 10
     at: Place = Place.START
-    exposure_s: PositiveFloat | None = None
+    exposure_s: Seconds | None = None
 
 
 class Scan(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
     angles: Angles
-    exposure_s: PositiveFloat
-    period_s: PositiveFloat
+    exposure_s: Seconds
+    period_s: Seconds
     """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""
-    settle_s: Annotated[float, Field(ge=0)] = 0.1
+    settle_s: Annotated[float, Field(ge=0, le=1e6)] = 0.1
     """Wait after each move of a step scan."""
     darks: Fields = Fields()
     flats: Fields = Fields()

@@ -15,7 +15,15 @@ from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, resolved_yaml
 from beamline.config.monitor import policies
 from beamline.config.references import reference_limits
-from beamline.core.errors import DataError, ReferencesError, ScanStopped, exit_code, user_message
+from beamline.core.errors import (
+    DataError,
+    ReferencesError,
+    ScanStopped,
+    exit_code,
+    is_defect,
+    leave_traceback,
+    user_message,
+)
 from beamline.core.events import Announcer, Emit, JsonLines, Sink
 from beamline.core.files import EVENTS
 from beamline.core.machine import free_memory
@@ -202,6 +210,8 @@ class _Run:
             if afterwards is not None:
                 result = self._reconstructed(afterwards, result)
         except BaseException as error:
+            if is_defect(error):
+                leave_traceback(error, self.folder)
             self.states.enter(self._end_by(error), "Ended early")
             self.emit("failed", {"message": user_message(error), "exit_code": exit_code(error), "folder": self.folder})
             raise

@@ -203,14 +203,18 @@ def write_legend(file: h5py.File) -> None:
 
 
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
-    """The legend of a scan file; today's checks where an older file has none."""
+    """The legend of a scan file; today's checks where an older file has none. ValueError for impossible bits."""
     columns = [hdf5.dataset(file, f"{LEGEND}/{name}") for name in ("name", "bit", "unit", "meaning")]
     if any(column is None for column in columns):
         return TODAY
-    return tuple(
+    legend = tuple(
         FlagBit(hdf5.text(name), int(bit), hdf5.text(unit), hdf5.text(meaning))
         for name, bit, unit, meaning in zip(*(column[()] for column in columns if column is not None), strict=True)
     )
+    bits = [entry.bit for entry in legend]
+    if len({*bits}) != len(bits) or any(not 0 <= bit < 64 - ALARM_SHIFT for bit in bits):
+        raise ValueError(f"the bits of {LEGEND} are {bits}; expected different ones from 0 to {63 - ALARM_SHIFT}")
+    return legend
 
 
 def read_flags(file: h5py.File, n: int) -> FrameFlags:

@@ -75,7 +75,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             problems.append(str(error))
             continue
         try:
-            require_harmless(file)
+            with readable(path):
+                require_harmless(file)
         except BaseException:
             file.close()
             raise
@@ -265,6 +266,8 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
             "expected degrees or radians. Set the attribute, or give --angles FILE (degrees, one a line)."
         )
     require_real(item.dtype, f"{item.name} in {item.file.filename}")
+    if lost := missing_links(item):
+        raise DataError(f"{item.file.filename} draws its angles from {lost[0]}, which is not there or differs.")
     return np.ravel(np.asarray(item[()], np.float64)) * factor
 
 
@@ -318,7 +321,9 @@ def _holds(drawn: h5py.Dataset, source: Any) -> bool:
 
 
 def require_possible(item: h5py.Dataset) -> None:
-    """DataError for frames [frame, row, col] of a size that no memory holds."""
+    """DataError for frames [frame, row, col] without pixels, or of a size that no memory holds."""
+    if 0 in item.shape[1:]:
+        raise DataError(f"{item.name} in {item.file.filename} has frames of {item.shape[1]} x {item.shape[2]} pixels.")
     if item.shape[0] > _FRAMES or item.shape[1] * item.shape[2] > _PIXELS:
         raise DataError(
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "

@@ -5,6 +5,7 @@ HDF5 opens whatever a link names: it waits for ever for a pipe, and for names of
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from contextlib import suppress
@@ -17,11 +18,13 @@ from beamline.core.errors import DataError
 from beamline.core.files import require_regular
 
 MOST_OBJECTS, DEEPEST, FILES = 50_000, 64, 64
+CLAIMED, PACKED = 1e9, 1e5  # bytes; and how many times what is stored
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
 def require_harmless(file: h5py.File) -> None:
-    """DataError for a file with more objects, or deeper groups, than any scan, or that draws on what is no file.
+    """DataError for a file with more objects or deeper groups than any scan, that draws on what is no file, or that
+    claims what it has not.
 
     Files that it draws on are looked at, too, and those that they draw on.
     """
@@ -82,7 +85,9 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
                     if info.type == h5py.h5o.TYPE_GROUP:
                         groups.append((h5py.h5g.open(group, name), depth + 1))
                     elif info.type == h5py.h5o.TYPE_DATASET:
-                        yield from _drawn_on(h5py.h5d.open(group, name))
+                        dataset = h5py.h5d.open(group, name)
+                        _refuse_empty_claim(dataset, f"{path}: {name.decode('utf-8', 'replace')}")
+                        yield from _drawn_on(dataset)
 
 
 def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
@@ -91,6 +96,15 @@ def _list(group: Any, links: list[tuple[bytes, int]]) -> None:
         return True if len(links) > MOST_OBJECTS else None
 
     group.links.iterate(take, info=True)
+
+
+def _refuse_empty_claim(dataset: Any, what: str) -> None:
+    """DataError for a dataset of more bytes than any compression makes of what is stored of it."""
+    n = math.prod(dataset.shape or ()) * dataset.dtype.itemsize
+    if n < CLAIMED or dataset.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
+        return
+    if n > PACKED * (stored := dataset.get_storage_size()):
+        raise DataError(f"{what} claims {n / 1e9:.3g} GB, of which {stored} bytes are there. Nothing was read.")
 
 
 def _drawn_on(dataset: Any) -> Iterator[str]:

@@ -62,7 +62,14 @@ class NXtomoSource(ScanReader):
     def _cone(self) -> tuple[float, float] | None:
         sod = hdf5.scalar(self._file, layout.SOURCE_DISTANCE, hdf5.LENGTH_UNITS)
         beyond = hdf5.scalar(self._places.detector, "distance", hdf5.LENGTH_UNITS)
-        return None if sod is None or beyond is None else (sod, sod + beyond)
+        if sod is None or beyond is None:
+            return None
+        if sod <= 0 or beyond < 0:
+            raise DataError(
+                f"{self.path}: the source is {sod:g} mm before the sample and the detector {beyond:g} mm behind it; "
+                "expected a positive distance of the source. Correct it in a copy of the file."
+            )
+        return sod, sod + beyond
 
     def _check(self) -> None:
         finer = hdf5.dataset(self._places.detector, "image_key_control")
@@ -72,7 +79,7 @@ class NXtomoSource(ScanReader):
         hdf5.require_possible(self._places.data)
         if self._ours:
             require_joined(self._file)
-        lost = hdf5.missing_links(self._places.data)
+        lost = hdf5.missing_links(self._places.data) + hdf5.missing_links(self._places.image_key)
         if lost:
             raise DataError(
                 f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."

@@ -145,7 +145,8 @@ def test_3_a_device_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Mon
     assert not (tmp_path / "runs").exists()
 
 
-ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK") if hasattr(signal, name)]
+NAMES = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGPWR", "SIGXCPU")
+ENDING = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])

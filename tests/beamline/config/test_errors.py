@@ -18,7 +18,10 @@ FAULTS = {
         ("views: 12", "views: 12, seed: 1"),
         "my.yaml:3: scan.angles.seed is not a known key; legal keys there: scheme, views, start_deg, span_deg",
     ),
-    "missing": (("exposure_s: 0.01", "settle_s: 0"), "my.yaml:2: scan.exposure_s is missing; expected a number > 0"),
+    "missing": (
+        ("exposure_s: 0.01", "settle_s: 0"),
+        "my.yaml:2: scan.exposure_s is missing; expected a number > 0 and <= 1e+06",
+    ),
     "choice": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {method: r3}"),
         "my.yaml:2: recon.method is 'r3'; expected auto | r2 | fbp | sirt | sart | cgls | asd-pocs | fista-tv | "
@@ -170,6 +173,24 @@ def test_faults_of_overrides_name_the_override(tmp_path: Path) -> None:
     assert "--set scan.period_s=[: this is not YAML" in faults(tmp_path, GOOD, "scan.period_s=[")
 
 
+@pytest.mark.parametrize("value", ["!!bool x", "!!timestamp x", "!!int ''", "!!float ''", "!!binary ä"])
+def test_a_tag_that_its_value_does_not_fit_is_no_yaml(tmp_path: Path, value: str) -> None:
+    assert "this is not YAML" in faults(tmp_path, GOOD, f"scan.period_s={value}")
+
+
+@pytest.mark.parametrize("key", ["scan.exposure_s", "scan.period_s", "scan.settle_s", "scan.flats.exposure_s"])
+def test_no_time_of_a_scan_is_longer_than_any_scan(tmp_path: Path, key: str) -> None:
+    assert f"{key} is 1.0e+308; expected a number" in faults(tmp_path, GOOD, f"{key}=1.0e+308")
+
+
+def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path) -> None:
+    large = tmp_path / "large.yaml"
+    large.write_text("# " + "x" * 2**20, encoding="utf-8")
+    for path, said in ((tmp_path, "It is a folder"), (large, "at most 1048576 are read")):
+        with pytest.raises(ConfigError, match=said):
+            load(path)
+
+
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"cannot be read: Is a directory|denied"):
+    with pytest.raises(ConfigError, match=r"cannot be read: It is a folder"):
         load(tmp_path)

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -106,6 +107,25 @@ def test_a_file_that_just_changed_is_left_alone_where_no_lock_tells(
     died = _died_in_the_scan(tmp_path, frames, clock)
     os.utime(died)
     with pytest.raises(DataError, match=r"changed \d s ago and is marked as being written.*Nothing was changed"):
+        recover(died)
+
+
+@pytest.mark.parametrize("ahead", [1e3, 1e6])
+def test_a_file_of_a_clock_that_is_ahead_is_recovered(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], ahead: float
+) -> None:
+    died = _died_in_the_scan(tmp_path, frames, clock)
+    os.utime(died, (died.stat().st_atime, time.time() + ahead))
+    assert recover(died).frames == 10
+
+
+def test_a_file_that_just_changed_by_the_clock_of_its_disk_is_left_alone(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    died = _died_in_the_scan(tmp_path, frames, clock)
+    os.utime(died)
+    monkeypatch.setattr(time, "time", lambda: 0.0)  # of a computer that is far behind its disk
+    with pytest.raises(DataError, match=r"changed \d s ago"):
         recover(died)
 
 

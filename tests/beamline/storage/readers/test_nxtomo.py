@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
+from beamline.storage import hdf5
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.readers.overlay import Overlay
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -275,7 +276,12 @@ def test_virtual_frames_of_a_dataset_that_was_replaced_are_refused(
 def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "f.h5", "w") as file:
         file.create_dataset("exchange/data", (3, 10**9, 10**9), "u2", chunks=(1, 10, 10))
-    with pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"):
+    with (
+        h5py.File(tmp_path / "f.h5") as file,
+        pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"),
+    ):
+        hdf5.require_possible(file["exchange/data"])
+    with pytest.raises(DataError, match=r"claims 6e\+09 GB, of which 0 bytes are there"):
         open_scan(tmp_path / "f.h5")
 
 

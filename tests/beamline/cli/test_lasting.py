@@ -1,0 +1,46 @@
+"""A terminal or a disk that takes no output ends no command, and changes no exit code of one that leaves files."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.beamline.cli.small_scan import SCAN
+from tests.beamline.scans import write_exchange
+
+FULL = Path("/dev/full")
+POSIX = pytest.mark.skipif(not FULL.exists(), reason="the system has no device that is always full")
+
+
+def _run(folder: Path, redirected: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    words = " ".join([sys.executable, "-m", "beamline.cli.main", *arguments])
+    return subprocess.run(
+        ["bash", "-c", f"{words} {redirected}"], cwd=folder, capture_output=True, text=True, timeout=200
+    )
+
+
+@POSIX
+def test_what_is_printed_to_a_full_disk_is_an_error_of_the_disk(folder: Path) -> None:
+    done = _run(folder, "> /dev/full", "info", "scan.h5")
+    assert done.returncode == 5
+    assert done.stderr == "beamline: the output on stdout is not whole (No space left on device).\n"
+
+
+@POSIX
+@pytest.mark.slow
+@pytest.mark.parametrize("redirected", ["> /dev/full", "> /dev/full 2>&1", ">&- 2>&- <&-", "2> /dev/full"])
+def test_a_command_that_leaves_a_file_ends_as_ever(tmp_path: Path, redirected: str) -> None:
+    write_exchange(tmp_path / "scan.h5", SCAN)
+    assert _run(tmp_path, redirected, "ingest", "scan.h5", "out.h5").returncode == 0
+    assert _run(tmp_path, redirected, "ingest", "scan.h5", "out.h5").returncode == 5  # it is there
+    assert _run(tmp_path, "", "validate", "--deep", "out.h5").returncode == 0  # and nothing was printed into it
+
+
+@POSIX
+@pytest.mark.slow
+def test_a_reader_that_wants_no_more_is_no_error(folder: Path) -> None:
+    done = _run(folder, "| head -c 1; exit ${PIPESTATUS[0]}", "config", "schema")
+    assert (done.returncode, done.stderr) == (0, "")

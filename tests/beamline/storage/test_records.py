@@ -1,0 +1,71 @@
+"""What a row of the frame log says of its frame has a checksum: a row that says something else is used by nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.projections.replay import replay
+from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest
+from beamline.storage.parts import views_in
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import validate
+from beamline.storage.writers import layout
+from drivers.frame import Frame, FrameKind
+from tests.beamline.scans import seal
+
+Write = Callable[[list[Frame]], Path]
+ROW = 8
+
+
+def _flip(path: Path, column: str, row: int, bit: int) -> None:
+    with h5py.File(path, "r+") as file:
+        values = file[column][()]
+        values[row : row + 1].view(f"u{values.itemsize}")[0] ^= np.array(1 << bit, f"u{values.itemsize}")
+        file[column][...] = values
+
+
+@pytest.mark.parametrize("column", [*layout.RECORDED, layout.RECORD_CHECKSUM])
+def test_one_flipped_bit_is_found_and_its_frame_is_left_out(write: Write, frames: list[Frame], column: str) -> None:
+    path = write(frames)
+    assert not [finding for finding in validate(path) if finding.rule == "records"]
+    _flip(path, column, ROW, 8 * np.dtype(layout.COLUMNS[column][0]).itemsize - 3)
+    with open_scan(path) as source:
+        assert source.altered == {ROW}
+        assert np.flatnonzero(source.image_key == FrameKind.INVALID).tolist() == [ROW]
+        assert sum(1 for _ in replay(source)) == len(frames)  # and does not count to 2**61
+    assert [f.severity for f in validate(path) if f.rule == "records"] == ["error"]
+    assert any("Look for a good copy" in said for said in describe(path)["findings"])
+    with h5py.File(path) as file:
+        assert len(views_in(file)) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
+    with pytest.raises(DataError, match=rf"differs from the checksum written with it: {ROW}\..* Nothing was written"):
+        ingest(path, path.with_name("copy.h5"))
+
+
+def test_a_view_that_was_taken_again_keeps_its_checksum(write: Write, frames: list[Frame]) -> None:
+    again = replace(frames[ROW], index=len(frames), time=frames[-1].time + 1, replaces=ROW)
+    path = write([*frames, again])
+    with open_scan(path) as source:
+        assert source.altered == frozenset()
+        assert source.image_key[ROW] == FrameKind.INVALID
+    _flip(path, layout.TRIGGER, ROW, 1)
+    with open_scan(path) as source:
+        assert source.altered == {ROW}
+
+
+def test_rows_that_replace_each_other_in_a_circle_are_refused(write: Write, frames: list[Frame]) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        file[layout.REPLACES][ROW] = ROW
+        seal(file)  # as if it had been written so
+        with pytest.raises(ValueError, match="row 8 is said to replace row 8"):
+            views_in(file)
+    with open_scan(path) as source, pytest.raises(DataError, match="only one before it can be replaced"):
+        _ = source.replaces
