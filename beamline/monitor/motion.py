@@ -15,6 +15,7 @@ from beamline.monitor.scatter import Scatter
 from drivers.frame import Frame
 
 SIGMAS = 8.0
+CONFIRMED = 0.5  # of the figure, that must be in what differs from row to row: a ghost is as high as the frame
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class Motion:
             max(least, SIGMAS * s.sigma) for least, s in zip(limits, usual, strict=True)
         )
         across, down, turn = (x - s.mean for x, s in zip(found, usual, strict=True))
-        if abs(across) > limit_across or abs(down) > limit_down:
+        jumped = abs(across) > limit_across or abs(down) > limit_down
+        if jumped:
             score, limit = math.hypot(across, down), min(limit_across, limit_down)
             advice = (
                 f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
@@ -84,4 +86,8 @@ class Motion:
             )
         else:
             return Look(after)
+        if (beside := change.beside_columns()) is not None:
+            right, below, further = (x - s.mean for x, s in zip(beside, usual, strict=True))
+            if (math.hypot(right, below) if jumped else abs(further)) < CONFIRMED * abs(score):
+                return Look(after)
         return Look(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, frame.index, score, limit, advice))
