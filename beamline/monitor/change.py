@@ -168,7 +168,7 @@ def _weigh(change, usual, weight, share, deviation):  # type: ignore[no-untyped-
 
 @numba.njit(nogil=True, cache=True)
 def _fit(now, one, two, four, weight, steps, residual, image, turning, found):  # type: ignore[no-untyped-def]
-    """Fills `residual`, `image`, `turning` and `found`: minus gain, across, down in cells, turn in velocities, noise."""
+    """Fills `residual`, `image`, `turning` and `found`: minus gain, across, down in cells, turn in steps, noise."""
     rows, cols = now.shape
     velocity = (one - four) * np.float32(steps / 3)
     change = now - one - velocity

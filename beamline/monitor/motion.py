@@ -15,7 +15,7 @@ from beamline.monitor.scatter import Scatter
 from drivers.frame import Frame
 
 SIGMAS = 8.0
-CONFIRMED = 0.5  # of the figure, that must be in what differs from row to row: a ghost is as high as the frame
+CONFIRMED = 0.5  # of a figure; where less of it differs from row to row, that counts: a ghost is as high as the frame
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,14 @@ class Motion:
             max(least, SIGMAS * s.sigma) for least, s in zip(limits, usual, strict=True)
         )
         across, down, turn = (x - s.mean for x, s in zip(found, usual, strict=True))
-        jumped = abs(across) > limit_across or abs(down) > limit_down
-        if jumped:
+        over = abs(across) > limit_across or abs(down) > limit_down or abs(turn) > limit_turn
+        if over and (beside := change.beside_columns()) is not None:
+            right, below, further = (x - s.mean for x, s in zip(beside, usual, strict=True))
+            if math.hypot(right, below) < CONFIRMED * math.hypot(across, down):
+                across, down = right, below
+            if abs(further) < CONFIRMED * abs(turn):
+                turn = further
+        if abs(across) > limit_across or abs(down) > limit_down:
             score, limit = math.hypot(across, down), min(limit_across, limit_down)
             advice = (
                 f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
@@ -86,8 +92,4 @@ class Motion:
             )
         else:
             return Look(after)
-        if (beside := change.beside_columns()) is not None:
-            right, below, further = (x - s.mean for x, s in zip(beside, usual, strict=True))
-            if (math.hypot(right, below) if jumped else abs(further)) < CONFIRMED * abs(score):
-                return Look(after)
         return Look(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, frame.index, score, limit, advice))
