@@ -17,12 +17,13 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
-from beamline.core.errors import AlarmError
+from beamline.core.errors import AlarmError, DataError
 from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
 from beamline.core.stop import StopRequest
 from beamline.core.text import count
 from drivers.clock import SystemClock
+from drivers.frame import FrameKind
 from recon.base.choices import AUTO
 from recon.methods import streams
 
@@ -145,10 +146,20 @@ def _faults(result: RunResult) -> list[str]:
             f"{result.alarmed_frames} of {result.n_frames} frames {verb} an alarm of the monitor{again}: "
             f"{counted(result.flags)}."
         )
-    if result.alarmed_views:
-        views = count(result.alarmed_views, "view")
-        said.append(f"`beamline recon` leaves out {views} among them; repeat the scan where too many are lost.")
+    if result.alarmed_views and (treated := _treated(result.path)):
+        said.append(f"A reconstruction (--flags use): {treated} Repeat the scan where too many views are lost.")
     return [*said, *result.reference_faults]
+
+
+def _treated(path: Path) -> str:
+    """What a reconstruction does with flagged views, in its own words; empty where the file does not tell."""
+    from beamline.storage.readers.open import open_scan
+    from beamline.storage.rules.treatment import treatment_of
+
+    with suppress(DataError), open_scan(path) as source:
+        views = source.image_key == FrameKind.PROJECTION
+        return "" if source.flags is None else treatment_of(source.flags, views, source.shape).said
+    return ""
 
 
 def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sinks: Sequence[Sink]) -> None:

@@ -22,6 +22,7 @@ from beamline.monitor.view import Cells, Grid, View
 
 SPAN = 4  # views before, of which the velocity is the mean of three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
+LEAST_VARYING = 0.1  # of what a shift changes, which must differ from row to row
 MOST_STEPS = 4  # steps that a gap may have: after a longer one, velocities say nothing
 
 
@@ -35,6 +36,7 @@ class Change:
         turn: steps by which the stage turned further than its last ones; NaN where nothing turns visibly.
         residual: float32 [row, col], change of the depth that these do not explain.
         noise: robust standard deviation of the residual times the square root of the weight, over the lit cells.
+        causes: what the fit knew, for `beside_columns`.
     """
 
     gain: float
@@ -43,6 +45,50 @@ class Change:
     turn: float
     residual: Cells
     noise: float
+    causes: Causes | None = None
+
+    def beside_columns(self) -> tuple[float, float, float] | None:
+        """Across, down and turn by what differs from row to row; None where the rows are too much alike to tell.
+
+        A hump of light that is as high as the frame, such as a ghost, changes all rows of a column alike. It shifts
+        nothing here, and a sample that moves moves here, too.
+        """
+        if self.causes is None or min(self.residual.shape) < 2:
+            return None
+        weight = self.causes.weight[:, 1:-1]
+        sums = np.maximum(weight.sum(axis=0), np.float32(1e-12))
+        whole = self.causes.basis()[:, :, 1:-1]
+        basis, residual = (x - (weight * x).sum(axis=-2, keepdims=True) / sums for x in (whole, self.residual[:, 1:-1]))
+        weighted = (basis * weight).reshape(3, -1).astype(np.float64)
+        normal = weighted @ basis.reshape(3, -1).T
+        if (np.diag(normal)[:2] < LEAST_VARYING * (whole**2 * weight).sum(axis=(1, 2))[:2]).any() or not normal.any():
+            return None
+        normal += np.diag(1e-9 * np.diag(normal) + 1e-12)
+        across, down, turn = np.linalg.solve(normal, weighted @ residual.ravel()).tolist()
+        return self.across + across, self.down + down, self.turn + turn
+
+
+@dataclass(frozen=True, eq=False)
+class Causes:
+    """What a fit of a view to those before knew.
+
+    Attributes:
+        image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed.
+        weight: float32 [row, col].
+        steps: since the view before.
+        cell: pixels a side.
+    """
+
+    image: Cells
+    turning: Cells
+    weight: Cells
+    steps: float
+    cell: int
+
+    def basis(self) -> Cells:
+        """[cause, row, col]: what a pixel across, a pixel down and a turn of a step change."""
+        down, across = np.gradient(self.image)
+        return np.stack([-across / self.cell, -down / self.cell, self.turning * np.float32(self.steps)])
 
 
 def change_of(view: View, before: Sequence[View], grid: Grid) -> Change | None:
@@ -56,19 +102,23 @@ def change_of(view: View, before: Sequence[View], grid: Grid) -> Change | None:
     # A gain that has changed is no velocity.
     gained = np.float32(sum(one.brighter for one in last[1:]))
     found = np.zeros(5)
-    residual = np.empty_like(view.depth)
+    residual, image, turning = (np.empty_like(view.depth) for _ in range(3))
+    weight = np.minimum(view.weight, last[-1].weight)
     _fit(
         view.depth,
         last[-1].depth,
         last[-2].depth,
         last[0].depth - gained,
-        np.minimum(view.weight, last[-1].weight),
+        weight,
         steps,
         residual,
+        image,
+        turning,
         found,
     )
     gain, across, down, turn, noise = (float(x) for x in found)
-    return Change(math.expm1(-gain), across * grid.cell, down * grid.cell, turn / float(steps), residual, noise)
+    causes = Causes(image, turning, weight, float(steps), grid.cell)
+    return Change(math.expm1(-gain), across * grid.cell, down * grid.cell, turn / float(steps), residual, noise, causes)
 
 
 def _steps(view: View, last: Sequence[View]) -> float | None:
@@ -117,14 +167,13 @@ def _weigh(change, usual, weight, share, deviation):  # type: ignore[no-untyped-
 
 
 @njit(nogil=True, cache=True)
-def _fit(now, one, two, four, weight, steps, residual, found):  # type: ignore[no-untyped-def]
-    """Fills `residual` and `found`: minus gain, across and down in cells, turn in velocities, noise."""
+def _fit(now, one, two, four, weight, steps, residual, image, turning, found):  # type: ignore[no-untyped-def]
+    """Fills `residual`, `image`, `turning` and `found`: minus gain, across, down in cells, turn in steps, noise."""
     rows, cols = now.shape
     velocity = (one - four) * np.float32(steps / 3)
     change = now - one - velocity
     line = np.empty(cols, np.float32)
-    image, smooth = np.empty_like(now), np.empty_like(now)
-    turning, left_over = np.empty_like(now), np.empty_like(now)
+    smooth, left_over = np.empty_like(now), np.empty_like(now)
     # Half a step back, as `change` compares now with one: the gradient is that of the middle.
     _smooth((one + two) * np.float32(0.5) + velocity, image, line)
     _smooth(velocity, turning, line)

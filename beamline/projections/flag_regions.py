@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.flag_legend import FlagBit, FrameFlags
+from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.rules.treatment import boxes_of, flagged_in_part
 from recon.base.binning import bin_views
 from recon.prep.resample import Resampling
 
 WARNED_SHARE = 0.5
 """Weight of a ray in the region of a warning."""
-LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
-MARGIN = 0.25  # of the region's shorter side, on all sides
 
 I64 = NDArray[np.int64]
 
@@ -72,21 +70,16 @@ class Regions:
 
 
 def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
-    """The regions of warnings and alarms in frames of this shape; rays in those of an alarm weigh nothing.
-
-    A view that a check marked when it had seen later ones has no region in the file: it takes the one that these lead
-    to, on a straight line.
-    """
+    """The regions of warnings and alarms in frames of this shape; rays in those of an alarm weigh nothing."""
     if flags.regions is None:
         return Regions(local=np.zeros(flags.bits.size, np.bool_))
-    whole, found = np.zeros(flags.bits.size, np.bool_), []
-    for i, entry in enumerate(flags.legend):
-        for frame, box in _boxes(flags, i, entry, shape):
-            if box is None:
-                whole[frame] = True
-            else:
-                found.append((frame, box, 0.0 if flags.bits[frame] >> entry.alarm_bit & 1 else WARNED_SHARE))
-    local = flags.flagged & ~whole
+    found = [
+        (frame, box, 0.0 if flags.bits[frame] >> entry.alarm_bit & 1 else WARNED_SHARE)
+        for i, entry in enumerate(flags.legend)
+        for frame, box in boxes_of(flags, i, entry, shape)
+        if box is not None
+    ]
+    local = flagged_in_part(flags, shape)
     kept = [each for each in found if local[each[0]]]
     return Regions(
         np.array([frame for frame, _, _ in kept], np.int64),
@@ -94,31 +87,3 @@ def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
         np.array([share for _, _, share in kept], np.float32),
         local,
     )
-
-
-def _boxes(
-    flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
-) -> Iterator[tuple[int, tuple[int, int, int, int] | None]]:
-    """Frames that a check flagged, each with its region and a margin; None: the whole view, or most of it."""
-    assert flags.regions is not None
-    rows = np.flatnonzero(flags.bits >> entry.bit & 1)
-    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
-        boxes = flags.regions[run, check].astype(np.float64)
-        known = boxes[:, 0] >= 0
-        if known.any() and not known.all():
-            line = np.polynomial.Polynomial.fit if known.sum() > 1 else None
-            for side in range(4):
-                values = boxes[known, side]
-                boxes[~known, side] = (
-                    values[0] if line is None else line(run[known], values, 1)(run[~known])  # ends move alike
-                )
-        for frame, box in zip(run.tolist(), boxes, strict=True):
-            top, bottom, left, right = box
-            margin = MARGIN * min(bottom - top, right - left)
-            low = np.floor(np.array([top, left]) - margin).astype(int).clip(0)
-            high = np.minimum(np.ceil(np.array([bottom, right]) + margin).astype(int), shape)
-            area = float(np.prod((high - low).clip(0)))
-            if not known.any() or area > LARGEST * shape[0] * shape[1]:
-                yield frame, None
-            else:
-                yield frame, (int(low[0]), int(high[0]), int(low[1]), max(int(high[1]), int(low[1])))

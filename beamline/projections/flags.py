@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import count
-from beamline.monitor.check import Level
-from beamline.monitor.motion import Motion
-from beamline.monitor.opposite import Opposite
 from beamline.projections.flag_regions import Regions, regions_of
-from beamline.storage.flag_legend import FrameFlags, counted
+from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.treatment import treatment_of
 from drivers.frame import FrameKind
 
 WARNED_WEIGHT = 0.5
@@ -55,9 +53,6 @@ class UsableViews:
 def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:
     """Projections without an alarm, and what they weigh; with `use_flags` False all of them, alike.
 
-    A view in which the sample jumped is as good as those after it: see `UsableViews.jumps`; and then, what views from
-    opposite sides show of it is no fault of theirs.
-
     Args:
         judged: flags that count in place of the file's.
     """
@@ -72,35 +67,17 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         said = f"--flags ignore: {n} are used as they are."
         return UsableViews(rows, said=said, flags=flags)
-    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
-    jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
-    all_flags, flags = flags, flags.without(Motion.bit)
-    if jumped.size:  # what views from the other side show of the jump is corrected with it
-        flags = flags.without(Opposite.bit)
-    if not flags.flagged[rows].any():
-        return UsableViews(rows, flags=all_flags, jumps=jumped)
-    regions = regions_of(flags, source.shape)
-    alarmed, warned = (views & some & ~regions.local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
-    partly, parts = views & regions.local, []
-    if alarmed.any():
-        verbs = ("has", "is") if alarmed.sum() == 1 else ("have", "are")
-        which = counted(flags.of(alarmed).counts())
-        parts.append(f"{alarmed.sum()} {verbs[0]} an alarm and {verbs[1]} left out ({which})")
-    weights = None
-    if warned.any():
-        verbs = ("has", "weighs") if warned.sum() == 1 else ("have", "weigh")
-        parts.append(f"{warned.sum()} {verbs[0]} a warning and {verbs[1]} half ({counted(flags.of(warned).counts())})")
-        weights = np.where(warned, np.float32(WARNED_WEIGHT), np.float32(1))
-    if partly.any():
-        verb = "is" if partly.sum() == 1 else "are"
-        which = counted(flags.of(partly).counts())
-        parts.append(f"{partly.sum()} {verb} flagged in a part, where rays weigh half, with an alarm nothing ({which})")
-    good = np.flatnonzero(views & ~alarmed)
+    treated = treatment_of(flags, views, source.shape)
+    if not treated.said:
+        return UsableViews(rows, flags=flags, jumps=treated.jumps)
+    weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
+    good = np.flatnonzero(views & ~treated.left_out)
     period = np.pi if source.cone is None else 2 * np.pi
     before, after = (_widest_gap(source.angles[some], period) for some in (rows, good))
     gap = f" They leave {np.degrees(after):.3g}° without a view." if after >= WIDE * before else ""
-    said = f"Of {rows.size} views {', '.join(parts)}.{gap} --flags ignore takes all alike."
-    return UsableViews(good, weights, int(alarmed.sum()), said, all_flags, regions, jumped)
+    said = f"{treated.said}{gap} --flags ignore takes all alike."
+    regions = regions_of(treated.flags, source.shape)
+    return UsableViews(good, weights, int(treated.left_out.sum()), said, flags, regions, treated.jumps)
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:

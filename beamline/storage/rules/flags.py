@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from beamline.core.text import count, spans
-from beamline.monitor.motion import Motion
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.treatment import treatment_of
 from drivers.frame import FrameKind
 
 FEWEST_VIEWS = 10
@@ -42,16 +42,15 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
             yield Finding("info", "flags", f"{message} No other frame has an alarm.")
             return
         message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
-    views = source.image_key == FrameKind.PROJECTION
-    spoilt = flags.without(Motion.bit).alarmed  # a view in which the sample jumped is as good as those after it
-    left, lost = int((views & ~spoilt).sum()), int((views & spoilt).sum())
-    if lost and left < FEWEST_VIEWS:
+    treated = treatment_of(flags, source.image_key == FrameKind.PROJECTION, source.shape)
+    n, lost = int(treated.views.sum()), int(treated.left_out.sum())
+    if lost and n - lost < FEWEST_VIEWS:
         message += (
-            f" {left} of {views.sum()} views have none, {FEWEST_VIEWS} are needed: repeat the scan. "
+            f" {n - lost} of {n} views are left, {FEWEST_VIEWS} are needed: repeat the scan. "
             "`beamline recon --flags ignore` takes all views, flagged ones too."
         )
         yield Finding("error", "flags", message)
         return
-    if lost:
-        message += f" A reconstruction leaves {count(lost, 'view')} among them out."
+    if treated.said:
+        message += f" A reconstruction (--flags use): {treated.said}"
     yield Finding("warning", "flags", message)

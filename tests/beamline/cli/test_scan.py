@@ -305,6 +305,7 @@ def test_7_a_complete_scan_with_alarms_says_so_last(tmp_path: Path, monkeypatch:
     assert result.exit_code == 7
     assert result.stdout.splitlines()[-1].startswith("flagged   stuck 3 alarm; see ")
     assert "Scan complete: 17 frames, 3 WITH AN ALARM" in result.stderr
+    assert "A reconstruction (--flags use): Of 12 views 3 have an alarm and are left out" in result.stderr
     assert "complete, but 3 of 17 frames have an alarm of the monitor: stuck 3 alarm" in result.stderr.splitlines()[-1]
     assert rows(tmp_path) == 17
     on(monkeypatch, FakeInstrument(Faults(repeats={9})))

@@ -10,6 +10,7 @@ import pytest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.motion import Motion
 from tests.beamline.monitor.blobs import BLOCK, Blobs
+from tests.beamline.monitor.test_ghost import fog
 
 
 def only(scan: Blobs) -> list[Flag]:
@@ -51,3 +52,20 @@ def test_vibration_raises_the_limit() -> None:
     rng = np.random.default_rng(4)
     scan.depth = lambda view, image: scan.line_integrals(view, tuple(rng.normal(0, 0.4 / BLOCK, 2)))
     assert only(scan) == []
+
+
+GHOSTS = [(0.6, 8.0, 30.0), (0.3, 3.0, 12.0), (0.1, 15.0, 30.0), (-0.1, 8.0, 30.0), (-0.3, 15.0, 12.0)]
+
+
+@pytest.mark.parametrize(("gain", "speed", "half_width"), GHOSTS)
+def test_the_edges_of_a_ghost_are_no_jump(gain: float, speed: float, half_width: float) -> None:
+    assert only(Blobs(80, counts=fog(gain, speed, half_width))) == []
+
+
+@pytest.mark.parametrize(("gain", "speed", "half_width"), GHOSTS)
+@pytest.mark.parametrize("shift", [(1.0, 0.0), (0.0, -1.0)])
+def test_a_jump_behind_a_ghost_is_one(gain: float, speed: float, half_width: float, shift: tuple[float, float]) -> None:
+    scan = jumping(*shift)
+    ghost = fog(gain, speed, half_width)
+    scan.counts = lambda view, light: ghost(view + 17, light)  # in the field from view 33 on at the latest
+    assert 50 in [flag.frame for flag in only(scan)]

@@ -109,7 +109,8 @@ def test_one_attempt_is_made(tmp_path: Path) -> None:
     assert (ran.result.retaken, ran.result.alarmed_frames) == (2, 1)
     (found,) = [finding for finding in validate(ran.result.path) if finding.rule == "flags"]
     assert found.severity == "warning"
-    assert "Frames with an alarm beside these: 22. A reconstruction leaves 1 view among them out" in found.message
+    said = "A reconstruction (--flags use): Of 16 views 1 has an alarm and is left out"
+    assert f"Frames with an alarm beside these: 22. {said}" in found.message
 
 
 def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Path) -> None:

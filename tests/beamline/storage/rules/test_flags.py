@@ -7,8 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.monitor.check import Level
+from beamline.monitor.check import Flag, Level
+from beamline.projections.flags import usable_views
 from beamline.storage.describe import describe
+from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.validate import validate
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -22,9 +26,10 @@ FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 
         (
             range(6, 9),
             "warning",
-            "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction leaves 3 v",
+            "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction (--flags "
+            "use): Of 18 views 3 have an alarm and are left out (beam 3 alarm)",
         ),
-        (range(6, 20), "error", "Frames with an alarm: 6-19. 4 of 18 views have none, 10 are needed"),
+        (range(6, 20), "error", "Frames with an alarm: 6-19. 4 of 18 views are left, 10 are needed"),
         (range(2), "warning", "Frames with an alarm: 0-1."),
     ],
 )
@@ -40,3 +45,27 @@ def test_a_scan_without_flags_has_no_finding(tmp_path: Path) -> None:
     path = write_flagged(tmp_path / "s.h5", FRAMES, {})
     assert [finding for finding in validate(path) if finding.rule == "flags"] == []
     assert (describe(path)["flagged_frames"], describe(path)["flags"]) == (0, {})
+
+
+IN_A_PART = "Of 18 views 4 are flagged in a part, where rays weigh half, with an alarm nothing (bands 4 alarm)."
+
+
+@pytest.mark.parametrize(
+    ("region", "said"),
+    [
+        ((0, 1, 4, 8), IN_A_PART),
+        (None, "Of 18 views 4 have an alarm and are left out (bands 4 alarm)."),
+    ],
+)
+def test_what_a_reconstruction_does_is_said_in_its_own_words(
+    tmp_path: Path, region: tuple[int, int, int, int] | None, said: str
+) -> None:
+    """Views that are masked in a part are not said to be left out: info, validate and recon have one rule."""
+    flags = [[Flag("bands", Level.ALARM, row, 0.5, 0.1, "", region)] if 6 <= row < 10 else [] for row in range(22)]
+    judged = FrameFlags.of_flags(flags)
+    with open_scan(write_flagged(tmp_path / "s.h5", FRAMES, {})) as source:
+        (finding,) = frames_flagged(source, judged)
+        taken = usable_views(source, True, judged)
+    assert finding.message.endswith(f"A reconstruction (--flags use): {said}")
+    assert taken.said.startswith(said)
+    assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)

@@ -1,0 +1,109 @@
+"""Treatment: what a reconstruction does with views by their flags; every command says it in these words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.check import Level
+from beamline.monitor.motion import Motion
+from beamline.monitor.opposite import Opposite
+from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
+
+LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
+MARGIN = 0.25  # of the region's shorter side, on all sides
+
+Mask = NDArray[np.bool_]
+Box = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Treatment:
+    """What becomes of the views of a scan.
+
+    Attributes:
+        flags: of all frames, those that count.
+        views, left_out, halved, masked: bool [frame of the file]: views; of these those with an alarm, which are left
+            out, those with a warning, which weigh half, and those that are flagged in a part, where rays weigh less.
+        jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
+    """
+
+    flags: FrameFlags
+    views: Mask
+    left_out: Mask
+    halved: Mask
+    masked: Mask
+    jumps: NDArray[np.int64]
+
+    @property
+    def said(self) -> str:
+        """One sentence; empty where no view is flagged."""
+        parts = []
+        for some, verbs in (
+            (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
+            (self.halved, (("has a warning and weighs", "have a warning and weigh"), "half")),
+            (self.masked, (("is", "are"), "flagged in a part, where rays weigh half, with an alarm nothing")),
+        ):
+            if n := int(some.sum()):
+                parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(some).counts())})")
+        return f"Of {self.views.sum()} views {', '.join(parts)}." if parts else ""
+
+
+def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Treatment:
+    """What `beamline recon` does with these views, whose frames have this shape, unless it ignores flags.
+
+    A view in which the sample jumped is as good as those after it; and then, what views from opposite sides show of it
+    is no fault of theirs.
+    """
+    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
+    jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
+    flags = flags.without(Motion.bit)
+    if jumped.size:  # what views from the other side show of the jump is corrected with it
+        flags = flags.without(Opposite.bit)
+    local = flagged_in_part(flags, shape)
+    left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
+    return Treatment(flags, views, left_out, halved, views & local, jumped)
+
+
+def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
+    """[frame]: it is flagged, and every flag is of a part of it."""
+    whole = np.zeros(flags.bits.size, np.bool_)
+    if flags.regions is None:
+        return whole
+    for i, entry in enumerate(flags.legend):
+        for frame, box in boxes_of(flags, i, entry, shape):
+            whole[frame] |= box is None
+    return flags.flagged & ~whole
+
+
+def boxes_of(flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]) -> Iterator[tuple[int, Box | None]]:
+    """Frames that a check flagged, each with its region and a margin; None: the whole view, or most of it.
+
+    A view that a check marked when it had seen later ones has no region in the file: it takes the one that these lead
+    to, on a straight line.
+    """
+    assert flags.regions is not None
+    rows = np.flatnonzero(flags.bits >> entry.bit & 1)
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        boxes = flags.regions[run, check].astype(np.float64)
+        known = boxes[:, 0] >= 0
+        if known.any() and not known.all():
+            line = np.polynomial.Polynomial.fit if known.sum() > 1 else None
+            for side in range(4):
+                values = boxes[known, side]
+                boxes[~known, side] = (
+                    values[0] if line is None else line(run[known], values, 1)(run[~known])  # ends move alike
+                )
+        for frame, box in zip(run.tolist(), boxes, strict=True):
+            top, bottom, left, right = box
+            margin = MARGIN * min(bottom - top, right - left)
+            low = np.floor(np.array([top, left]) - margin).astype(int).clip(0)
+            high = np.minimum(np.ceil(np.array([bottom, right]) + margin).astype(int), shape)
+            area = float(np.prod((high - low).clip(0)))
+            if not known.any() or area > LARGEST * shape[0] * shape[1]:
+                yield frame, None
+            else:
+                yield frame, (int(low[0]), int(high[0]), int(low[1]), max(int(high[1]), int(low[1])))
