@@ -141,6 +141,12 @@ class ChildProcess:
         self._close_stdin()
         return ending
 
+    def beat(self) -> None:
+        """Write a byte to the stdin of a tethered process, as a sign that we live."""
+        assert self._process.stdin is not None
+        with suppress(OSError, ValueError):  # it has ended
+            os.write(self._process.stdin.fileno(), b".")
+
     def end(self, grace: float = 0.0) -> None:
         """End the process if it still runs: it has `grace` real s before it is killed."""
         if self.running:
