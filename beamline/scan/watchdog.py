@@ -39,14 +39,8 @@ BEAT = 1.0  # real s between signs of life
 FROZEN = 60.0  # s without one, after which a scan counts as dead
 AGAIN = 3  # watchdogs that are started in the place of others
 ACTED = 70  # exit code of one that has made the instrument safe
-INHIBIT = (
-    "systemd-inhibit",
-    "--what=shutdown:sleep",
-    "--mode=block",
-    "--who=beamline scan",
-    "--why=A scan runs",
-    "cat",
-)
+COMMAND = (sys.executable, "-m", "beamline.scan.watchdog")
+INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=beamline", "--why=A scan runs", "cat")
 
 
 @contextmanager
@@ -79,7 +73,8 @@ def inhibited() -> Iterator[None]:
             with suppress(OSError):
                 nowhere = ending.enter_context(Path(os.devnull).open("w"))
                 words = [program, *INHIBIT[1:]]
-                ending.enter_context(ChildProcess(words, nowhere, lambda line: None, tether=True))
+                process = ending.enter_context(ChildProcess(words, nowhere, lambda line: None, tether=True))
+                ending.callback(process.let_go)
         yield
 
 
@@ -93,7 +88,7 @@ class _Keeper:
     def __init__(
         self, folder: Path, emit: Emit, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
     ) -> None:
-        self._command = [sys.executable, "-m", "beamline.scan.watchdog", str(folder), str(os.getpid())]
+        self._command = [*COMMAND, str(folder), str(os.getpid())]
         self._emit, self._start = emit, start
         self._ready, self._over = threading.Event(), threading.Event()
         self._process = self._started()
@@ -106,9 +101,6 @@ class _Keeper:
             self._process.beat()
         if not self._ready.is_set() or not self._process.running:
             self._warn("The watchdog does not run: a scan that is killed leaves the shutter open.")
-            if pause is not None:
-                pause.pause("no watchdog runs")
-            return
         self._thread = threading.Thread(target=self._keep, args=(stop, pause), name="watchdog", daemon=True)
         self._thread.start()
 
@@ -131,14 +123,13 @@ class _Keeper:
                 stop.abort(why)
                 return
             if not left:
-                self._warn(
-                    f"The watchdog has ended again (code {code}): a scan that is killed leaves the shutter open."
-                )
+                self._warn(f"The watchdog has ended, too ({code}): a scan that is killed leaves the shutter open.")
                 if pause is not None:
                     pause.pause("no watchdog runs")
                 return
             left -= 1
             self._warn(f"The watchdog has ended (code {code}); another one is started.")
+            self._process.end()
             with suppress(OSError):
                 self._process = self._started()
 
@@ -241,7 +232,7 @@ def main(folder: Path, scan: int, source: BinaryIO) -> int:
 
     if frozen:
         say(
-            f"The process of the scan did nothing for {FROZEN:.0f} s: it counts as dead. It is killed to free its ports."
+            f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. It is killed to free its port."
         )
         try:
             psutil.Process(scan).kill()  # it is still that process: the pipe is open
