@@ -18,8 +18,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime
+from io import BytesIO, RawIOBase
 from pathlib import Path
-from typing import BinaryIO
 
 import psutil
 
@@ -178,7 +178,7 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
 class _Life:
     """Signs of life from a stream, counted in a thread: a read of a pipe waits."""
 
-    def __init__(self, source: BinaryIO) -> None:
+    def __init__(self, source: RawIOBase | BytesIO) -> None:
         self._source, self.signs, self.ended = source, 0, False
         threading.Thread(target=self._read, name="signs of life", daemon=True).start()
 
@@ -209,7 +209,7 @@ def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
     return False
 
 
-def main(folder: Path, scan: int, source: BinaryIO) -> int:
+def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
     """Wait until the scan is dead, then act, and write down what was done; the exit code.
 
     Args:
@@ -245,4 +245,6 @@ def main(folder: Path, scan: int, source: BinaryIO) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), sys.stdin.buffer))
+    # Without a buffer, whose lock a reading thread would hold at the end of the process.
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as signs_of_life:  # noqa: PTH123
+        sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), signs_of_life))

@@ -51,7 +51,7 @@ import sys
 from pathlib import Path
 from beamline.scan import watchdog
 watchdog.FROZEN = 10.0
-watchdog.main(Path(sys.argv[1]), int(sys.argv[2]), sys.stdin.buffer)
+watchdog.main(Path(sys.argv[1]), int(sys.argv[2]), sys.stdin.buffer.raw)
 """
 posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets no such requests")
 
