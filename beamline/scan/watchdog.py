@@ -246,5 +246,5 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
 
 if __name__ == "__main__":
     # Without a buffer, whose lock a reading thread would hold at the end of the process.
-    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as signs_of_life:  # noqa: PTH123
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as signs_of_life:
         sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), signs_of_life))
