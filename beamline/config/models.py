@@ -109,6 +109,8 @@ class Scan(Section):
     """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 0.1
     """Wait after each move of a step scan."""
+    without_watchdog: Literal["warn", "pause"] = "warn"
+    """What a scan does that has no watchdog, or whose watchdog ended and could not be replaced."""
     darks: Fields = Fields()
     flats: Fields = Fields()
 

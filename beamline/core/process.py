@@ -147,6 +147,16 @@ class ChildProcess:
         self._process.stdin.write(line + "\n")
         self._process.stdin.flush()
 
+    def beat(self) -> None:
+        """Write a byte to the stdin of a tethered process, as a sign that we live."""
+        assert self._process.stdin is not None
+        with suppress(OSError, ValueError):  # it has ended
+            os.write(self._process.stdin.fileno(), b".")
+
+    def let_go(self) -> None:
+        """Close the stdin of a tethered process: it sees what it would see if we died."""
+        self._close_stdin()
+
     def end(self, grace: float = 0.0) -> None:
         """End the process if it still runs: it has `grace` real s before it is killed."""
         if self.running:

@@ -161,7 +161,9 @@ def run_scan(
             stack.enter_context(verbs_taken(folder, stop, run.pause, emit))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
-                guarded.enter_context(watched(folder, emit))
+                guarded.enter_context(
+                    watched(folder, emit, stop, run.pause if config.scan.without_watchdog == "pause" else None)
+                )
             guarded.callback(connected.close)
             return run.go(live, afterwards, release=guarded.close)
 

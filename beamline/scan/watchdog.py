@@ -1,25 +1,33 @@
-"""Watchdog: a process that makes the instrument safe when the process of the scan dies without doing so (kill -9).
+"""Watchdog: a process that makes the instrument safe when the process of the scan dies or freezes without doing so.
 
-`python -m beamline.scan.watchdog RUN` waits for the end of its stdin, which the scan holds open as long as it lives; a
-scan that ends by itself kills the watchdog first. What the scan held is free then: the stage's port, which the watchdog
-opens, and the camera, which stops without its program.
+`python -m beamline.scan.watchdog RUN PID` reads its stdin, which the scan holds open as long as it lives, and to which
+it writes a byte each second: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. A
+frozen scan holds the stage's port, so it is killed first. What the scan held is free then: the port, which the watchdog
+opens, and the camera, which stops without its program. A scan that ends by itself kills the watchdog first. Requests to
+end, which a shutdown sends to every process, the watchdog passes over as long as its scan lives.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime
+from io import BytesIO, RawIOBase
 from pathlib import Path
+
+import psutil
 
 from beamline.config.devices import StageOutputShutter
 from beamline.config.load import Config, load
 from beamline.core.events import Emit
 from beamline.core.process import ChildProcess
+from beamline.core.stop import PauseRequest, StopRequest
 from beamline.instrument.connect import shutter_of
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from drivers.clock import Clock, SystemClock
@@ -27,22 +35,109 @@ from drivers.clock import Clock, SystemClock
 PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
 BETWEEN = 0.5  # s between attempts
 READY_WITHIN = 60.0  # real s
+BEAT = 1.0  # real s between signs of life
+FROZEN = 60.0  # s without one, after which a scan counts as dead
+AGAIN = 3  # watchdogs that are started in the place of others
+ACTED = 70  # exit code of one that has made the instrument safe
+COMMAND = (sys.executable, "-m", "beamline.scan.watchdog")
+INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=beamline", "--why=A scan runs", "cat")
 
 
 @contextmanager
-def watched(folder: Path, emit: Emit) -> Iterator[None]:
-    """A watchdog for the run in this folder as long as the context lasts; a warning where there is none."""
-    command, ready = [sys.executable, "-m", "beamline.scan.watchdog", str(folder)], threading.Event()
-    with (
-        Path(os.devnull).open("w") as nowhere,
-        ChildProcess(command, nowhere, lambda line: ready.set(), tether=True) as process,
-    ):
-        deadline = time.monotonic() + READY_WITHIN
-        while not ready.wait(BETWEEN) and process.running and time.monotonic() < deadline:
-            pass
-        if not ready.is_set() or not process.running:
-            emit("warning", {"message": "The watchdog does not run: a scan that is killed leaves the shutter open."})
+def watched(
+    folder: Path,
+    emit: Emit,
+    stop: StopRequest | None = None,
+    pause: PauseRequest | None = None,
+) -> Iterator[None]:
+    """A watchdog for the run in this folder as long as the context lasts; a warning where there is none.
+
+    One that ends meanwhile is told and replaced.
+
+    Args:
+        stop: is aborted where a watchdog took the scan for dead and acted.
+        pause: is asked for where the last watchdog has ended; None: the scan goes on without one.
+    """
+    with Path(os.devnull).open("w") as nowhere, inhibited():
+        keeper = _Keeper(folder, emit, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
+        with closing(keeper):
+            keeper.begin(stop or StopRequest(), pause)
+            yield
+
+
+@contextmanager
+def inhibited() -> Iterator[None]:
+    """The system is asked not to shut down or sleep, where there is systemd; nobody waits for its answer."""
+    with ExitStack() as ending:
+        if (program := shutil.which(INHIBIT[0])) is not None:
+            with suppress(OSError):
+                nowhere = ending.enter_context(Path(os.devnull).open("w"))
+                words = [program, *INHIBIT[1:]]
+                process = ending.enter_context(ChildProcess(words, nowhere, lambda line: None, tether=True))
+                ending.callback(process.let_go)
         yield
+
+
+class _Keeper:
+    """Keeps a watchdog alive and tells it that the scan lives, in a thread of its own.
+
+    Args:
+        start: starts a command; the function is called with each line that it writes.
+    """
+
+    def __init__(
+        self, folder: Path, emit: Emit, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
+    ) -> None:
+        self._command = [*COMMAND, str(folder), str(os.getpid())]
+        self._emit, self._start = emit, start
+        self._ready, self._over = threading.Event(), threading.Event()
+        self._process = self._started()
+        self._thread: threading.Thread | None = None
+
+    def begin(self, stop: StopRequest, pause: PauseRequest | None) -> None:
+        """Wait until the first one is ready, and keep it from then on."""
+        deadline = time.monotonic() + READY_WITHIN
+        while not self._ready.wait(BETWEEN) and self._process.running and time.monotonic() < deadline:
+            self._process.beat()
+        if not self._ready.is_set() or not self._process.running:
+            self._warn("The watchdog does not run: a scan that is killed leaves the shutter open.")
+        self._thread = threading.Thread(target=self._keep, args=(stop, pause), name="watchdog", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join(READY_WITHIN)
+        self._process.end()
+
+    def _keep(self, stop: StopRequest, pause: PauseRequest | None) -> None:
+        left = AGAIN
+        while not self._over.wait(BEAT):
+            if self._process.running:
+                self._process.beat()
+                continue
+            code = self._process.code
+            if code == ACTED:
+                why = f"the process did nothing for {FROZEN:.0f} s, and the watchdog made the instrument safe"
+                self._warn(f"Failed: {why}. The scan ends.")
+                stop.abort(why)
+                return
+            if not left:
+                self._warn(f"The watchdog has ended, too ({code}): a scan that is killed leaves the shutter open.")
+                if pause is not None:
+                    pause.pause("no watchdog runs")
+                return
+            left -= 1
+            self._warn(f"The watchdog has ended (code {code}); another one is started.")
+            self._process.end()
+            with suppress(OSError):
+                self._process = self._started()
+
+    def _started(self) -> ChildProcess:
+        return self._start(self._command, lambda line: self._ready.set())
+
+    def _warn(self, message: str) -> None:
+        self._emit("warning", {"message": message})
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
@@ -80,21 +175,76 @@ def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], 
             return True
 
 
-def main(folder: Path) -> None:
-    """Wait until the scan is dead, then act, and write down what was done."""
+class _Life:
+    """Signs of life from a stream, counted in a thread: a read of a pipe waits."""
+
+    def __init__(self, source: RawIOBase | BytesIO) -> None:
+        self._source, self.signs, self.ended = source, 0, False
+        threading.Thread(target=self._read, name="signs of life", daemon=True).start()
+
+    def _read(self) -> None:
+        with suppress(OSError, ValueError):
+            while data := self._source.read(1):
+                self.signs += len(data)
+        self.ended = True
+
+
+def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
+    """Wait until the scan is dead; whether it is frozen.
+
+    A step in which this process did nothing either (the computer slept, or was busy with its memory) counts once.
+
+    Args:
+        signs: of life so far; None: the process has ended.
+    """
+    silent, before = 0.0, clock.now()
+    last = signs()
+    while last is not None:
+        clock.sleep(BETWEEN)
+        silent, before = silent + min(clock.now() - before, 2 * BETWEEN), clock.now()
+        if (now := signs()) != last:
+            silent, last = 0.0, now
+        elif silent >= FROZEN:
+            return True
+    return False
+
+
+def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
+    """Wait until the scan is dead, then act, and write down what was done; the exit code.
+
+    Args:
+        scan: its process.
+        source: ends when it dies.
+    """
+    for name in ("SIGTERM", "SIGINT", "SIGHUP", "SIGBREAK"):
+        if (request := getattr(signal, name, None)) is not None:
+            signal.signal(request, signal.SIG_IGN)
     config = load(folder / CONFIG, environment={})
+    life, clock = _Life(source), SystemClock()
     sys.stdout.write("ready\n")
     sys.stdout.flush()
-    sys.stdin.read()
+    frozen = until_dead(lambda: None if life.ended else life.signs, clock)
 
     def say(text: str) -> None:
         # A full disk, or a folder that is gone, must not keep the stage turning.
         with suppress(OSError), (folder / WATCHDOG_LOG).open("a", encoding="utf-8") as log:
             log.write(f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}  {text}\n")
 
-    say("The process of the scan has died.")
-    make_safe(config, SystemClock(), say)
+    if frozen:
+        say(
+            f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. It is killed to free its port."
+        )
+        try:
+            psutil.Process(scan).kill()  # it is still that process: the pipe is open
+        except psutil.Error as error:
+            say(f"It could not be killed: {error}.")
+    else:
+        say("The process of the scan has died.")
+    make_safe(config, clock, say)
+    return ACTED
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    # Without a buffer, whose lock a reading thread would hold at the end of the process.
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as signs_of_life:
+        sys.exit(main(Path(sys.argv[1]), int(sys.argv[2]), signs_of_life))

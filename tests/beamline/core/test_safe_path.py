@@ -34,7 +34,10 @@ def executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], li
 
 def said(command: Sequence[str], folder: Path, environment: dict[str, str] | None = None) -> str:
     lines: list[str] = []
-    with (folder / "stderr").open("w") as stderr, ChildProcess(command, stderr, lines.append, environment) as process:
+    with (
+        (folder / "stderr").open("w") as stderr,
+        ChildProcess(command, stderr, lines.append, environment, tether=True) as process,
+    ):
         assert process.wait() is Ending.EXITED
     return "".join(lines) + (folder / "stderr").read_text(encoding="utf-8")
 
@@ -50,7 +53,7 @@ def test_the_watchdog_starts(tmp_path: Path, executed: Callable[[], list[str]]) 
 @pytest.mark.slow
 def test_reconstructions_and_trials_start(tmp_path: Path, executed: Callable[[], list[str]]) -> None:
     assert "Usage" in said([*COMMAND, "--help"], tmp_path)
-    assert "job.read_text" in said(trial(tmp_path / "no_job.json"), tmp_path, with_our_path())
+    assert "FileNotFoundError" in said(trial(tmp_path / "no_job.json"), tmp_path, with_our_path())
     assert executed() == []
 
 

@@ -1,20 +1,24 @@
-"""A scan whose process is killed leaves a stage that stands and a closed shutter."""
+"""A scan whose process is killed or frozen leaves a stage that stands and a closed shutter."""
 
 from __future__ import annotations
 
 import io
+import os
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 
 from beamline.config.load import Config, config_folder, load, resolved_yaml
+from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan import watchdog
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
-from beamline.scan.watchdog import watched
+from beamline.scan.watchdog import BETWEEN, FROZEN, inhibited, until_dead, watched
 from drivers.clock import Clock, SystemClock
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
@@ -22,14 +26,18 @@ from simulators.wires.registry import WIRES
 from tests.beamline.ball_scan import COMMON
 from tests.simulators.wires.transports import serve_tcp
 
+OTHERS = (("pi_gcs", False), ("pm16c", False), *((("zaber", True),) if os.name == "posix" else ()))
 STAGES = {"pi_gcs": "axis: A, trigger_line: 1", "zaber": "output: 1", "pm16c": "channel: 3"}
 SCAN = """
 import sys, time
 from pathlib import Path
 from beamline.config.load import load
 from beamline.instrument.connect import shutter_of, stage_alone
+from beamline.scan import watchdog
 from beamline.scan.watchdog import watched
 from drivers.clock import Clock, SystemClock
+if len(sys.argv) > 2:
+    watchdog.COMMAND = (sys.executable, "-c", sys.argv[2])
 folder, by_hand = Path(sys.argv[1]), []
 config = load(folder / "config.resolved.yaml", environment={})
 with watched(folder, lambda event, data: None), stage_alone(config) as stage:
@@ -38,10 +46,21 @@ with watched(folder, lambda event, data: None), stage_alone(config) as stage:
     print("it turns", flush=True)
     time.sleep(100)
 """
+HASTY = """
+import sys
+from pathlib import Path
+from beamline.scan import watchdog
+watchdog.FROZEN = 10.0
+watchdog.main(Path(sys.argv[1]), int(sys.argv[2]), sys.stdin.buffer.raw)
+"""
+posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets no such requests")
 
 
-@pytest.mark.parametrize("kind", ["zaber", *(pytest.param(k, marks=pytest.mark.slow) for k in ("pi_gcs", "pm16c"))])
-def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "frozen"),
+    [("zaber", False), *(pytest.param(*one, marks=pytest.mark.slow) for one in OTHERS)],
+)
+def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Path, kind: str, frozen: bool) -> None:
     clock = SystemClock()
     line = TriggerLine(clock)
     template, outputs = config_folder() / "instrument.yaml", kind != "pm16c"
@@ -54,17 +73,22 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Pa
     with serve_tcp(controller) as url:
         config = load(template, [*words, f"devices.stage.port={url}"], {})
         (tmp_path / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
-        with subprocess.Popen([sys.executable, "-c", SCAN, str(tmp_path)], stdout=subprocess.PIPE) as scan:
+        command = [sys.executable, "-c", SCAN, str(tmp_path), *([HASTY] if frozen else [])]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as scan:
             assert scan.stdout is not None and scan.stdout.readline().strip() == b"it turns"
             time.sleep(0.5)
             assert line.angle_at(clock.now()) > 0
             assert controller.output_is_high(2) is outputs
-            scan.kill()
+            scan.send_signal(signal.SIGSTOP) if frozen else scan.kill()
         deadline, text = time.monotonic() + 60, ""
         while time.monotonic() < deadline and "disarmed" not in text:
             time.sleep(0.1)
             text = log.read_text(encoding="utf-8") if log.exists() else ""
-        assert "has died" in text and "told to stop" in text and "disarmed" in text
+        assert (
+            ("did nothing for 10 s and counts as dead" if frozen else "has died") in text
+            and "told to stop" in text
+            and "disarmed" in text
+        )
         assert ("Close the beam shutter." in text) is ("moved by hand" in text) is not outputs
         assert ("its shutter is closed" in text) is outputs
         stood = line.angle_at(clock.now())
@@ -91,6 +115,108 @@ def test_what_cannot_be_said_or_done_keeps_no_other_step_from_being_tried(
         return True
 
     monkeypatch.setattr(watchdog, "make_safe", safe)
-    monkeypatch.setattr(sys, "stdin", io.StringIO())
-    watchdog.main(tmp_path)
+    monkeypatch.setattr(signal, "signal", lambda *how: None)
+    assert watchdog.main(tmp_path, os.getpid(), io.BytesIO(b"...")) == watchdog.ACTED
     assert made == [False]
+
+
+class _Scan:
+    """One that gives a sign of life a second until it freezes or ends, at times on the clock; the clock may jump."""
+
+    def __init__(self, ends: float, jumps: dict[int, float]) -> None:
+        self.clock, self._ends, self._jumps, self._looks = VirtualClock(0.0), ends, jumps, 0
+
+    def now(self) -> float:
+        return self.clock.now()
+
+    def sleep(self, seconds: float) -> None:
+        self.clock.sleep(seconds + self._jumps.pop(self._looks, 0.0))
+
+    def signs(self, after: int | None) -> int | None:
+        self._looks += 1
+        return after if self.now() >= self._ends else int(min(self.now(), self._ends))
+
+
+def test_a_frozen_scan_is_dead_after_so_many_seconds_and_one_that_ended_at_once() -> None:
+    frozen, died = _Scan(30.0, {}), _Scan(30.0, {})
+    assert until_dead(lambda: frozen.signs(30), frozen)
+    assert frozen.now() == pytest.approx(30.0 + FROZEN, abs=2 * BETWEEN)
+    assert not until_dead(lambda: died.signs(None), died)
+    assert died.now() == pytest.approx(30.0, abs=2 * BETWEEN)
+
+
+def test_a_computer_that_slept_is_no_frozen_scan() -> None:
+    """Neither the scan nor the watchdog did anything meanwhile."""
+    asleep = _Scan(5000.0, {9: 3600.0, 30: 500.0})
+    woken: list[float] = []
+
+    def signs() -> int | None:
+        woken.append(asleep.now())
+        return None if len(woken) > 300 else asleep.signs(0) if len(woken) < 60 else len(woken)
+
+    assert not until_dead(signs, asleep)
+
+
+def children_with(word: str) -> list[psutil.Process]:
+    """Those of ours that run and have this in their command."""
+    running = [one for one in psutil.Process().children() if one.status() != psutil.STATUS_ZOMBIE]
+    return [one for one in running if word in " ".join(one.cmdline())]
+
+
+@posix
+def test_requests_to_end_do_not_end_the_watchdog_of_a_scan_that_lives(tmp_path: Path) -> None:
+    (tmp_path / CONFIG).write_text(resolved_yaml(load(config_folder() / "instrument.yaml", (), {})))
+    told: list[str] = []
+    with watched(tmp_path, lambda event, data: told.append(data["message"])):
+        (process,) = children_with("beamline.scan.watchdog")
+        for request in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+            process.send_signal(request)
+        time.sleep(1.0)
+        assert process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    assert told == [] and not (tmp_path / WATCHDOG_LOG).exists()
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_a_watchdog_that_died_is_told_and_replaced_or_the_scan_pauses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, paused: bool
+) -> None:
+    monkeypatch.setattr(watchdog, "BEAT", 0.01)
+    monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", "print('ready')"))  # it ends at once
+    told, stop, pause = list[str](), StopRequest(), PauseRequest()
+    with watched(tmp_path, lambda event, data: told.append(data["message"]), stop, pause if paused else None):
+        deadline = time.monotonic() + 60
+        while not any("ended, too" in text for text in told) and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert sum("another one is started" in text for text in told) == watchdog.AGAIN
+    assert ("no watchdog runs" in pause.reason) is paused and not stop.stopping
+
+
+def test_a_scan_that_was_taken_for_dead_ends_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watchdog, "BEAT", 0.01)
+    monkeypatch.setattr(
+        watchdog, "COMMAND", (sys.executable, "-c", f"print('ready'); raise SystemExit({watchdog.ACTED})")
+    )
+    told, stop = list[str](), StopRequest()
+    with watched(tmp_path, lambda event, data: told.append(data["message"]), stop):
+        deadline = time.monotonic() + 60
+        while not stop.aborting and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert "the watchdog made the instrument safe" in stop.reason and "The scan ends" in told[-1]
+
+
+@posix
+def test_the_system_is_asked_not_to_shut_down_where_it_can_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program, asked = tmp_path / "systemd-inhibit", tmp_path / "asked"
+    program.write_text(f'#!/bin/sh\necho "$@" > {asked}.new; mv {asked}.new {asked}; cat; rm {asked}\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    with inhibited():
+        deadline = time.monotonic() + 60
+        while not asked.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert "--what=shutdown:sleep" in asked.read_text() and "--mode=block" in asked.read_text()
+        (process,) = children_with("systemd-inhibit")
+    assert not process.is_running()
+    program.chmod(0o644)  # nothing that can be executed
+    with inhibited():
+        pass
