@@ -217,3 +217,11 @@ def test_a_scan_is_no_volume(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for name in ("scan.tif", "angles.npy", "text.nrrd", "empty", "missing.h5"):
         assert volume_format(tmp_path / name) is None
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 5), (3, 5, 1), (1, 1, 1)])
+def test_a_tiff_of_a_slice_or_a_column_comes_back(tmp_path: Path, shape: tuple[int, int, int]) -> None:
+    values = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
+    write_volume(tmp_path / "v.tif", replace(RECORD, volume=Volume(values, Grid(shape, 0.25))))
+    with opened_volume(tmp_path / "v.tif") as read:
+        np.testing.assert_array_equal(read.volume.data[:], values)
