@@ -38,8 +38,9 @@ class TiffFile:
         dtype = slices.pixels.dtype
         big = int(np.prod(slices.shape, dtype=np.int64)) * dtype.itemsize >= _CLASSIC
         facts = json.dumps(facts_of(record, slices.pixels) | {"shape": slices.shape})
-        tags = _ome(record, facts) if big else _imagej(record, facts)
-        with tifffile.TiffWriter(path, bigtiff=big, ome=big, imagej=not big, byteorder="<") as tif:
+        ome = big or slices.shape[2] == 1  # tifffile takes a single column of ImageJ's for samples of a pixel
+        tags = _ome(record, facts) if ome else _imagej(record, facts)
+        with tifffile.TiffWriter(path, bigtiff=big, ome=ome, imagej=not ome, byteorder="<") as tif:
             tif.write(iter(slices), shape=slices.shape, dtype=dtype, photometric="minisblack", **tags)
 
     def holds(self, path: Path) -> bool:

@@ -179,7 +179,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     assert metrics["residual"] < 0.1
     np.testing.assert_array_equal(record.history["n_views"], views)
     assert "<html" in (tmp_path / "report.html").read_text()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "report.html", "scan.h5"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "recon.live.png", "report.html", "scan.h5"]
 
 
 @pytest.mark.parametrize("use_flags", [True, False])

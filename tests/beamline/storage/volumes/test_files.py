@@ -236,3 +236,11 @@ def test_a_disk_that_gives_back_something_else_leaves_nothing(
     with pytest.raises(DataError, match="slice 2 that is read back is not what was written"):
         write_volume(tmp_path / name, RECORD)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("shape", [(1, 4, 5), (3, 5, 1), (1, 1, 1)])
+def test_a_tiff_of_a_slice_or_a_column_comes_back(tmp_path: Path, shape: tuple[int, int, int]) -> None:
+    values = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
+    write_volume(tmp_path / "v.tif", replace(RECORD, volume=Volume(values, Grid(shape, 0.25))))
+    with opened_volume(tmp_path / "v.tif") as read:
+        np.testing.assert_array_equal(read.volume.data[:], values)
