@@ -121,7 +121,8 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     assert metrics["residual_held_out"] < events[-1].data["fbp"]["residual_held_out"]
     assert {"ssim3d", "nrmse", "residual", "seconds"} <= set(metrics)
     # The sweeps of the finish tell of themselves, in their own unit, and are no steps of the fit.
-    progress = [event.data for event in events if event.event == "progress" and not event.data.get("unit")]
+    told = [event.data for event in events if event.data.get("stage") == "recon"]
+    progress = [data for data in told if not data.get("unit")]
     assert progress[-1]["step"] == 150
     record = read_reconstruction(tmp_path / "out.h5")
     assert record.history["step"][-1] == 150
@@ -376,7 +377,7 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
     )  # fmt: skip
     metrics = reconstruct_file(options, events.append, SystemClock())
     assert metrics["residual"] < 0.2
-    progress = [event.data for event in events if event.event == "progress"]
+    progress = [event.data for event in events if event.data.get("stage") == "recon"]
     assert [p["step"] for p in progress] == list(range(1, 9))
     assert progress[-1]["per_s"] > 0 and progress[-1]["eta_s"] == 0
     record = read_reconstruction(tmp_path / "out.h5")
