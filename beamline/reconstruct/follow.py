@@ -12,6 +12,7 @@ from beamline.core.text import count
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.progress import compilation_events
 from beamline.reconstruct.recon_report import ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
@@ -97,13 +98,8 @@ def follow(
 
 def _compile(sink: Sink, clock: Clock) -> None:
     """Compile what the fit needs, once on a machine, before the first view; the state `ready` says that it is there."""
-    begin = clock.now()
-
-    def compiled(n: int) -> None:
-        now = clock.now()
-        sink(Event("progress", now, {"stage": "kernels", "n": n, "seconds": now - begin}))
-
-    sink(Event("state", begin, {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    compiled = compilation_events(sink, clock)
+    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
     warm_up(on_kernel=compiled)
     sink(Event("state", clock.now(), {"state": "ready", "message": "The live volume is ready for views"}))
 
