@@ -96,7 +96,7 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
 
         return run_series(xafs.Series(series.title, series.n, frames(), series.regions), sink, clock, stopped)
 
-    monkeypatch.setattr(xafs, "run_series", interrupted)
+    monkeypatch.setattr("beamline.xafs.series.run_series", interrupted)
     result = _beamline("edge_scan", "--from", "8.335", "--to", "8.365")
     assert result.exit_code == 4, result.output
     assert f"Stopped after {energies} energies" in result.stderr
