@@ -53,7 +53,7 @@ class Cause(Enum):
 
     BEAM = "beam"
     SPACE = "space on the disk"
-    BACKLOG = "frames that wait for the disk"
+    BACKLOG = "frames that wait to be written"
 
 
 class PauseRequest:

@@ -21,7 +21,7 @@ from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.progress import corrections_done, progress_events
+from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.result import write_result
@@ -87,9 +87,11 @@ def reconstruct_file(
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
-    phases.enter("reconstruction")
     region = None if options.region is None else locate(options.region, selection, prepared.geometry)
     with keeping(options.partial_path) if slabs else nullcontext():
+        phases.enter("compiling kernels")
+        _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region).compile_kernels()
+        phases.enter("reconstruction")
         # A direct method and a slab have no volume so far: a signal interrupts them.
         with (never_stopped if options.method.traits.direct or slabs else stop_scope)() as stopped:
             job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
@@ -189,6 +191,22 @@ class _Job:
         except ValueError as error:
             raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
 
+    def compile_kernels(self) -> None:
+        """Compile what will run here, once on a machine, and say so; workers of a cluster do it there.
+
+        It must not count in the time of the run, nor in its estimate of the time left.
+        """
+        method, budget = self.options.method, self.options.budget
+        methods = method.candidates if budget is not None and isinstance(method, Auto) else (method,)
+        for one in methods if self.options.cluster is None else ():
+            with self.refused(f" by {one.name}"):
+                warm_up(
+                    one,
+                    self.prepared.geometry,
+                    device=self.options.device,
+                    on_kernel=compilation_events(self.sink, self.clock),
+                )
+
     def run(self, method: Method, control: RunControl) -> Reconstruction:
         """Run a method, with views held out if it takes any, until it ends or is stopped."""
         return self.run_on(method, self.prepared, self.grid, control)
@@ -211,8 +229,6 @@ class _Job:
         weights = None if filled else prepared.ray_weights(len(held_out))
         control = replace(control, should_stop=self.stop_latch, now=self.clock.now)
         with self.refused(f" by {method.name}"):
-            # Compilation must not count in the time of the run, nor in its estimate of the time left.
-            warm_up(method, prepared.geometry, device=self.options.device)
             return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
                 use=DataUse(weights, held_out), control=control,
@@ -306,8 +322,6 @@ def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProj
     """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the binning of their pixels."""
     method = job.options.method
     methods = method.candidates if isinstance(method, Auto) else (method,)
-    for one in methods:  # compilation happens once on a machine and is not part of the budget
-        warm_up(one, job.prepared.geometry)
     control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
         done = within(

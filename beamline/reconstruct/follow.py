@@ -12,6 +12,7 @@ from beamline.core.text import count
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.progress import compilation_events
 from beamline.reconstruct.recon_report import ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
@@ -103,13 +104,8 @@ def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTimi
 
     The state `ready` says that it is there, and where the volume can be watched.
     """
-    begin = clock.now()
-
-    def compiled(n: int) -> None:
-        now = clock.now()
-        sink(Event("progress", now, {"stage": "kernels", "n": n, "seconds": now - begin}))
-
-    sink(Event("state", begin, {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    compiled = compilation_events(sink, clock)
+    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
     warm_up(on_kernel=compiled)
     picture = options.target.live_picture
     message = (

@@ -39,6 +39,17 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
     return listen
 
 
+def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
+    """A listener that passes the number of kernels compiled so far on as events."""
+    begin = clock.now()
+
+    def compiled(n: int) -> None:
+        now = clock.now()
+        sink(Event("progress", now, {"stage": "kernels", "n": n, "seconds": now - begin}))
+
+    return compiled
+
+
 def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> None:
     """Say what each correction did to the views; "" is not said."""
     for state, message in messages.items():

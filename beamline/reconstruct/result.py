@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -245,7 +246,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "filter": made.filter,
         "seed": context.seed,
         **_flat("", made.settings),
-        **_flat("seconds_of", context.phases.seconds),
+        **{f"seconds_of_{re.sub(r'[^a-zA-Z]+', '_', name)}": took for name, took in context.phases.seconds.items()},
         "command": context.command,
         **({"recipe": context.recipe} if context.recipe else {}),
     }

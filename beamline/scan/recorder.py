@@ -30,7 +30,7 @@ from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
-from beamline.scan.supervision import BacklogGuard, SpaceGuard
+from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
 from drivers.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
@@ -108,6 +108,7 @@ class Recorder:
         self._retaken, self._retaking = 0, False
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
+        self._work = Workload()
         room = _room(timeline)
         self._waiting: Queue[Frame | threading.Event | None] = Queue(room)
         self._checked: Queue[_Checked | Exception | threading.Event | None] = Queue(CHECKED_FRAMES)
@@ -116,7 +117,7 @@ class Recorder:
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
         self._space = SpaceGuard(self._row_bytes * (room + in_work + on_the_way), pause)
-        self._backlog = BacklogGuard(room, pause) if views.trains else None
+        self._backlog = BacklogGuard(room, pause, self._work) if views.trains else None
         self._flying = False
         self._looked_at, self._busy_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
@@ -243,11 +244,14 @@ class Recorder:
             elif self._failure is not None:
                 continue  # frames after a failure are discarded, so that `put` does not wait for a place in the queue
             else:
+                begun, cpu = time.monotonic(), time.thread_time()
                 try:
                     found = digest(item.counts, self._monitor.context.saturation, self._preview_bin)
                     checked = item, found, self._look(item, found)
                 except Exception as error:
                     checked = error
+                self._work.checking += time.monotonic() - begun
+                self._work.checking_cpu += time.thread_time() - cpu
             self._checked.put(checked)
         self._checked.put(None)
 
@@ -255,6 +259,7 @@ class Recorder:
         """The second thread: writes, and tells."""
         item, flushed = self._checked.get(), True
         while True:
+            begun, cpu = time.monotonic(), time.thread_time()
             try:
                 if isinstance(item, Exception):
                     raise item
@@ -270,6 +275,8 @@ class Recorder:
                 with suppress(Exception):  # the first one counts
                     self._writer.flush()  # the frames before
                 self._failure = self._failure or error
+            self._work.writing += time.monotonic() - begun
+            self._work.writing_cpu += time.thread_time() - cpu
             self._busy_since = math.inf
             if item is None:
                 return

@@ -33,6 +33,7 @@ from beamline.core.text import count, size
 from beamline.instrument.connect import Instrument, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
+from beamline.monitor.rehearsal import rehearse
 from beamline.plan.plan import Block
 from beamline.plan.retake import Retake, spread
 from beamline.scan.acquisition import Acquisition
@@ -60,7 +61,7 @@ ASK_LIVE_AFTER = 4.0
 is there within 10: what the scan takes to end counts."""
 
 READY_WITHIN = 300.0
-"""Real s that a scan waits for its live reconstruction before the first frame: it compiles, once on a machine."""
+"""Real s that a scan waits for its live reconstruction, which compiles once on a machine; see `_Run._compiled`."""
 
 _LITTLE_LIGHT = "little light"
 
@@ -232,8 +233,18 @@ class _Run:
             if command is not None:
                 follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit, self.stop.stop_as_enough)
                 ending.callback(follower.close)
-                follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
+            if self.config.simulation is None:
+                self._compiled(follower)
             return self._acquire_and_follow(writer, follower, release)
+
+    def _compiled(self, follower: LiveReconstruction | None) -> None:
+        """Wait until the live reconstruction and the monitor have compiled, at the same time: once on a machine.
+
+        A real scan waits before its first frame, a simulated one, whose references do not age, before its first view.
+        """
+        rehearse(self.ready.monitor)
+        if follower is not None:
+            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
 
     def _prepare_memory(self) -> None:
         """Memory for the frames that may wait for the disk, before the first comes: at most a quarter of what is
@@ -267,7 +278,7 @@ class _Run:
     ) -> RunResult:
         recorder = self._recorder(writer)
         beam = self._beam_log()
-        acquisition = self._acquisition(recorder, beam)
+        acquisition = self._acquisition(recorder, beam, follower)
         labels = LabelLog()
         with beam:
             error = _failure_of(lambda: self._acquire(acquisition, recorder, labels))
@@ -361,13 +372,13 @@ class _Run:
             pause=self.pause,
         )
 
-    def _acquisition(self, recorder: Recorder, beam: BeamLog) -> Acquisition:
+    def _acquisition(self, recorder: Recorder, beam: BeamLog, follower: LiveReconstruction | None) -> Acquisition:
         ready, instrument = self.ready, self.instrument
         return Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
             self.emit,
             Supervision(
-                lambda: self._refusal(recorder), self.pause, lambda: _wait_in_pause(recorder), self.states,
+                lambda: self._refusal(recorder, follower), self.pause, lambda: _wait_in_pause(recorder), self.states,
                 lambda missing: self._retakes(recorder, missing), lambda: self._wait_for_reading(beam),
             ),
         )  # fmt: skip
@@ -381,10 +392,12 @@ class _Run:
         while not over() and not self.stop.stopping:
             time.sleep(PAUSE_POLL)
 
-    def _refusal(self, recorder: Recorder) -> str | None:
+    def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
         """Why no projection should be taken after these darks and flats; None where none, or the operator wants it."""
         recorder.wait()
         self._tell_little_light(recorder)
+        if self.config.simulation is not None:
+            self._compiled(follower)
         blocks = self.ready.timeline.blocks
         faults = self._reference_faults(recorder, blocks[: blocks.index(self.ready.timeline.views)])
         if not faults or self.config.references.on_fault == "log":

@@ -120,23 +120,52 @@ class SpaceGuard:
             self._pause.release(Cause.SPACE)
 
 
+@dataclass
+class Workload:
+    """Seconds that a recorder's threads have spent, by the clock and of the processor.
+
+    Checking a frame waits for nothing but the processor; so what writing took beyond the same multiple of its own
+    processor time, it waited for the disk.
+    """
+
+    checking: float = 0.0
+    checking_cpu: float = 0.0
+    writing: float = 0.0
+    writing_cpu: float = 0.0
+
+    @property
+    def disk(self) -> float:
+        """Seconds for which a write waited for the disk."""
+        contended = self.checking / self.checking_cpu if self.checking_cpu > 0 else 1.0
+        return max(0.0, self.writing - max(1.0, contended) * self.writing_cpu)
+
+    @property
+    def behind(self) -> tuple[str, str]:
+        """What the frames wait for, and what would help: the disk where the writes waited longer than checks took."""
+        if self.disk > self.checking:
+            return "the disk is behind", "a longer period_s or a faster disk"
+        return "the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it"
+
+
 class BacklogGuard:
-    """Pauses a fly scan before frames come that find no room, until few wait for the disk.
+    """Pauses a fly scan before frames come that find no room, until few wait to be written.
 
     Args:
         room: frames that may wait.
+        work: what the frames before took.
     """
 
-    def __init__(self, room: int, pause: PauseRequest) -> None:
-        self._room, self._pause = room, pause
+    def __init__(self, room: int, pause: PauseRequest, work: Workload) -> None:
+        self._room, self._pause, self._work = room, pause, work
 
     def __call__(self, waiting: int) -> None:
         """Take note of the frames that wait."""
         if 4 * waiting >= 3 * self._room:
+            what, advice = self._work.behind
             self._pause.hold(
                 Cause.BACKLOG,
-                f"the disk is behind, {waiting} of at most {self._room} frames wait in memory. The scan goes on by "
-                "itself when most of them are written; a longer period_s or a faster disk spares the pauses",
+                f"{what}, {waiting} of at most {self._room} frames wait in memory. The scan goes on by "
+                f"itself when most of them are written; {advice} spares the pauses",
             )
         elif 4 * waiting <= self._room:
             self._pause.release(Cause.BACKLOG)

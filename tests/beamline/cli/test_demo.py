@@ -93,7 +93,6 @@ def test_a_live_volume_that_fails_leaves_the_scan_and_says_where_to_look(
 
 
 def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from beamline.cli import demo
     from beamline.instrument.connect import connect
 
     def without_truth(config: Config) -> object:
@@ -101,7 +100,7 @@ def test_a_real_instrument_has_no_truth(here: Path, monkeypatch: pytest.MonkeyPa
 
         return replace(connect(config), simulated=None)
 
-    monkeypatch.setattr(demo, "connect", without_truth)
+    monkeypatch.setattr("beamline.instrument.connect.connect", without_truth)
     with pytest.raises(ConfigError, match="simulated devices"):
         run_demo(_small(), here / "runs", [], StopRequest(), "beamline demo")
     assert list(here.iterdir()) == []

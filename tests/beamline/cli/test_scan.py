@@ -14,7 +14,6 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from beamline.cli import scan as scan_module
 from beamline.cli.main import main
 from beamline.config.load import config_folder
 from beamline.scan import run as run_module
@@ -242,7 +241,7 @@ def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypat
 
 def test_a_shutter_moved_by_hand_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     instrument, asked = FakeInstrument(), []
-    monkeypatch.setattr(scan_module, "ask_operator", asked.append)
+    monkeypatch.setattr("beamline.instrument.operator.ask_operator", asked.append)
 
     def connect(config: object, clock: object, ask: Any, check_stop: object) -> Any:
         connected = instrument.connected()
@@ -274,7 +273,7 @@ def test_the_live_reconstruction_is_asked_for_as_configured(tmp_path: Path, monk
         asked.append(command and list(command(Path("scan.h5"), Path("recon.h5"))))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("beamline.cli.scan.run_scan", run_scan)
+    monkeypatch.setattr("beamline.scan.run.run_scan", run_scan)
     runner = CliRunner()
     overrides = ["--set", "recon.seconds=7", "--set", "optics.axis_col=80.5"]
     assert runner.invoke(main, ["scan", SIMULATED, *overrides]).exit_code == 130

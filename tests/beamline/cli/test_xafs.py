@@ -14,6 +14,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli import xafs
 from beamline.cli.main import main
+from beamline.xafs.series import Series, run_series
 
 
 @pytest.fixture
@@ -85,8 +86,6 @@ def test_measured_radiographs(folder: Path) -> None:
 def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
     folder: Path, monkeypatch: pytest.MonkeyPatch, energies: int, left: set[str]
 ) -> None:
-    run_series = xafs.run_series
-
     def interrupted(series, sink, clock, stopped):  # type: ignore[no-untyped-def]
         def frames():  # type: ignore[no-untyped-def]
             for k, frame in enumerate(series.frames, start=1):
@@ -94,9 +93,9 @@ def test_ctrl_c_is_exit_code_4_with_the_energies_so_far(
                     signal.raise_signal(signal.SIGINT)
                 yield frame
 
-        return run_series(xafs.Series(series.title, series.n, frames(), series.regions), sink, clock, stopped)
+        return run_series(Series(series.title, series.n, frames(), series.regions), sink, clock, stopped)
 
-    monkeypatch.setattr(xafs, "run_series", interrupted)
+    monkeypatch.setattr("beamline.xafs.series.run_series", interrupted)
     result = _beamline("edge_scan", "--from", "8.335", "--to", "8.365")
     assert result.exit_code == 4, result.output
     assert f"Stopped after {energies} energies" in result.stderr

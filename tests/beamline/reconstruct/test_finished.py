@@ -81,8 +81,8 @@ def test_the_times_of_all_phases_are_told_and_add_up_to_the_time_that_it_took(tm
     assert sum(done["times"].values()) == pytest.approx(done["elapsed"], abs=0.35)  # three looks beside the phases
     assert list(done["times"]) == [
         "opening the scan", "flags and references", "tilt and references", "rotation axis", "jumps", "correction",
-        "background, rings, views held out, hardening", "reconstruction", "measuring the volume", "FBP for comparison",
-        "report", "writing the volume",
+        "background, rings, views held out, hardening", "compiling kernels", "reconstruction", "measuring the volume",
+        "FBP for comparison", "report", "writing the volume",
     ]  # fmt: skip
     begun = [event.data["phase"] for event in events if event.data.get("stage") == "phase" and event.data["n"] == 0]
     assert begun == list(done["times"])
@@ -121,7 +121,8 @@ def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -
     assert metrics["residual_held_out"] < events[-1].data["fbp"]["residual_held_out"]
     assert {"ssim3d", "nrmse", "residual", "seconds"} <= set(metrics)
     # The sweeps of the finish tell of themselves, in their own unit, and are no steps of the fit.
-    progress = [event.data for event in events if event.event == "progress" and not event.data.get("unit")]
+    told = [event.data for event in events if event.data.get("stage") == "recon"]
+    progress = [data for data in told if not data.get("unit")]
     assert progress[-1]["step"] == 150
     record = read_reconstruction(tmp_path / "out.h5")
     assert record.history["step"][-1] == 150
@@ -141,7 +142,7 @@ def test_what_is_compiled_before_the_clock_starts_is_of_the_fits_own_geometry(
 ) -> None:
     asked: list[dict[str, object]] = []
 
-    def compiled(method: R2 | None = None, geometry: object = None, device: str = "cpu") -> None:
+    def compiled(method: R2 | None = None, geometry: object = None, **others: object) -> None:
         asked.append({"method": method or R2(), "geometry": geometry})
 
     monkeypatch.setattr(offline, "warm_up", compiled)
@@ -376,7 +377,7 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
     )  # fmt: skip
     metrics = reconstruct_file(options, events.append, SystemClock())
     assert metrics["residual"] < 0.2
-    progress = [event.data for event in events if event.event == "progress"]
+    progress = [event.data for event in events if event.data.get("stage") == "recon"]
     assert [p["step"] for p in progress] == list(range(1, 9))
     assert progress[-1]["per_s"] > 0 and progress[-1]["eta_s"] == 0
     record = read_reconstruction(tmp_path / "out.h5")

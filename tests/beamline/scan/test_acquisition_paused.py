@@ -15,7 +15,7 @@ from beamline.core.errors import ScanStopped
 from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.states import State, StateMachine
-from beamline.scan.supervision import BacklogGuard, Supervision
+from beamline.scan.supervision import BacklogGuard, Supervision, Workload
 from drivers.frame import Frame, FrameKind
 from drivers.manual import ManualShutter
 from drivers.protocols import CameraFrame
@@ -222,7 +222,7 @@ class SlowDisk:
 def slow_disk(guarded: bool) -> tuple[SlowDisk, Run, Paused]:
     """A fly scan of a view every 0.2 s with a disk that takes 0.5 s for each."""
     paused = Paused()
-    guard = BacklogGuard(8, paused.pause)
+    guard = BacklogGuard(8, paused.pause, Workload())
     disk = SlowDisk(paused, 0.5, 8, guard if guarded else lambda waiting: None)
     paused.instrument.on_frame = lambda number: disk.put()
     machine = StateMachine(lambda event, data: paused.states.append(data["state"]), State.PREPARING)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -156,3 +157,12 @@ def test_a_frame_that_comes_alone_is_flushed_at_once_and_others_when_none_waits(
     recorder.wait()
     assert writer.flushed[-1] == 9
     recorder.finish()
+
+
+def test_the_time_of_writes_that_wait_is_the_disks() -> None:
+    recorder = record(Writer(lambda row: time.sleep(0.02)))
+    for row in range(10):
+        recorder.put(frame(row))
+    recorder.finish()
+    assert recorder._work.disk > 0.1
+    assert recorder._work.checking_cpu > 0

@@ -20,7 +20,15 @@ from beamline.instrument.connect import Instrument
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
 from beamline.scan.states import State
-from beamline.scan.supervision import AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, SpaceGuard
+from beamline.scan.supervision import (
+    AlarmPolicy,
+    AlarmReaction,
+    BacklogGuard,
+    BeamGuard,
+    BeamLimits,
+    SpaceGuard,
+    Workload,
+)
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
@@ -31,6 +39,29 @@ from tests.beamline.ran import Ran
 
 def flags(level: Level | None) -> tuple[Flag, ...]:
     return () if level is None else (Flag("beam", level, 0, 1.0, 0.5, "Look at the beam."),)
+
+
+@pytest.mark.parametrize(
+    ("work", "behind"),
+    [
+        (Workload(checking=1.0, checking_cpu=1.0, writing=9.0, writing_cpu=0.5), "disk"),
+        (Workload(checking=9.0, checking_cpu=9.0, writing=1.0, writing_cpu=0.5), "processor"),  # large frames
+        (Workload(checking=9.0, checking_cpu=3.0, writing=6.0, writing_cpu=2.0), "processor"),  # shared with others
+        (Workload(checking=2.0, checking_cpu=1.0, writing=9.0, writing_cpu=1.0), "disk"),
+        (Workload(), "processor"),
+    ],
+)
+def test_a_scan_that_pauses_says_whether_its_frames_wait_for_the_disk_or_the_processor(
+    work: Workload, behind: str
+) -> None:
+    pause = PauseRequest()
+    guard = BacklogGuard(8, pause, work)
+    guard(5)
+    assert not pause.reason
+    guard(6)
+    assert f"the {behind} is behind, 6 of at most 8 frames wait" in pause.reason
+    guard(2)
+    assert not pause.reason
 
 
 A, W, N = Level.ALARM, Level.WARN, None
@@ -134,7 +165,7 @@ def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
 ) -> None:
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (1, 1))  # the writer keeps up with the virtual clock
     monkeypatch.setattr(recorder_module, "WAITING_BYTES", 1)
-    monkeypatch.setattr(recorder_module, "BacklogGuard", lambda room, pause: lambda waiting: None)
+    monkeypatch.setattr(recorder_module, "BacklogGuard", lambda *_: lambda waiting: None)
     instrument = FakeInstrument(Faults(repeats={9, 10}))
     paused: list[tuple[str, bool]] = []
 
