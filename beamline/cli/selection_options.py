@@ -291,8 +291,8 @@ _AFTER = (
         default="auto",
         show_default=True,
         help="What is taken off each view so that its air is at zero. columns: the line through the air at the left "
-        "and right edge; LEFT,RIGHT: of so many columns; surface:0 to 3: also a polynomial through all rays that miss the "
-        "sample; auto: that where the views confirm it, and says so.",
+        "and right edge; LEFT,RIGHT: of so many columns; surface:0 to 3: also a polynomial through all rays that miss "
+        "the sample; auto: that where the views confirm it, and says so.",
     ),
     click.option(
         "--flags",

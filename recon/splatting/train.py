@@ -163,7 +163,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         sweeps = 0
     if sweeps:
         fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
-        finished, sweeps = finish(volume, model, fitted, method.finish, settings, control)
+        finished, sweeps = finish(volume, model, fitted, method.finish, settings, control, not method.allow_negative)
         if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
             sweeps = 0
         else:
