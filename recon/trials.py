@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.edges import edge_steepness
+from recon.assess.lost_mass import compare
 from recon.base.binning import bin_views
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
@@ -41,6 +42,7 @@ class Score:
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
         residual_seen: the same of views that it was made from, their mean.
         steepness: of its edges, over those of the steepest volume that was tried, see `edge_steepness`.
+        loses: it lost weak matter that a direct method shows, see `lost_mass`.
         hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
     """
 
@@ -49,6 +51,7 @@ class Score:
     residuals: F64
     residual_seen: float = math.inf
     steepness: float = 1.0
+    loses: bool = False
     hides: Callable[[], bool] = lambda: False
 
     @property
@@ -120,7 +123,11 @@ def predicts_best(
 
     def scores() -> list[Score]:
         steep = edge_steepness([volume for _, volume in found])
-        return [replace(score, steepness=edges) for (score, _), edges in zip(found, steep, strict=True)]
+        shown = next((volume for score, volume in found if score.method.traits.direct), None)
+        return [
+            replace(score, steepness=edges, loses=shown is not None and _loses(volume, shown))
+            for (score, volume), edges in zip(found, steep, strict=True)
+        ]
 
     regular = [at for at in order or range(len(methods)) if at != spare]
     for at in regular:
@@ -143,7 +150,8 @@ def predicts_best(
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
-    """The score to prefer: of those that are level the first that hides nothing and dulls no edges.
+    """The score to prefer: of those that are level the first that hides nothing and dulls no edges. What loses weak
+    matter is not asked, unless all do.
 
     Dull are edges beside which those of another level one that follows noise no more are steeper: noise alone makes a
     volume steeper where edges are soft.
@@ -154,13 +162,14 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     thin crack, which few rays see; and FISTA-TV to a fit that it finished, though from the fit it comes nearer to the
     sample (0.1 to 2.6 dB). The penalised one alone prefers what is smooth.
     """
+    passed = {score.at: "loses weak matter" for score in scores if score.loses}
+    scores = [score for score in scores if not score.loses] or scores
     least = min(scores, key=lambda s: s.residual)
     level = [
         score
         for score in sorted(scores, key=lambda s: s.at)
         if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
     ]
-    passed: dict[int, str] = {}
     for score in level if len(level) > 1 else ():
         if any(other.overfit <= score.overfit and score.steepness < _DULL * other.steepness for other in level):
             passed[score.at] = "dulls edges"
@@ -256,6 +265,12 @@ def _residuals(volume: Volume, problem: ReconProblem) -> F64:
     seen = np.where(matter, left, np.nan) if matter.any() else left
     found = np.array([median_deviation(view) for view in seen if np.isfinite(view).any()])
     return found if found.size else np.full(1, np.inf)
+
+
+def _loses(volume: F32, shown: F32) -> bool:
+    """The volume lost weak matter that this one, of a direct method, shows."""
+    beside = compare(volume, shown)
+    return beside is not None and beside.lost is not None
 
 
 def _hides(volume: Volume, problem: ReconProblem) -> bool:

@@ -20,7 +20,7 @@ from recon.methods import build, by_name, has_setting, taking, with_trait
 SETTINGS = {
     "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
     "kernel": "fit.kernel", "early_stop": "early_stop", "finish": "finish", "iterations": "iterations",
-    "tv_weight": "tv_weight",
+    "tv_weight": "tv_weight", "allow_negative": "allow_negative",
 }  # fmt: skip
 """Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
@@ -35,7 +35,7 @@ _TIMED = ("steps", "seconds", "gaussians")
 _OF_A_FIT = (*_TIMED, "start", "loss", "kernel", "device", "early_stop", "finish", "checkpoint", "resume")
 # The options that exclude each of those that choose a plan.
 _CHOSEN = {"budget": ("quality", *_OF_A_FIT, "iterations"), "quality": ("budget", *_TIMED, "finish")}
-_FINISHED = tuple(name for name in _OF_A_FIT if name not in _TIMED)  # of scans that are finished only
+_FINISHED = (*(name for name in _OF_A_FIT if name not in _TIMED), "allow_negative")  # of scans that are finished only
 
 
 def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
@@ -178,6 +178,12 @@ _TV_WEIGHT = click.option(
     type=POSITIVE,
     help="Weight of the total variation, relative to the density of the sample.",
 )
+_ALLOW_NEGATIVE = click.option(
+    "--allow-negative",
+    is_flag=True,
+    help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
+    "with it.",
+)
 _OF_ROWS = (_STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
 _OPTIONS = (
     _STEPS,
@@ -240,4 +246,5 @@ _OPTIONS = (
     ),
     _ITERATIONS,
     _TV_WEIGHT,
+    _ALLOW_NEGATIVE,
 )

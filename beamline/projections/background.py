@@ -10,6 +10,7 @@ from beamline.projections.selection import Surface
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
+from recon.base.noise import noise_level
 from recon.base.volume import Grid
 from recon.prep.background import AirSums, Background, Mask, matter
 from recon.splatting.initialise import first_volume
@@ -19,16 +20,18 @@ F32 = NDArray[np.float32]
 
 _COLS, _VIEWS = 96, 180  # of the volume that tells where the sample is
 _RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
-_AT_ONCE = 64  # views
-_LEAST_VIEWS = 8
+_AT_ONCE, _NOISE_VIEWS = 64, 16  # views
+_LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
 
 
 class _Views:
     """Line integrals [view, row, col] with their geometry, which are taken binned and finite, so many at a time."""
 
-    def __init__(self, data: F32, geometry: Geometry) -> None:
+    def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
         self.data, (rows, cols) = data, geometry.detector_shape
         self.factor = max(1, min(round(cols / _COLS), rows))
+        filled = np.zeros((1, rows, cols), np.float32) if unknown is None else unknown[None].astype(np.float32)
+        self._measured = bin_views(filled, self.factor)[0] == 0
         self.geometry = geometry.binned(self.factor)
 
     def binned(self, numbers: NDArray[np.intp]) -> F32:
@@ -40,18 +43,23 @@ class _Views:
         for part in np.array_split(numbers, max(1, numbers.size // _AT_ONCE)):
             paths = Projector(self.geometry.select(part), grid).forward(volume)
             for view, path in zip(self.binned(part), paths, strict=True):
-                sums.add(view, path <= 0)
+                sums.add(view, (path <= 0) & self._measured)
         return sums
 
 
 def without_background(
-    data: F32, geometry: Geometry, wanted: Surface, others: tuple[F32, Geometry] | None = None
+    data: F32,
+    geometry: Geometry,
+    wanted: Surface,
+    others: tuple[F32, Geometry] | None = None,
+    unknown: Mask | None = None,
 ) -> str:
     """Take the background of the beam off views [view, row, col], in place; what was done, in words; empty: nothing.
 
     Args:
         wanted: "auto": where the views confirm it; a number: polynomials of this order.
         others: further views and their geometry, which lose their background, too.
+        unknown: bool [row, col], pixels that were not measured.
 
     Raises:
         DataError: polynomials were asked for, and too few rays miss the sample.
@@ -59,15 +67,15 @@ def without_background(
     if wanted == "none":
         return ""
     order = None if wanted == "auto" else wanted
-    views = _Views(data, geometry)
-    found, where = _found(views, order) if len(data) >= _LEAST_VIEWS else (None, None)
+    views = _Views(data, geometry, unknown)
+    found, where = _found(views, order) if _see_all_sides(geometry) else (None, None)
     if found is None or where is None:
         if order is None:
             return ""
         raise DataError(
             "--air surface: too few rays miss the sample, so that no surface can be fitted. Give --air columns or none."
         )
-    if order is None and not found.confirmed:
+    if order is None and not found.confirmed(noise_level(views.binned(_spread(len(data), _NOISE_VIEWS)))):
         return ""
     seen = (
         f"the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by the "
@@ -79,7 +87,7 @@ def without_background(
             f"taken off. If that is air, give --air surface:{found.order}."
         )
     if others is not None:
-        more = _Views(*others)
+        more = _Views(*others, unknown)
         unseen = more.sums(*where, np.arange(len(more.data))).fit(found.order)
         if unseen is not None:
             unseen.remove(more.data)
@@ -89,10 +97,17 @@ def without_background(
     )
 
 
+def _see_all_sides(geometry: Geometry) -> bool:
+    """Views enough, and no wide gap between them: else a first volume does not show where the sample is."""
+    angles = np.sort(np.mod(geometry.angles, geometry.period))
+    gaps = np.diff(angles, append=angles[0] + geometry.period)
+    return geometry.n_views >= _LEAST_VIEWS and bool(gaps.max() < _WIDEST_GAP)
+
+
 def _found(views: _Views, order: int | None) -> tuple[Background | None, tuple[Mask, Grid]]:
     """The background of all views, by where a first volume of some of them has matter; and that."""
     n, geometry = len(views.data), views.geometry
-    numbers = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(np.intp))
+    numbers = _spread(n, _VIEWS)
     some, grid = geometry.select(numbers), Grid.matching(geometry)
     _, y, x = grid.coordinates()
     away = np.hypot(y[:, None], x)
@@ -108,3 +123,8 @@ def _found(views: _Views, order: int | None) -> tuple[Background | None, tuple[M
         if found is None:
             break
     return found, (sample, grid)
+
+
+def _spread(n: int, most: int) -> NDArray[np.intp]:
+    """At most so many of n views, evenly spread."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.intp))

@@ -245,7 +245,7 @@ def prepare_projections(
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
     ids = projections.view_ids
     geometry = jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids)
-    background = without_background(projections.data, geometry, selection.surface, held_out)
+    background = without_background(projections.data, geometry, selection.surface, held_out, areas(projections.masked))
     taken, rings = remove_rings_in_place(projections.data, source.angles[ids], selection.rings)
     if others is not None:
         others.data[...] -= taken

@@ -34,6 +34,7 @@ from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.clock import Clock
 from drivers.frame import FrameKind
+from recon.base.masks import areas
 from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty
@@ -350,7 +351,7 @@ class ScanFollower:
         views, selection = self._joined(), self._options.selection
         geometry = geometry_of(self.source, selection, axis_col, self.source.angles[views.view_ids])
         try:
-            said = without_background(views.data, geometry, selection.surface)
+            said = without_background(views.data, geometry, selection.surface, unknown=areas(views.masked))
         except DataError as error:  # nobody throws the volume of a scan away for this
             self._warn(str(error))
             return ""

@@ -211,6 +211,11 @@ def compose(
         f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}. A "
         "smoother volume has more of both, though it may show less: look for cracks and pores in the pictures.",
     ]
+    if any("air" in values for values in metrics.values()):
+        footnotes.append(
+            "Level of air: the mean where FBP has no matter, over the deviation of FBP there (blocks of voxels). "
+            "Air of FBP that is below zero is missing from the other volume's weak matter."
+        )
     if _grew(made):
         footnotes.append(
             "Time of R²-Gaussian: from the first look at the growing file to the volume; it includes the scan."

@@ -1,4 +1,5 @@
-"""What speaks against a volume, in words: structure that it leaves in the views, parts that are in some views only."""
+"""What speaks against a volume, in words: structure that it leaves in the views, mass that it lost, views that do not
+fit."""
 
 from __future__ import annotations
 
@@ -6,10 +7,23 @@ from beamline.core.text import count
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import ReconOutcome, label_of
+from recon.assess.lost_mass import Comparison
 from recon.methods import by_name
 from recon.voxels import odd_views, unexplained
 
 _NAMED = 5  # odd views, at most
+
+
+def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
+    """The warning that a volume has lost weak matter that FBP shows; empty where it has not."""
+    if beside_fbp.lost is None:
+        return ""
+    z, y, x = (f"{first}:{end}" for first, end in beside_fbp.lost)
+    return (
+        f"The {label_of(made.method)} volume keeps {beside_fbp.kept:.0%} of the mass that FBP shows above its own air "
+        f"in a region of {z},{y},{x} [z, y, x]: weak matter was lost, as where air is below zero. See --air in "
+        "docs/commands.md, give --allow-negative, or use --method fbp."
+    )
 
 
 def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:

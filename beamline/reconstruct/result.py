@@ -19,7 +19,7 @@ from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
-from beamline.reconstruct.remarks import hiding_warning, odd_views_warning
+from beamline.reconstruct.remarks import hiding_warning, lost_mass_warning, odd_views_warning
 from beamline.report.html import write_report
 from beamline.report.logbook import write_logbook
 from beamline.report.record import history_arrays
@@ -28,6 +28,7 @@ from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.partial_volume import complete
 from beamline.storage.writers.recon_file import ReconRecord, Value
 from drivers.clock import Clock
+from recon.assess.lost_mass import compare
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.prep.align import AxisEstimate
@@ -141,6 +142,15 @@ def write_result(
         data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, out=out)
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
+    if BASELINE in volumes:  # it is the first
+        for name, volume in volumes.items():
+            beside_fbp = compare(volume.data, volumes[BASELINE].data)
+            if beside_fbp is None:
+                break  # it shows no air
+            metrics[name]["air"] = beside_fbp.air
+            if lost := lost_mass_warning(made, beside_fbp):
+                sink(Event("warning", clock.now(), {"message": lost}))
+                context = replace(context, warnings=[*context.warnings, lost])
     own = metrics[made.method]
     phases.enter("report")
     parameters = parameters_of(made, prepared, context)

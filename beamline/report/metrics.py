@@ -25,6 +25,7 @@ METRICS = {
     "residual": Metric("Data residual, views used", "", 4, "lower is better"),
     "residual_held_out": Metric("Data residual, views held out", "", 4, "lower is better"),
     "unexplained": Metric("Matter that leaves structure", "", 4, "lower is better"),
+    "air": Metric("Level of air, in noise of FBP", "", 2, "nearer to 0 is better"),
     "seconds": Metric("Time", "s", 1, "lower is better"),
 }
 

@@ -1,4 +1,4 @@
-"""Noise of a scan, from differences of third and fourth order along rows and columns, and pixels that make rings."""
+"""Noise of a scan, from differences of third and fourth order along rows and columns; pixels that make rings; air."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import gaussian_filter, median_filter
+from scipy.signal import find_peaks
 
 F32 = NDArray[np.float32]
 
@@ -17,6 +18,9 @@ _VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
+_SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
+_CLIPPED, _ROUNDS = 4.0, 20  # standard deviations of air, rounds
+_GROWTH = 4.0  # of the deviation of air over that of what is below its commonest value
 
 
 def noise_level(images: F32) -> float:
@@ -74,6 +78,33 @@ def ring_offsets(residual: F32) -> F32:
         steady -= median_filter(steady, (_NEIGHBOURS, 1), mode="nearest")
     error = 1.25 * median_deviation(residual - np.median(residual)) / np.sqrt(n)
     return np.where(np.abs(steady) > 3 * error, steady, 0).astype(np.float32)
+
+
+def air_level(values: F32) -> tuple[float, float]:
+    """The level of air among the values of a volume, and its standard deviation.
+
+    The lowest value that many voxels have; from there the values within four deviations, until these stay. Where air
+    is uneven, its deviation is up to four times that of the values below the first.
+    """
+    values = values.ravel()
+    values = values[:: max(1, values.size // _SAMPLED)]
+    low, high = np.percentile(values, (0.05, 99.95))
+    if not high > low:
+        return float(low), 0.0
+    counts, edges = np.histogram(values, _BINS, (low, high))
+    smooth = np.concatenate(([0], gaussian_filter(counts.astype(np.float64), 2), [0]))
+    least = _PEAK * smooth.max()
+    peaks, _ = find_peaks(smooth, height=least, prominence=least / 2)
+    level = float(edges[peaks[0] - 1] + edges[peaks[0]]) / 2
+    below = level - values[values < level]
+    first = noise = median_deviation(below)
+    for _ in range(_ROUNDS):
+        near = values[np.abs(values - level) <= _CLIPPED * noise]
+        if not near.size:  # all that is below is the same
+            break
+        level = float(np.median(near))
+        noise = min(median_deviation(near - level), _GROWTH * first)
+    return level, noise
 
 
 def _sample(images: F32) -> F32:

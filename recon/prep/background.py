@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
-from scipy.signal import find_peaks
+
+from recon.base.noise import air_level
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -26,14 +27,13 @@ LEAST_SIZE = 0.005
 
 _SMOOTH = 1.5  # voxels: weak matter stands out of the noise when it is smoothed
 _SIGMAS, _MARGIN = 5.0, 4  # of the smoothed air; voxels around matter that count as matter
-_SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
-_MAD, _CLIPPED, _ROUNDS = 1.4826, 4.0, 20  # normal standard deviation over median deviation; such deviations; rounds
-_GROWTH = 4.0  # of the spread of air over what is below its commonest value
+_MAD, _CLIPPED = 1.4826, 4.0  # normal standard deviation over median deviation; such deviations
 _BLOCK = 8  # pixels a side: every other block of air is predicted from those between
 _LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # of the rays of a view; of the views
 _WINDOWS = (45, 15, 5, 1)  # views that share a surface
 _BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75  # of the mean square left: fewer views, or a higher order, must pay
 _BETTER = 0.99  # so must any surface
+_LEFT = 2.0  # times the noise: air of which a surface leaves more is no air
 _FARTHEST = 1000.0  # largest variance of a surface over that of a constant: beyond it extrapolates
 _ROWS_A_POWER = 4
 
@@ -64,10 +64,10 @@ class Background:
     air: float
     level: float
 
-    @property
-    def confirmed(self) -> bool:
-        """It is no chance and not too small: blocks of air that it was not fitted on are nearer to nothing by it."""
-        return self.size >= LEAST_SIZE and self.after**2 < _BETTER * self.before**2
+    def confirmed(self, noise: float) -> bool:
+        """It is not too small, and leaves little beside the noise of binned rays in air that it was not fitted on."""
+        pays = self.after**2 < _BETTER * self.before**2
+        return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
     @property
     def may_be_matter(self) -> bool:
@@ -115,33 +115,6 @@ def matter(volume: F32, inside: Mask) -> Mask:
     smooth = gaussian_filter(volume, [min(_SMOOTH, n / 8) for n in volume.shape], mode="nearest")
     level, noise = air_level(smooth[:, inside])
     return np.asarray(binary_dilation((smooth - level > _SIGMAS * noise) & inside, iterations=_MARGIN))
-
-
-def air_level(values: F32) -> tuple[float, float]:
-    """The level of air among the values of a volume, and its standard deviation.
-
-    The lowest value that many voxels have; from there the values within four deviations, until these stay. Where air
-    is uneven, its deviation is up to four times that of the values below the first.
-    """
-    values = values.ravel()
-    values = values[:: max(1, values.size // _SAMPLED)]
-    low, high = np.percentile(values, (0.05, 99.95))
-    if not high > low:
-        return float(low), 0.0
-    counts, edges = np.histogram(values, _BINS, (low, high))
-    smooth = np.concatenate(([0], gaussian_filter(counts.astype(np.float64), 2), [0]))
-    least = _PEAK * smooth.max()
-    peaks, _ = find_peaks(smooth, height=least, prominence=least / 2)
-    level = float(edges[peaks[0] - 1] + edges[peaks[0]]) / 2
-    below = level - values[values < level]
-    first = noise = _MAD * float(np.median(below)) if below.size else 0.0
-    for _ in range(_ROUNDS):
-        near = values[np.abs(values - level) <= _CLIPPED * noise]
-        if not near.size:  # all that is below is the same
-            break
-        level = float(np.median(near))
-        noise = min(_MAD * float(np.median(np.abs(near - level))), _GROWTH * first)
-    return level, noise
 
 
 class AirSums:

@@ -108,6 +108,7 @@ def finish(
     sweeps: int | None = None,
     settings: FitSettings | None = None,
     control: RunControl | None = None,
+    nonnegative: bool = True,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -136,6 +137,8 @@ def finish(
             two attempts keeps the first where it explains the views of a parallel beam, which see all matter, better
             than the fit, else the fit. Of such views it keeps the first during the second, too.
 
+        nonnegative: voxels below zero are clipped.
+
     Raises:
         ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
     """
@@ -160,6 +163,7 @@ def finish(
             views,
             weight=known,
             start=start,
+            nonnegative=nonnegative,
             on_iteration=lambda sweep, _: watch.sweep(sweep, method.iterations),
             on_trial=watch.trial,
             decide=decide,

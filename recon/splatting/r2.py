@@ -49,6 +49,7 @@ class R2:
         finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None: 8
             to 24 as views held out prefer, or none for rolled or tilted views, which the voxel projector does not
             take. The result's `gaussians` stay the model as it was fitted.
+        allow_negative: the finish keeps voxels below zero; Gaussians have none.
         fit: weights, rates and limits.
     """
 
@@ -65,6 +66,7 @@ class R2:
     start: Start = "fbp"
     early_stop: bool = False
     finish: int | None = None
+    allow_negative: bool = False
     fit: FitSettings = field(default_factory=FitSettings)
 
     def __post_init__(self) -> None:

@@ -183,7 +183,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
         if method.seconds is not None:
             control = replace(control, should_stop=_until(control, end))
         fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
-        finished, sweeps = finish(volume, model, fitted, wanted, settings, control)
+        finished, sweeps = finish(volume, model, fitted, wanted, settings, control, not method.allow_negative)
         if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
             sweeps = 0
         else:

@@ -117,10 +117,11 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     filled, known = masked(problem.projections, problem.use.weights)
     decide = control.decide or Decisions(problem.seed)
     projector = Projector(geometry, problem.grid)
-    volume = solve(
-        method, projector, filled, weight=known, on_iteration=report, on_trial=control.should_stop, decide=decide
-    )
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
+    volume = solve(
+        method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
+        on_iteration=report, on_trial=control.should_stop, decide=decide,
+    )  # fmt: skip
     return MethodResult(volume, {**settings, "seed": problem.seed}, tuple(history))
 
 

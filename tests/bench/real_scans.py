@@ -52,6 +52,14 @@ SCANS = {
         ((-0.001, 0.0045), (-0.001, 0.0045)),
         ((0, 160, 0, 160), (60, 130, 45, 115)),
     ),
+    "dome": Shown(
+        "beamline recon diamond_24737_parallel_91x135x160.h5 -m fista-tv --air columns -o dome_columns.h5",
+        "beamline recon diamond_24737_parallel_91x135x160.h5 -m fista-tv -o dome.h5",
+        ("FISTA-TV, --air columns", "FISTA-TV"),
+        60,
+        ((-0.0007, 0.0028), (-0.0007, 0.0028)),
+        ((0, 160, 0, 160), (30, 130, 20, 120)),
+    ),
     "tooth": Shown(
         "beamline recon aps2bm_tooth_181x2x640.h5 -m fbp -o tooth_fbp.h5",
         "beamline recon aps2bm_tooth_181x2x640.h5 -m r2 --rings vo -o tooth_r2.h5",

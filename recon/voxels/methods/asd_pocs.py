@@ -36,6 +36,7 @@ class AsdPocs:
         goal: ||A x - p|| / ||p|| to be reached; None: 0.15 of that of filtered back-projection (FBP or FDK), or, for
             views that it does not take (a cone's short scan), of a sweep of ordered-subset SIRT, which has about
             the same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
+        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "asd-pocs"
@@ -51,6 +52,7 @@ class AsdPocs:
     alpha_decay: float = 0.95
     ratio: float = 0.94
     goal: float | None = None
+    allow_negative: bool = False
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_iterative(self, problem, control)

@@ -30,6 +30,9 @@ class Cgls:
 
     Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations: from
     there the residual is that of one iteration less. Memory: 3 volumes, 3 x the projections.
+
+    Attributes:
+        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "cgls"
@@ -38,6 +41,7 @@ class Cgls:
     traits: ClassVar[Traits] = Traits()
 
     iterations: int = 10
+    allow_negative: bool = False
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_iterative(self, problem, control)

@@ -31,7 +31,8 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FistaTv:
-    """min ½||A x - p||² + μ TV(x), x >= 0, see `recon.voxels.ordered_fista`. Memory: 7 volumes, 2 x the projections.
+    """min ½||A x - p||² + μ TV(x), x >= 0 by default, see `recon.voxels.ordered_fista`. Memory: 7 volumes,
+    2 x the projections.
 
     Attributes:
         iterations: passes over all views.
@@ -39,6 +40,7 @@ class FistaTv:
             threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
         subsets: of the views, a step each; 1 is FISTA without subsets, which needs about ten times the iterations.
         tv_steps: dual steps of total variation in each step.
+        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "fista-tv"
@@ -50,6 +52,7 @@ class FistaTv:
     tv_weight: float | None = None
     subsets: int = 9
     tv_steps: int = 3
+    allow_negative: bool = False
 
     def __post_init__(self) -> None:
         if self.tv_weight is not None and not 0 <= self.tv_weight < math.inf:

@@ -24,6 +24,9 @@ class Sart:
     """Simultaneous algebraic reconstruction, one view a step in random order (Andersen & Kak 1984).
 
     The relaxation shrinks by `decay` a sweep. Memory: 3 volumes, 3 x the projections.
+
+    Attributes:
+        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "sart"
@@ -34,6 +37,7 @@ class Sart:
     iterations: int = 20
     relaxation: float = 1.0
     decay: float = 0.999
+    allow_negative: bool = False
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_iterative(self, problem, control)

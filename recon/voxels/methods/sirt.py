@@ -21,7 +21,11 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Sirt:
-    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections."""
+    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections.
+
+    Attributes:
+        allow_negative: voxels below zero are kept.
+    """
 
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
@@ -30,6 +34,7 @@ class Sirt:
 
     iterations: int = 100
     relaxation: float = 1.0
+    allow_negative: bool = False
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_iterative(self, problem, control)

@@ -81,6 +81,15 @@ def test_nothing_is_taken_off_beams_that_are_their_flats(bodies: tuple[Cylinder 
     assert "taken off. Air" not in said
 
 
+def test_a_surface_is_not_sought_where_views_do_not_show_where_the_sample_is() -> None:
+    """From a third of the half circle a first volume is all streaks, and from few views, too."""
+    views, few = _views(DOME, POST) + BENT, np.arange(0, 60, 6)
+    for part in (slice(0, 20), few):
+        some = views[part].copy()
+        assert without_background(some, GEOMETRY.select(part), "auto") == ""
+        assert (some == views[part]).all()
+
+
 def test_positive_air_is_told_and_taken_off_on_request_only() -> None:
     views = _views(DOME, POST) + np.float32(0.03)
     kept = views.copy()

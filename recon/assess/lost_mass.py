@@ -1,0 +1,92 @@
+"""lost_mass: weak matter that FBP shows above its own air, and a volume without negative densities does not have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_opening, find_objects, gaussian_filter, label
+
+from recon.base.noise import air_level
+
+F32 = NDArray[np.float32]
+
+_BLOCKS = 96  # of a volume along its longest side, at most
+_SMOOTH, _SIGMAS = 1.5, 5.0  # blocks; of air
+_MARGIN, _RIM = 4, 0.92  # blocks around matter; of the radius that all views see
+_LEAST_AIR = 100  # blocks
+_LEFT = 0.5  # of what FBP shows: a voxel with less has lost it
+_CORE = 3, 5, 5  # blocks along z, y and x of the boxes that a region is made of
+_LEAST = 64  # blocks of a region
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A volume beside an FBP of the same views.
+
+    Attributes:
+        air: level of the volume where FBP shows no matter, over `noise`.
+        noise: standard deviation of FBP there, in blocks of voxels.
+        lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region has.
+        kept: mass in that region, over FBP's; each above its own air.
+    """
+
+    air: float
+    noise: float
+    lost: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None = None
+    kept: float = 1.0
+
+
+def compare(volume: F32, reference: F32) -> Comparison | None:
+    """The air of a volume, and the largest region in which it lost weak matter that the reference shows.
+
+    Both in blocks of voxels, so that a volume that lies on disk takes little memory. A region is a union of boxes
+    of 3 x 5 x 5 blocks [z, y, x]: streaks are thinner.
+
+    Args:
+        volume: [z, y, x], of any method.
+        reference: [z, y, x], FBP or FDK.
+
+    Returns:
+        None where the reference shows no air.
+    """
+    factor = max(1, math.ceil(max(volume.shape) / _BLOCKS))
+    factor = min(factor, *volume.shape)
+    shown, found = _blocks(reference, factor), _blocks(volume, factor)
+    ny, nx = shown.shape[1:]
+    y, x = np.mgrid[:ny, :nx]
+    inside = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
+    smooth = [min(_SMOOTH, n / 8) for n in shown.shape]
+    shown, found = (gaussian_filter(values, smooth, mode="nearest") for values in (shown, found))
+    if not inside.any():
+        return None
+    level, noise = air_level(shown[:, inside])
+    matter = (shown - level > _SIGMAS * noise) & inside
+    air = inside & ~binary_dilation(matter, iterations=_MARGIN)
+    if noise == 0 or air.sum() < _LEAST_AIR:
+        return None
+    own = float(found[air].mean(dtype=np.float64))
+    comparison = Comparison(own / noise, noise)
+    gone = matter & (found - own < _LEFT * (shown - level))
+    core = [min(n, wide) for n, wide in zip(gone.shape, _CORE, strict=True)]
+    parts, n = label(binary_opening(gone, np.ones(core)))
+    sizes = np.bincount(parts.ravel())[1:]
+    if not n or sizes.max() < _LEAST:
+        return comparison
+    at = int(sizes.argmax())
+    region = parts == at + 1
+    kept = float((found[region] - own).sum(dtype=np.float64) / (shown[region] - level).sum(dtype=np.float64))
+    spans = tuple((part.start * factor, part.stop * factor) for part in find_objects(parts)[at])
+    return Comparison(own / noise, noise, (spans[0], spans[1], spans[2]), kept)
+
+
+def _blocks(volume: F32, factor: int) -> F32:
+    """Means of blocks of so many voxels a side; those that fill no block at the ends are dropped."""
+    nz, ny, nx = (n // factor for n in volume.shape)
+    blocks = np.empty((nz, ny, nx), np.float32)
+    for z in range(nz):
+        image = volume[z * factor : (z + 1) * factor, : ny * factor, : nx * factor].mean(axis=0, dtype=np.float32)
+        blocks[z] = image.reshape(ny, factor, nx, factor).mean(axis=(1, 3))
+    return blocks
