@@ -38,13 +38,9 @@ def _assert_all_is_there(rows: list[Row]) -> None:
         assert (row["again"], row["left"]) == (False, ["scan.h5"]), row
 
 
-def _assert_said_in_a_sentence(rows: list[Row], crashes: int = 0) -> None:
+def _assert_said_in_a_sentence(rows: list[Row]) -> None:
     """A failure is a refusal: no traceback, no crash, nothing from HDF5 on the terminal when the program ends."""
-    crashed = [row for row in rows if row["done"] == "exit -11"]
-    assert len(crashed) <= crashes, crashed
     for row in rows:
-        if row in crashed:
-            continue
         assert not str(row["done"]).startswith(("Traceback", "exit")), row
         assert row["stderr"] == "", row
 
@@ -60,7 +56,7 @@ def test_the_disk_fails_from_each_of_the_last_writes_of_a_scan_on(tmp_path: Path
     rows = _rows(tmp_path, "close", "from", number)
     assert len(rows) == 100
     _assert_all_is_there(rows)
-    _assert_said_in_a_sentence(rows, crashes=1)  # of HDF5, whose last write, the head, fails; all frames are there
+    _assert_said_in_a_sentence(rows)
 
 
 @pytest.mark.parametrize("torn", [False, True])
