@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import re
@@ -141,15 +142,21 @@ def never_close(file: h5py.File) -> None:
 
     For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
     object, and may leave it marked as one that nobody can open. HDF5 closes it all the same when the process ends, and
-    crashes where the disk still fails: so its handle leads to memory from now on.
+    crashes where the disk still fails: its handle leads to memory then.
     """
-    if os.name == "posix":  # elsewhere the numbers of handles may be another library's
-        with suppress(OSError, RuntimeError, ValueError):
-            memory = os.memfd_create("closed") if sys.platform == "linux" else os.open(os.devnull, os.O_RDWR)
-            os.dup2(memory, file.id.get_vfd_handle(), inheritable=False)
-            os.close(memory)
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back
+    if os.name == "posix":  # elsewhere the numbers of handles may be another library's
+        with suppress(OSError, RuntimeError, ValueError):
+            handle = file.id.get_vfd_handle()
+            atexit.register(_lead_to_memory, handle, os.fstat(handle).st_ino)
+
+
+def _lead_to_memory(handle: int, inode: int) -> None:
+    with suppress(OSError):
+        if os.fstat(handle).st_ino == inode:
+            memory = os.memfd_create("closed") if sys.platform == "linux" else os.open(os.devnull, os.O_RDWR)
+            os.dup2(memory, handle)
 
 
 class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types

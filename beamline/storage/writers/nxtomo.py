@@ -228,7 +228,11 @@ class NXtomoWriter:
         self._last[layout.FINISHED][()] = 1
         self._file.flush()
         self._to_disk.finish(self._committed)
-        self._file.close()
+        try:
+            self._file.close()
+        except FAILURES:
+            self._broken = True  # HDF5 has closed it by half: to touch it again would be a crash
+            raise
 
     def _let_go(self) -> None:
         """Mark the end where there is room for it already, and leave the rest as a dead writer would.

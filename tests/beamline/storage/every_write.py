@@ -5,6 +5,7 @@ It is started under the library of tests/faulty_disk.py, forks once for each fau
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import gc
 import json
@@ -90,7 +91,8 @@ class Rig:
                 os._exit(0)
             if self._children % 20 == 0:
                 sys.exit()  # as a program ends: HDF5 closes what is open
-            self.writer = None  # the same without the end of Python, which takes seconds
+            atexit._run_exitfuncs()  # the same without the end of Python, which takes seconds
+            self.writer = None
             gc.collect()
             sys.stderr.flush()
             ctypes.CDLL(None).exit(0)
