@@ -17,6 +17,7 @@ from recon.splatting.initialise import first_volume
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 _COLS, _VIEWS = 96, 180  # of the volume that tells where the sample is
 _RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
@@ -53,8 +54,10 @@ def without_background(
     wanted: Surface,
     others: tuple[F32, Geometry] | None = None,
     unknown: Mask | None = None,
-) -> str:
-    """Take the background of the beam off views [view, row, col], in place; what was done, in words; empty: nothing.
+) -> tuple[str, F64 | None]:
+    """Take the background of the beam off views [view, row, col], in place.
+
+    Returns what was done, in words (empty: nothing), and the terms of the mean surface that was taken off.
 
     Args:
         wanted: "auto": where the views confirm it; a number: polynomials of this order.
@@ -65,18 +68,18 @@ def without_background(
         DataError: polynomials were asked for, and too few rays miss the sample.
     """
     if wanted == "none":
-        return ""
+        return "", None
     order = None if wanted == "auto" else wanted
     views = _Views(data, geometry, unknown)
     found, where = _found(views, order) if _see_all_sides(geometry) else (None, None)
     if found is None or where is None:
         if order is None:
-            return ""
+            return "", None
         raise DataError(
             "--air surface: too few rays miss the sample, so that no surface can be fitted. Give --air columns or none."
         )
     if order is None and not found.confirmed(noise_level(views.binned(_spread(len(data), _NOISE_VIEWS)))):
-        return ""
+        return "", None
     seen = (
         f"the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by the "
         f"{found.air:.0%} of the rays that miss the sample (order {found.order})"
@@ -85,16 +88,17 @@ def without_background(
         return (
             f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: none "
             f"taken off. If that is air, give --air surface:{found.order}."
-        )
+        ), None
     if others is not None:
         more = _Views(*others, unknown)
         unseen = more.sums(*where, np.arange(len(more.data))).fit(found.order)
         if unseen is not None:
             unseen.remove(more.data)
     found.remove(data)
-    return (
+    said = (
         f"Background of the beam: {seen}; taken off. Air was {found.before:.2g} off nothing and is {found.after:.2g}."
     )
+    return said, found.coefficients.mean(axis=0)
 
 
 def _see_all_sides(geometry: Geometry) -> bool:

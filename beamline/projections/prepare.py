@@ -73,6 +73,7 @@ class PreparedProjections:
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
         background: what was done about the background of the beam; empty where nothing was asked.
+        background_terms: of the mean surface that was taken off, see `recon.prep.background.surface`; None: none was.
         rings: what was done about rings; empty where nothing was asked.
         flats: what was done about changes of the beam; empty where nothing was asked.
         phase: what was done about phase; empty where nothing was asked.
@@ -99,6 +100,7 @@ class PreparedProjections:
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
     background: str = ""
+    background_terms: NDArray[np.float64] | None = None
     rings: str = ""
     flats: str = ""
     phase: str = ""
@@ -245,7 +247,9 @@ def prepare_projections(
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
     ids = projections.view_ids
     geometry = jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids)
-    background = without_background(projections.data, geometry, selection.surface, held_out, areas(projections.masked))
+    background, background_terms = without_background(
+        projections.data, geometry, selection.surface, held_out, areas(projections.masked)
+    )
     taken, rings = remove_rings_in_place(projections.data, source.angles[ids], selection.rings)
     if others is not None:
         others.data[...] -= taken
@@ -265,6 +269,7 @@ def prepare_projections(
         flats=correction.flats,
         phase=correction.phase,
         background=background,
+        background_terms=background_terms,
         rings=rings,
         tilt=tilt,
         shares_of=shares_of,

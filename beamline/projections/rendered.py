@@ -13,6 +13,7 @@ from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.prep.background import surface
 from recon.voxels.projector import project
 
 PARAMETERS = "/entry/reconstruction/parameters"
@@ -20,6 +21,8 @@ PARAMETERS = "/entry/reconstruction/parameters"
 
 def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[np.float32]]:
     """Of a volume file of `beamline recon` of this scan: (angle in radians, pixels a side of a cell) to means of cells.
+
+    What was taken off all views as the background of the beam is in them.
 
     Raises:
         DataError: no volume of ours, of a cone beam, or one that is not made of all rows of this scan's frames.
@@ -29,6 +32,8 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             data = file["/entry/data/data"][()]
             z, y, x = (file[f"/entry/data/{name}"][()] for name in "zyx")
             axis, pitch = (float(file[f"{PARAMETERS}/{name}"][()]) for name in ("axis_col", "pixel_pitch"))
+            taken_off = file.get(f"{PARAMETERS}/background_terms")
+            terms = None if taken_off is None else taken_off[()]
         except KeyError as error:
             raise DataError(
                 f"{path} is no volume of `beamline recon`: {error.args[0]}. Nothing was looked at."
@@ -55,6 +60,8 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             )
         geometry = Geometry.parallel([angle], source.shape, pixel, axis).binned(binning)
         image = project(volume, geometry)[0]
+        if terms is not None:
+            image += surface(terms, source.shape, binning)
         k = cell // binning
         rows, cols = (n // k for n in image.shape)
         return image[: rows * k, : cols * k].reshape(rows, k, cols, k).mean(axis=(1, 3))

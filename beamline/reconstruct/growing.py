@@ -295,8 +295,8 @@ class ScanFollower:
             )
         assert self._correction is not None
         self._correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
-        background = self._without_background(self.axis_col)
-        prepared = self._prepared(self.axis_col, usable, background)
+        background, terms = self._without_background(self.axis_col)
+        prepared = replace(self._prepared(self.axis_col, usable), background=background, background_terms=terms)
         self._sink(
             Event(
                 "state",
@@ -345,22 +345,22 @@ class ScanFollower:
             self._batches = [merge_and_empty(self._batches)]
         return self._batches[0]
 
-    def _without_background(self, axis_col: float) -> str:
-        """Take the background of the beam off all views, now that all are there; what was done, in words."""
+    def _without_background(self, axis_col: float) -> tuple[str, NDArray[np.float64] | None]:
+        """Take the background of the beam off all views, now that all are there; as `without_background`."""
         assert self._fit is not None
         views, selection = self._joined(), self._options.selection
         geometry = geometry_of(self.source, selection, axis_col, self.source.angles[views.view_ids])
         try:
-            said = without_background(views.data, geometry, selection.surface, unknown=areas(views.masked))
+            said, terms = without_background(views.data, geometry, selection.surface, unknown=areas(views.masked))
         except DataError as error:  # nobody throws the volume of a scan away for this
             self._warn(str(error))
-            return ""
+            return "", None
         if said:
             corrections_done({"background": said}, self._sink, self._clock)
             self._fit.replace_views(views.data)
-        return said
+        return said, terms
 
-    def _prepared(self, axis_col: float, usable: UsableViews, background: str) -> PreparedProjections:
+    def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         projections = self._joined()
         assert self._correction is not None
         found = assemble(
@@ -368,4 +368,4 @@ class ScanFollower:
         )
         done, degrees = self._correction, self._options.selection.tilt_deg
         tilt = turned_text(degrees) if degrees else ""
-        return replace(found, noise=done.noise, phase=done.phase, flats=done.flats, tilt=tilt, background=background)
+        return replace(found, noise=done.noise, phase=done.phase, flats=done.flats, tilt=tilt)

@@ -248,6 +248,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "hardening": prepared.hardening or "not corrected",
         "surface": selection.surface,
         "background": prepared.background or "none taken off",
+        **({} if prepared.background_terms is None else {"background_terms": prepared.background_terms}),
         "rings": selection.rings,
         **({"rings_removed": prepared.rings} if prepared.rings else {}),
         "floored_fraction": float(prepared.projections.floored),

@@ -74,26 +74,23 @@ class Background:
         """It is positive: weak matter all around the sample looks like this, and a volume can hold it."""
         return self.level > 0
 
-    def of(self, view: int) -> F32:
-        """The surface [row, col] of a view."""
-        return self._surface(coordinate(self.shape[0]), coordinate(self.shape[1]), view)
-
-    def remove(self, views: F32, first: int = 0, factor: int = 1) -> None:
+    def remove(self, views: F32, factor: int = 1) -> None:
         """Subtract the surfaces from views [view, row, col], in place.
 
         Args:
-            first: number of the first of them.
             factor: by which their pixels are binned.
         """
-        v, u = (coordinate(n, factor) for n in self.shape)
-        for n, view in enumerate(views):
-            view -= self._surface(v, u, first + n)
+        for view, terms in zip(views, self.coefficients, strict=True):
+            view -= surface(terms, self.shape, factor)
 
-    def _surface(self, v: F64, u: F64, view: int) -> F32:
-        across = np.zeros((HIGHEST + 1, u.size))  # for each power of the row
-        for c, (i, j) in zip(self.coefficients[view], powers(HIGHEST), strict=True):
-            across[j] += c * u**i
-        return (np.vander(v, HIGHEST + 1, increasing=True) @ across).astype(np.float32)
+
+def surface(terms: F64, shape: tuple[int, int], factor: int = 1) -> F32:
+    """A polynomial [row, col] on a detector of this shape, binned by a factor; terms [term] as in `powers`."""
+    v, u = (coordinate(n, factor) for n in shape)
+    across = np.zeros((HIGHEST + 1, u.size))  # for each power of the row
+    for c, (i, j) in zip(terms, powers(HIGHEST), strict=True):
+        across[j] += c * u**i
+    return (np.vander(v, HIGHEST + 1, increasing=True) @ across).astype(np.float32)
 
 
 def coordinate(n: int, factor: int = 1) -> F64:

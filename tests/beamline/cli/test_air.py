@@ -1,0 +1,96 @@
+"""--air: a beam that bends between flats and views, from the simulated scan to the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from beamline.cli.main import main
+from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
+from beamline.projections.selection import Selection, Surface
+from beamline.storage.readers.open import open_scan
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SHAPE, VIEWS = (40, 56), 45
+SCENE = """
+phantom:
+  kind: solids
+  solids:
+    - {kind: ellipsoid, semi_axes: [0.13, 0.13, 0.13], attenuation: 0.15, centre: [0.02, 0.0, -0.02]}
+    - {kind: cylinder, radius: 0.1, height: 0.16, attenuation: 5.0, centre: [0.0, 0.0, 0.16]}
+beam: {photons_per_s: 1.0e+5}
+detector: {shape: [40, 56], pixel_size_um: 12.0, exposure_s: 0.02}
+scan: {views: 45, darks: 2, flats: 4}
+effects: [BEND, photon_noise, offset]
+"""
+BEND = "{kind: beam_bend, curvature: [0.06, 0.03], level: -0.06, drift: -2.0e-4}"
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder, found = tmp_path_factory.mktemp("air"), {}
+    for name, effect in (("bent", f"{BEND}, "), ("straight", "")):
+        (folder / f"{name}.yaml").write_text(SCENE.replace("BEND, ", effect), encoding="utf-8")
+        found[name] = folder / f"{name}.h5"
+        done = CliRunner().invoke(main, ["simulate", str(folder / f"{name}.yaml"), "--out", str(found[name])])
+        assert done.exit_code == 0, done.output
+    return found
+
+
+def _prepared(path: Path, surface: Surface = "auto", spill: Spill | None = None) -> PreparedProjections:
+    with open_scan(path) as source:
+        return prepare_projections(source, Selection(axis_col=27.5, surface=surface), lambda said: None, spill)
+
+
+def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
+    """What the terminal says, and the record of the volume's file."""
+    done = CliRunner().invoke(main, ["recon", str(scan), "--axis", "27.5", "-o", str(output), *options])
+    assert done.exit_code == 0, done.output
+    with h5py.File(output) as file:
+        found: list[str] = []
+        file.visititems(
+            lambda name, node: found.append(node[()].decode()) if name.endswith("/background") else None  # type: ignore[func-returns-value]
+        )
+    return done.output, found[0]
+
+
+def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Path]) -> None:
+    bent, straight = (_prepared(scans[name]) for name in ("bent", "straight"))
+    assert "taken off" in bent.background and straight.background == ""
+    left = bent.projections.data - straight.projections.data
+    noise = float(np.std(left[:, :8]))
+    assert np.abs(left.mean(axis=0)).max() < 0.01 and noise < 0.02
+    as_it_was = _prepared(scans["bent"], "none").projections.data - straight.projections.data
+    assert np.abs(as_it_was.mean(axis=0)).max() > 0.04
+
+
+def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict[str, Path], tmp_path: Path) -> None:
+    said, record = _recon(scans["bent"], tmp_path / "v.h5", "-m", "sirt", "--iterations", "3")
+    assert "Background of the beam: the air of the views is a surface" in said and record in said
+    page = (tmp_path / "v.html").read_text(encoding="utf-8")
+    assert "the air of the views is a surface" in page and "Level of air" in page
+    said, record = _recon(scans["bent"], tmp_path / "plain.h5", "-m", "fbp", "--air", "columns", "--no-report")
+    assert "Background" not in said and record == "none taken off"
+
+
+def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:
+    whole = _prepared(scans["bent"])
+    spill = Spill(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
+    parts = _prepared(scans["bent"], spill=spill)
+    np.testing.assert_array_equal(parts.projections.data, whole.projections.data)
+    assert parts.background == whole.background
+
+
+def test_a_followed_scan_loses_its_background_before_the_last_round(scans: dict[str, Path], tmp_path: Path) -> None:
+    said, record = _recon(scans["bent"], tmp_path / "v.h5", "--follow", "--seconds", "1", "--no-report")
+    assert "taken off" in record and record in said
+
+
+@pytest.mark.parametrize("wrong", ["surface", "surface:4", "line"])
+def test_models_that_are_none_are_refused(scans: dict[str, Path], wrong: str) -> None:
+    done = CliRunner().invoke(main, ["recon", str(scans["bent"]), "--air", wrong])
+    assert done.exit_code == 2 and "surface:ORDER" in done.output
