@@ -23,6 +23,8 @@ from drivers.clock import Clock
 from drivers.manual import Ask
 from recon.methods import BASELINE
 
+LONG = 2.0
+"""Real s after which a phase that tells no progress is named on a stream that is no terminal."""
 SAY_EVERY = 0.2
 """s between events on how far many frames are."""
 PLAIN_EVERY = 5.0
@@ -59,6 +61,7 @@ class Terminal:
         self._last_text = ""
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
+        self._long: threading.Timer | None = None  # names the phase when it has taken LONG
 
     def __enter__(self) -> Self:
         return self
@@ -66,6 +69,7 @@ class Terminal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._end_of_phase()
         with _closed_terminal_ignored():
             self._bar.stop()
 
@@ -89,6 +93,7 @@ class Terminal:
             self._console.print(printable(text))
 
     def _take(self, event: Event) -> None:
+        self._end_of_phase()
         if event.event == "frame":
             self._show("scan", event.data["n"], event.data["of"], rates(event.data))
         elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
@@ -96,7 +101,7 @@ class Terminal:
         elif event.event == "progress" and event.data.get("stage") == "archive":
             self._show("written and compared", event.data["n"], event.data["of"], rate_text(event.data, "MB"))
         elif event.event == "progress" and event.data.get("stage") == "phase":
-            self._show(event.data["phase"], event.data["n"], event.data["of"], phase_text(event.data))
+            self._show_phase(event.data)
         elif event.event == "progress" and event.data.get("stage") == "axes":
             self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
         elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:
@@ -112,6 +117,19 @@ class Terminal:
             if text and text != self._last_text:  # a snapshot of the same views replaces the one before
                 self._last_text = text
                 self._console.print(printable(text))
+
+    def _show_phase(self, data: Mapping[str, Any]) -> None:
+        if data["n"] or not self._bar.disable:
+            self._show(data["phase"], data["n"], data["of"], phase_text(data))
+            return
+        self._long = threading.Timer(LONG, self.say, [f"{data['phase']}: begun {LONG:.0f} s ago"])
+        self._long.daemon = True
+        self._long.start()
+
+    def _end_of_phase(self) -> None:
+        if self._long is not None:
+            self._long.cancel()
+            self._long = None
 
     def _show(self, what: str, done: int, total: int, note: str) -> None:
         if self._asking:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import EVENTS, parts_of, to_disk, whole_file
+from beamline.core.files import EVENTS, parts_of, whole_file
 from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
@@ -110,10 +110,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
         try:
             with hdf5.created(partial, layout.LIBVER) as file:
                 names = [Path(os.path.relpath(part, joined.parent)).as_posix() for part in parts]
-                frames = _join(files, names, file)
-                file.flush()
-                to_disk(file.id.get_vfd_handle())
-                return frames
+                return _join(files, names, file)
         except hdf5.ALTERED as error:
             raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
 

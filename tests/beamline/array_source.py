@@ -28,6 +28,7 @@ class ArraySource:
     replaces = None
     part_starts: NDArray[np.int64] = np.zeros(1, np.int64)
     checksummed = False
+    altered: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()
     finished = True
     plan: dict[str, Any] = {}  # noqa: RUF012

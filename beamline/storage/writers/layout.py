@@ -415,7 +415,10 @@ def field_of_view(file: h5py.File) -> str:
 
 def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
     """Of the views that are planned, in radians; one that is not known where the plan does not say them."""
-    return np.radians(np.asarray(json.loads(info.plan).get("angles_deg", [np.nan]), np.float64))
+    try:
+        return np.radians(np.asarray(json.loads(info.plan)["angles_deg"], np.float64))
+    except (ValueError, LookupError, TypeError):  # a plan of another program, or none
+        return np.array([np.nan])
 
 
 def _field_of_view(angles: NDArray[np.float64], frame_shape: tuple[int, ...], axis_col: float | None) -> str:
