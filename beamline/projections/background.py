@@ -19,7 +19,7 @@ from recon.voxels.projector import Projector
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_COLS, _VIEWS = 96, 180  # of the volume that tells where the sample is
+_VOXELS, _VIEWS = 2**20, 180  # at most, of the volume that tells where the sample is
 _RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
 _AT_ONCE, _NOISE_VIEWS = 64, 16  # views
 _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
@@ -30,7 +30,8 @@ class _Views:
 
     def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
         self.data, (rows, cols) = data, geometry.detector_shape
-        self.factor = max(1, min(round(cols / _COLS), rows))
+        fine = (f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= _VOXELS)
+        self.factor = next(fine, rows)
         filled = np.zeros((1, rows, cols), np.float32) if unknown is None else unknown[None].astype(np.float32)
         self._measured = bin_views(filled, self.factor)[0] == 0
         self.geometry = geometry.binned(self.factor)

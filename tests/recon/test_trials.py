@@ -83,3 +83,10 @@ def test_of_two_that_predict_alike_the_one_that_follows_its_noise_is_not_taken()
     )
     assert best_of([honest, follower])[0].at == 0
     assert best_of([honest, Score(1, Fbp(), 0.9 + scatter, residual_seen=0.85)])[0].at == 1
+
+
+@pytest.mark.parametrize(("losing", "best"), [((), 0), ((0,), 1), ((0, 1), 2), ((0, 1, 2), 0)])
+def test_what_loses_weak_matter_is_taken_only_where_all_do(losing: tuple[int, ...], best: int) -> None:
+    scores = [Score(i, Fbp(), np.full(9, r), loses=i in losing) for i, r in enumerate((1.0, 1.5, 2.0))]
+    taken, passed = best_of(scores)
+    assert taken.at == best and {at for at, why in passed.items() if why == "loses weak matter"} == set(losing)
