@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.process import ChildProcess
-from beamline.core.stop import ScanAborted, StopRequest
+from beamline.core.stop import StopRequest
 from beamline.scan import run as module
 from beamline.scan.live_process import LivePlan, LiveReconstruction, follow_command, live_need, live_plan
 from beamline.scan.run import RunResult, run_scan
@@ -97,7 +96,16 @@ def test_no_view_is_taken_before_it_is_ready_or_the_time_to_wait_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patience: float
 ) -> None:
     monkeypatch.setattr(module, "READY_WITHIN", patience)
-    compiles = "import time; time.sleep(0.5)\n" + READY
+    compiles = (
+        f"""
+import pathlib, sys, time
+events = pathlib.Path(sys.argv[1]).with_name("events.jsonl")
+while "block_started" not in events.read_text():
+    time.sleep(0.05)
+time.sleep({0 if patience else 100})
+"""
+        + READY
+    )
     ran = Ran(
         tmp_path, FakeInstrument(), live=lambda scan, output: [sys.executable, "-c", compiles, str(scan), str(output)]
     )
@@ -114,13 +122,17 @@ def test_no_view_is_taken_before_it_is_ready_or_the_time_to_wait_is_over(
 
 
 def test_a_stop_ends_the_wait_for_it(tmp_path: Path) -> None:
-    stop = StopRequest()
-    stop_soon = threading.Timer(0.3, stop.stop)
-    stop_soon.start()
-    idle = "import time; time.sleep(100)"
-    ran = Ran(tmp_path, FakeInstrument(), stop=stop, live=lambda scan, output: [sys.executable, "-c", idle])
-    stop_soon.join()
-    assert type(ran.error) is ScanAborted and "before anything was acquired" in str(ran.error)
+    stop, idle = StopRequest(), "import time; time.sleep(100)"
+
+    def stop_after_flats(event: Event) -> None:
+        if event.event == "block_done" and event.data["kind"] == "flat":
+            stop.stop()
+
+    ran = Ran(
+        tmp_path, FakeInstrument(), stop=stop, live=lambda scan, output: [sys.executable, "-c", idle],
+        heard=stop_after_flats,
+    )  # fmt: skip
+    assert type(ran.error) is ScanStopped and "Stopped after 0 of 12 projections" in str(ran.error)
 
 
 @pytest.mark.parametrize(
