@@ -13,7 +13,7 @@ import pytest
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.process import ChildProcess
-from beamline.core.stop import StopRequest
+from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan import run as module
 from beamline.scan.live_process import LivePlan, LiveReconstruction, follow_command, live_need, live_plan
 from beamline.scan.run import RunResult, run_scan
