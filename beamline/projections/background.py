@@ -123,6 +123,8 @@ def _found(views: _Views, order: int | None) -> tuple[Background | None, tuple[M
         if found is not None:
             found.remove(levelled, factor=views.factor)
         inside = away <= geometry.reach - rim * grid.voxel_size
+        if not inside.any():  # a detector of a few columns
+            return None, (np.zeros(grid.shape, np.bool_), grid)
         sample = matter(first_volume(levelled, some, grid).data, inside)
         found = views.sums(sample, grid, np.arange(n) if last else numbers).fit(order)
         if found is None:

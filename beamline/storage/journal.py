@@ -60,19 +60,18 @@ class Changes:
         if not self.ranges:
             return
         journal = journal_of(self.path)
+        room, free = self.room, shutil.disk_usage(self.path.parent).free
+        if free < room:
+            raise DataError(
+                f"{self.path} needs {size(room)} on its disk to be changed, {size(free)} are free. Nothing was changed."
+            )
         try:
-            room, free = self.room, shutil.disk_usage(self.path.parent).free
-            if free < room:
-                raise DataError(
-                    f"{self.path} needs {size(room)} on its disk to be changed, {size(free)} are free. Nothing was "
-                    "changed."
-                )
             with whole_file(journal, replace=True) as partial, partial.open("xb") as file:
                 file.write(_journal(self))
                 file.flush()
                 to_disk(file.fileno())
             _folder_to_disk(journal.parent)
-        except OSError as error:
+        except (OSError, DataError) as error:
             with suppress(OSError):
                 journal.unlink(missing_ok=True)
             raise DataError(f"{journal} cannot be written ({_why(error)}). {self.path} is as it was.") from error
@@ -197,5 +196,6 @@ def _folder_to_disk(folder: Path) -> None:
             os.close(handle)
 
 
-def _why(error: Exception) -> str:
-    return (isinstance(error, OSError) and error.strerror) or str(error)
+def _why(error: BaseException) -> str:
+    cause = error.__cause__ if isinstance(error, DataError) and error.__cause__ is not None else error
+    return (isinstance(cause, OSError) and cause.strerror) or str(cause)

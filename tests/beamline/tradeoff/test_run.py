@@ -164,7 +164,7 @@ def _full(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")  # as a write tells it: without a name
 
 
-@pytest.mark.parametrize(("where", "name"), [((np, "savez"), "data.npz"), ((Path, "write_text"), "tradeoff.json")])
+@pytest.mark.parametrize(("where", "name"), [((np, "savez"), "data.npz"), ((Path, "write_bytes"), "tradeoff.json")])
 def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: object, where: tuple[object, str], name: str
 ) -> None:
@@ -182,7 +182,7 @@ def test_a_disk_that_is_full_later_keeps_the_trials_written(
 ) -> None:
     def filling(trial: Trial, *_: object, keep: Path | None = None) -> Outcome:
         if trial.views != 27:
-            monkeypatch.setattr(Path, "write_text", _full)
+            monkeypatch.setattr(Path, "write_bytes", _full)
         return _made_up(trial)
 
     made_up(filling)
