@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.cli.recon import report_beside
+from beamline.reconstruct.result import report_beside
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.storage.volumes.files import opened_volume
