@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,25 +33,35 @@ Connected = Callable[..., api.Instrument]
 
 
 @pytest.fixture
-def connected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Connected:
+def closed() -> list[FakeInstrument]:
+    """Fake instruments whose devices were closed."""
+    return []
+
+
+@pytest.fixture
+def connected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: list[FakeInstrument]) -> Connected:
     """`connect` that finds a fake instrument where the devices would be; runs come into `tmp_path`."""
 
     def connect(fake: FakeInstrument | None = None, **values: object) -> api.Instrument:
         fake = fake or FakeInstrument()
-        monkeypatch.setattr("beamline.instrument.connect.connect", lambda config, ask=None: fake.connected())
+        monkeypatch.setattr(
+            "beamline.instrument.connect.connect",
+            lambda config, ask=None: replace(fake.connected(), close=lambda: closed.append(fake)),
+        )
         return api.connect(SIMULATED, set={**SMALL, "storage.folder": str(tmp_path), **values}, tell=None)
 
     return connect
 
 
-def test_scans_in_a_row_carry_their_own_sample_energy_time_and_views(connected: Connected) -> None:
-    fake = FakeInstrument()
-    with connected(fake) as instrument:
+def test_scans_in_a_row_carry_their_own_sample_energy_time_and_views(
+    connected: Connected, closed: list[FakeInstrument]
+) -> None:
+    with connected() as instrument:
         first = instrument.scan(sample="cathode-1", energy_kev=24.9)
         again = instrument.scan(sample="cathode-2", energy_kev=25.1, set={"scan.angles.views": 6})
         third = instrument.scan()
-        assert fake.is_open
-    assert not fake.is_open
+        assert not closed
+    assert len(closed) == 1
     with open_scan(first.path) as one, open_scan(again.path) as two, open_scan(third.path) as three:
         sources = (one, two, three)
         assert [source.attributes["sample"] for source in sources] == ["cathode-1", "cathode-2", "battery"]
@@ -64,14 +75,14 @@ def test_scans_in_a_row_carry_their_own_sample_energy_time_and_views(connected: 
     assert instrument.last == third
 
 
-def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected) -> None:
+def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected, closed: list[FakeInstrument]) -> None:
     fake = FakeInstrument(on_frame=lambda number: signal.raise_signal(signal.SIGINT) if number == 8 else None)
     before, taken = signal.getsignal(signal.SIGINT), []
     with pytest.raises(api.ScanStopped), connected(fake) as instrument:
         for sample in ("a", "b", "c"):
             taken.append(sample)
             instrument.scan(sample=sample)
-    assert taken == ["a"] and not fake.is_open
+    assert taken == ["a"] and closed == [fake]
     assert signal.getsignal(signal.SIGINT) is before
     assert instrument.last is not None and instrument.last.status == "stopped"
     with open_scan(instrument.last.path) as source:
