@@ -9,6 +9,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import h5py
@@ -74,15 +75,18 @@ def test_frames_come_to_another_program_while_the_scan_runs(tmp_path: Path) -> N
             command = [sys.executable, "-c", code, str(event.data["folder"])]
             readers.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
 
+    def indices() -> Iterator[int]:
+        assert readers[0].stdout is not None
+        return map(int, readers[0].stdout)
+
     def wait(number: int) -> None:
         if number == 8:
-            stdout = readers[0].stdout
-            assert stdout is not None
-            came.extend(int(stdout.readline()) for _ in range(5))
+            came.extend(islice(indices(), 5))
 
     ran = Ran(tmp_path / "runs", FakeInstrument(on_frame=wait), heard=begin)
     assert ran.error is None
-    came.extend(map(int, readers[0].communicate(timeout=60)[0].split()))
+    with readers[0]:
+        came.extend(indices())
     assert came == list(range(19)) and readers[0].returncode == 0
 
 
