@@ -213,12 +213,15 @@ def connect(
     return Instrument(read, devices.connect(read, ask=ask), tell)
 
 
-def scan(config: str | Path, *, set: Mapping[str, object] | None = None, **of_scan: Any) -> ScanResult:
+def scan(
+    config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
+    tell: Tell | None = to_stderr, **of_scan: Any,
+) -> ScanResult:  # fmt: skip
     """Connect, run one scan, and close the devices. Arguments and errors are those of `connect` and `Instrument.scan`.
 
     `set` is for both: it may change what devices are opened with.
     """
-    with connect(config, set=set) as instrument:
+    with connect(config, set=set, ask=ask, tell=tell) as instrument:
         return instrument.scan(**of_scan)
 
 

@@ -21,7 +21,7 @@ Example = Callable[..., str]
 def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Example:
     """Run a script as `python SCRIPT my.yaml ...` does; what it printed."""
 
-    def run(name: str, *words: str, scene: dict[str, object] | None = None) -> str:
+    def run(name: str, *words: str) -> str:
         settings = yaml.safe_load((config_folder() / "simulated.yaml").read_text())
         settings["scan"] |= {
             "angles": {"scheme": "fixed", "views": 45, "start_deg": 0, "span_deg": 180},
@@ -32,8 +32,6 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
         settings["devices"]["camera"]["roi"] = [1148, 2000, 8, 96]
         settings["recon"]["live"] = False
         settings["simulation"]["clock"] = "virtual"
-        if scene is not None:
-            settings["simulation"]["scene"] = scene
         (tmp_path / "my.yaml").write_text(yaml.safe_dump(settings))
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [name, "my.yaml", *words])
@@ -51,12 +49,14 @@ def test_there_is_a_test_of_each_example() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_day_of_samples(example: Example, tmp_path: Path) -> None:
     lines = example("day_of_samples.py", "cathode-1", "cathode-2").splitlines()
     assert [line.split()[:3] for line in lines] == [["cathode-1", "complete", "51"], ["cathode-2", "complete", "51"]]
     assert len(list((tmp_path / "runs").iterdir())) == 2
 
 
+@pytest.mark.slow
 def test_an_energy_series(example: Example, tmp_path: Path) -> None:
     lines = example("energy_series.py", "24.9", "25.1").splitlines()
     assert [line.split()[0] for line in lines] == ["24.9", "25.1"]

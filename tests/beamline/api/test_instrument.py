@@ -192,6 +192,13 @@ def test_the_simulated_instrument_on_a_virtual_clock(tmp_path: Path) -> None:
     assert second[0].time > first[-1].time
 
 
+def test_one_scan_connects_and_closes(connected: Connected, closed: list[FakeInstrument], tmp_path: Path) -> None:
+    connected()  # the fake instrument stands in from now on
+    values = {**SMALL, "devices.stage.max_speed_deg_s": 20}
+    result = api.scan(SIMULATED, set=values, sample="one", output=tmp_path / "elsewhere", tell=None)
+    assert result.sample == "one" and result.folder.parent.name == "elsewhere" and len(closed) == 1
+
+
 def test_a_device_that_does_not_answer_is_the_projects_own_error(tmp_path: Path) -> None:
     port = str(tmp_path / "no-port")
     text = (config_folder() / "instrument.yaml").read_text()
