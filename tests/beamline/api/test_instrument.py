@@ -14,6 +14,7 @@ import pytest
 
 from beamline import api
 from beamline.config.load import config_folder
+from beamline.scan.live_process import Commands
 from beamline.storage.readers.open import open_scan
 from drivers.errors import DeviceError
 from tests.beamline.fakes import FakeInstrument, Faults
@@ -190,6 +191,18 @@ def test_the_simulated_instrument_on_a_virtual_clock(tmp_path: Path) -> None:
     assert [result.frames for result in results] == [50, 50]
     first, second = (list(api.stream(result.path)) for result in results)
     assert second[0].time > first[-1].time
+
+
+def test_the_live_volume_is_asked_for_as_configured_and_named(
+    connected: Connected, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = """import json; print(json.dumps({"event": "state", "state": "ready", "message": ""}))
+print(json.dumps({"event": "done", "output": "recon.h5"}))"""
+    live = Commands(live=lambda scan, output: [sys.executable, "-c", done], remark="A remark.")
+    monkeypatch.setattr("beamline.api.instrument.commands_of", lambda config: live)
+    with connected() as instrument:
+        assert instrument.scan().volume == Path("recon.h5")
+        assert instrument.scan(live=False).volume is None
 
 
 def test_one_scan_connects_and_closes(connected: Connected, closed: list[FakeInstrument], tmp_path: Path) -> None:
