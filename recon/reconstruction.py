@@ -16,6 +16,7 @@ from torch import Tensor
 
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
+from recon.base.picture import html, middle_slices
 from recon.base.units import look_like_counts, warn_of_degrees
 from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name, with_trait
@@ -48,6 +49,14 @@ class Reconstruction:
     def __repr__(self) -> str:
         model = "" if self.gaussians is None else f", {self.gaussians.n} Gaussians"
         return f"Reconstruction({self.method}: {self.volume!r}, {self.seconds:.3g} s{model})"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the volume's middle slices, and how they came about."""
+        pixels, (low, high) = middle_slices(self.volume.data)
+        facts = {"result": repr(self)[15:-1], "grey": f"black {low:.4g}, white {high:.4g}"}
+        if self.history and np.isfinite(self.history[-1].residual):
+            facts["residual"] = f"{self.history[-1].residual:.4g} after {self.history[-1].step} steps"
+        return html(f"Reconstruction by {self.method}", pixels, facts)
 
     def save(self, path: str | Path) -> None:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.

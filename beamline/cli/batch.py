@@ -7,11 +7,12 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Event, fan_out
+from beamline.core.signals import terminated_like_interrupted
 from beamline.reconstruct.batch import TABLE, BatchOptions, run_batch
 from drivers.clock import SystemClock
 

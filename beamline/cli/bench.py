@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.events import Event
 from beamline.core.machine import machine, machine_line
+from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
 from drivers import orca_quest
 from drivers.clock import SystemClock

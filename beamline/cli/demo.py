@@ -13,11 +13,11 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
-from beamline.cli.scan import stop_signals
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.narration import sentence
+from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from drivers.clock import SystemClock
 

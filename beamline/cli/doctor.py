@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import set_option
 from beamline.core.events import Event
+from beamline.core.signals import terminated_like_interrupted
 from beamline.doctor.check import Verdict
 from drivers.clock import SystemClock
 

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
 from beamline.cli.recon import parsed, refuse_shared, volume_path
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.files import refuse_existing
+from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
 from drivers.clock import SystemClock
 

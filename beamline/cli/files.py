@@ -9,13 +9,14 @@ from typing import Any
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import DataError
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing
+from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import count, printable, size, spans
 from beamline.storage.codecs import CODECS
 from drivers.clock import SystemClock

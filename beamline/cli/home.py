@@ -8,9 +8,9 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.json_output import terminated_like_interrupted
 from beamline.cli.options import POSITIVE, config_argument, set_option
 from beamline.core.errors import INTERRUPTED
+from beamline.core.signals import terminated_like_interrupted
 from drivers.errors import DeviceError
 
 

@@ -50,6 +50,7 @@ _COMMANDS = {
     "home": _Entry("home", "Search the stage's reference position. The stage turns."),
     "tune": _Entry("tune", "Take a few frames and say which exposure to take."),
     "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
+    "runs": _Entry("runs", "List the runs in a folder: sample, frames, state, size, flags.", files=False),
     "watch": _Entry("watch", "Show a run in the browser while it goes on, and afterwards."),
     "pause": _Entry("control", "Pause a running scan, from another terminal: no view is lost."),
     "resume": _Entry("control", "Let a paused scan go on."),

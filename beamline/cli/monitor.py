@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import StopOnSignal, json_events
+from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing, write_whole
+from beamline.core.signals import StopOnSignal
 from beamline.core.text import spans
 from drivers.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.monitor.check import Flag, Level
-    from beamline.projections.replay import Kind
+    from beamline.monitor.check import Level
+    from beamline.projections.replay import Judged, Kind
 
 
 @click.command()
@@ -66,18 +67,13 @@ def monitor(
     from beamline.config.load import load
     from beamline.config.monitor import configured_checks
     from beamline.config.references import reference_limits
-    from beamline.monitor.aside import Aside
-    from beamline.monitor.check import Level
     from beamline.monitor.checks import CHECKS
     from beamline.projections.flagged_frames import worst_frames
     from beamline.projections.rendered import rendered
-    from beamline.projections.replay import by_kind, counts_of, replay
+    from beamline.projections.replay import replay, verdict
     from beamline.report.contact_sheet import contact_sheet
     from beamline.storage.flag_legend import FrameFlags, counted
-    from beamline.storage.readers.base import rows_replaced
     from beamline.storage.readers.open import SourceOptions
-    from beamline.storage.rules.references import reference_groups
-    from beamline.storage.rules.validate import altered_said
 
     if overrides and config is None:
         raise click.UsageError("--set changes a value of the configuration: give --config too.")
@@ -91,46 +87,39 @@ def monitor(
             checks, limits = configured_checks(read.monitor), reference_limits(read.references)
         sink = fan_out(*(json_sinks or [terminal]))
         progress = counting("monitor", sink, clock)
-        found: list[tuple[Flag, ...]] = []
+        found: list[Judged] = []
         active: set[tuple[str, Level]] = set()
-        n, aside = 0, Aside()
         with SourceOptions(file, **said).open(follow=follow) as source, StopOnSignal("Stopping.")() as stopped:
             model = None if volume is None else rendered(volume, source)
             for judged in replay(source, checks, model=model, follow=clock if follow else None, should_stop=stopped):
-                n, aside = n + 1, judged.aside
-                found.append(judged.flags)
+                found.append(judged)
                 if not follow:
-                    progress(n, judged.n)
+                    progress(len(found), judged.n)
                 now = {(flag.check, flag.level) for flag in judged.flags}
                 for flag in judged.flags:
                     if (flag.check, flag.level) not in active:
                         sink(Event("flag", clock.now(), asdict(flag)))
                 active = now
-            references = []
-            if source.quantity == "counts":
-                references = [group.described() for group in reference_groups(source, limits).judged if group.faults]
-            again = set(rows_replaced(source).tolist())
-            altered = [altered_said(source)] if source.altered else []
-            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags(found))):
+            said_of = verdict(source, found, limits)
+            if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in found]))):
                 write_whole(sheet, contact_sheet(worst))
-        for fault in [*references, *altered]:
+        altered = [said_of.altered] if said_of.altered else []
+        for fault in [*said_of.references, *altered]:
             sink(Event("warning", clock.now(), {"message": fault}))
-        flags = [flag for each in found for flag in each]
-        kinds = by_kind(flags)
-        alarmed = {frame for flag in flags if flag.level is Level.ALARM for frame in flag.frames} - again
+        n, alarmed, again, references = said_of.n_frames, said_of.alarmed, said_of.retaken, said_of.references
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
-            "flags": counts_of(kinds), "references": references,
-            "aside": aside.said(),
-            "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in kinds],
+            "flags": said_of.flags, "references": references,
+            "aside": said_of.aside,
+            "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in said_of.kinds],
         }  # fmt: skip
         for json_sink in json_sinks:
             json_sink(Event("done", clock.now(), done))
     if not as_json:
-        end = f"{file}: {n} frames, flagged: {counted(counts_of(kinds))}"
-        end += f"; {len(again)} views were taken again: frames {spans(sorted(again))} do not count" if again else ""
-        left_out = [f"Not looked at: {'; '.join(aside.said())}."] if aside.said() else []
-        click.echo("\n".join([*table(kinds), *references, *altered, *left_out, end]))
+        end = f"{file}: {n} frames, flagged: {counted(said_of.flags)}"
+        end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""
+        left_out = [f"Not looked at: {'; '.join(said_of.aside)}."] if said_of.aside else []
+        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *left_out, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.method_options import (
     SETTINGS,
     method_options,
@@ -31,6 +31,7 @@ from beamline.cli.terminal import LogLines, Terminal, counting, results
 from beamline.core.errors import QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out, while_it_works
 from beamline.core.files import named_on_failure, refuse_existing, write_whole
+from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
 from drivers.clock import Clock, SystemClock
@@ -237,7 +238,7 @@ def recon(
     from beamline.reconstruct.finished import reconstruct_file
     from beamline.reconstruct.follow import follow as follow_scan
     from beamline.reconstruct.options import ReconOptions
-    from beamline.reconstruct.result import OutputPaths
+    from beamline.reconstruct.result import OutputPaths, report_beside
     from recon.voxels.enough_views import Goal
 
     settings = {name: values.pop(name) for name in SETTINGS}
@@ -354,11 +355,6 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
             f"The data residual of views {views} is {metrics[name]:.4g}, more than --max-residual {max_residual:g}. "
             "The volume and its report were written. Check them, the rotation axis and the flags of the scan."
         )
-
-
-def report_beside(output: Path) -> Path:
-    """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
-    return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
 
 
 def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import click
 
@@ -19,26 +16,16 @@ from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
 from beamline.core.errors import AlarmError, DataError
 from beamline.core.events import Event, Sink
-from beamline.core.machine import free_memory
+from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from beamline.core.text import count
 from drivers.clock import SystemClock
 from drivers.frame import FrameKind
-from recon.base.choices import AUTO
-from recon.methods import streams
 
 if TYPE_CHECKING:
     from beamline.config.load import Config
-    from beamline.scan.live_process import LiveCommand
     from beamline.scan.resume import ResumableRun
     from beamline.scan.run import RunResult
-
-_ENDING = (
-    "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
-    "SIGPWR",
-)  # fmt: skip
-"""What would end the process, on any system: a batch system's warning, a time limit, a failing mains."""
-_SAID_WITHIN = 0.2  # s
 
 
 @click.command()
@@ -84,6 +71,7 @@ def scan(
     """
     from beamline.config.load import load
     from beamline.instrument.operator import ask_operator
+    from beamline.scan.live_process import Commands, commands_of
     from beamline.scan.resume import NotJoined, open_for_resume
     from beamline.scan.run import run_scan
 
@@ -107,11 +95,13 @@ def scan(
         if dry:
             _dry_run(config, output, series, json_sinks)
             return
-        stop = StopRequest()
+        stop, how = StopRequest(), commands_of(config, series) if not no_live else Commands()
+        if how.remark:
+            click.echo(how.remark, err=True)
         with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
             sinks: list[Sink] = [terminal, *json_sinks, *([beside] if page else [])]
             result = run_scan(
-                config, series or output, sinks, stop, **_commands(config, no_live, series),
+                config, series or output, sinks, stop, live=how.live, afterwards=how.afterwards,
                 ask=lambda request: terminal.ask(request, ask_operator),
             )  # fmt: skip
     if not as_json:
@@ -171,70 +161,6 @@ def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, j
     refuse_violations(worked.timeline)
     for sink in json_sinks:
         sink(Event("done", SystemClock().now(), worked.data()))
-
-
-class _Commands(TypedDict, total=False):
-    live: LiveCommand
-    afterwards: LiveCommand
-
-
-def _commands(config: Config, no_live: bool, series: ResumableRun | None) -> _Commands:
-    """How the scan is reconstructed: while it runs, when it is complete, or not at all."""
-    from beamline.config.load import plan_of
-    from beamline.instrument.connect import describe
-    from beamline.scan.live_process import finished_command, follow_command, live_plan
-
-    if no_live or not config.recon.live:
-        return {}
-    if config.recon.method == AUTO or not streams(config.recon.method):
-        click.echo(f"{config.recon.method} needs the complete scan: the volume comes after it.", err=True)
-        return {"afterwards": finished_command(config)}
-    if series is not None and series.end_references is not None:
-        click.echo("Only darks and flats are taken: the volume is made of joined.h5 afterwards.", err=True)
-        return {"afterwards": finished_command(config)}
-    _, camera, _ = describe(config)
-    plan = live_plan(camera.shape, plan_of(config).angles.size, free_memory())
-    return {"live": follow_command(config, plan, series.parts if series else ())}
-
-
-@contextmanager
-def stop_signals(stop: StopRequest) -> Iterator[None]:
-    """Within the context the first Ctrl-C requests a stop, the second an abort.
-
-    SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
-    other signals that would end the process request a stop.
-    """
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if stop.stopping:
-            stop.abort("Ctrl-C was pressed again")
-            _say("Aborting.")
-        else:
-            stop.stop("Ctrl-C was pressed")
-            _say("Stopping cleanly. Press Ctrl-C again to abort.")
-
-    def terminate(number: int, frame: FrameType | None) -> None:
-        stop.stop(f"the process received {signal.Signals(number).name}")
-
-    there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
-    ending = [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
-    with ExitStack() as restore:
-        for number in (signal.SIGINT, *ending):
-            handler = interrupt if number == signal.SIGINT else terminate
-            restore.callback(signal.signal, number, signal.signal(number, handler))
-        yield
-
-
-def _say(text: str) -> None:
-    """Print in a thread of its own: where nobody reads the terminal, that would hold up the scan that is to stop."""
-
-    def write() -> None:
-        with suppress(OSError, ValueError):  # the terminal was closed
-            click.echo(text, err=True)
-
-    thread = threading.Thread(target=write, daemon=True)
-    thread.start()
-    thread.join(_SAID_WITHIN)
 
 
 def _results(result: RunResult) -> str:

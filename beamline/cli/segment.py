@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_option
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
+from beamline.core.signals import terminated_like_interrupted
 from drivers.clock import SystemClock
 from recon.base.choices import NECK
 

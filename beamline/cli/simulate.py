@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import StopOnSignal, json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
@@ -19,6 +19,7 @@ from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.shipped import shipped_scenes
+from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
 from drivers.clock import Clock, SystemClock
 

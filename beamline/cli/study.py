@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.method_options import row_options, row_settings
 from beamline.cli.options import SEED, json_option
 from beamline.cli.recipe import Repeatable, repeating
@@ -16,6 +16,7 @@ from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
+from beamline.core.signals import terminated_like_interrupted
 from beamline.study.studies import STUDIES
 from drivers.clock import SystemClock
 from recon.base.choices import Filter

@@ -8,13 +8,14 @@ from typing import Any
 
 import click
 
-from beamline.cli.json_output import json_events, terminated_like_interrupted
+from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, SEED, json_option
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
+from beamline.core.signals import terminated_like_interrupted
 from drivers.clock import SystemClock
 from recon.methods import names
 

@@ -11,10 +11,10 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
-from beamline.cli.scan import stop_signals
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
 from beamline.core.events import Announcer, Event, Sink
+from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 
 

@@ -14,9 +14,8 @@ from typing import Self
 
 import click
 
-from beamline.core.errors import ConfigError
 from beamline.core.events import Event
-from beamline.core.files import EVENTS
+from beamline.core.files import RUNS
 from beamline.core.process import ChildProcess
 
 LOOPBACK, PORT = "127.0.0.1", 8642
@@ -39,11 +38,11 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
-    from beamline.config.models import Storage
     from beamline.page.run_files import Reader, watched  # they load HDF5 and the server, which `scan -h` needs not
     from beamline.page.serve import open_port, start
+    from beamline.scan.runs import newest
 
-    reader = Reader(watched(path or _newest(Path(Storage.model_fields["folder"].default))))
+    reader = Reader(watched(path or newest(Path(RUNS))))
     try:
         server = start(reader, open_port(bind, port), control=control, log=_log)
         click.echo(f"{LOOK:<8}{server.addresses.look}")
@@ -102,13 +101,3 @@ def _end_with_stdin() -> None:
 
 def _log(line: str) -> None:
     click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
-
-
-def _newest(runs: Path) -> Path:
-    """The running scan of a folder, else its newest run."""
-    from beamline.scan.control import running
-
-    found = running(runs) or sorted(run for run in runs.glob("*/") if (run / EVENTS).is_file())
-    if not found:
-        raise ConfigError(f"There is no run in {runs}. Name the folder of a run, or a scan file.")
-    return found[-1]

@@ -14,11 +14,11 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, SEED, FiniteRange
-from beamline.cli.scan import stop_signals
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
+from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from drivers.clock import SystemClock
 

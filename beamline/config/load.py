@@ -24,7 +24,7 @@ from beamline.config.models import (
     RandomAngles,
     SectorAngles,
 )
-from beamline.config.tree import override, read
+from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
 from beamline.core.shipped import config_folder
@@ -32,7 +32,17 @@ from beamline.core.version import version
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, ScanPlan
 
-__all__ = ["Config", "config_folder", "load", "plan_of", "resolved_yaml", "scene_mapping", "schema"]
+__all__ = [
+    "Config",
+    "changed",
+    "config_folder",
+    "load",
+    "override_of",
+    "plan_of",
+    "resolved_yaml",
+    "scene_mapping",
+    "schema",
+]
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:
@@ -59,17 +69,49 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment)
+    return _validated(tree, str(path))
+
+
+def changed(config: Config, overrides: Iterable[str]) -> Config:
+    """The configuration with other values; neither its file nor the environment is looked at again.
+
+    Raises:
+        ConfigError: as `load`.
+    """
+    name = "the configuration"
+    return _validated(override(read(resolved_yaml(config), name), overrides, {}), name)
+
+
+def override_of(key: str, value: object) -> str:
+    """The override that sets a key to a plain value, a NumPy scalar or a path.
+
+    Raises:
+        ConfigError: another kind of value.
+    """
+    plain = value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
+    plain = list(plain) if isinstance(plain, tuple) else plain
+    try:
+        text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf, allow_unicode=True)
+    except yaml.YAMLError:
+        raise ConfigError(
+            f"{key}: {value!r} is no value of a configuration; expected a number, a text, a list or a group. Nothing "
+            "was started."
+        ) from None
+    return f"{key}={text.removesuffix('...' + chr(10)).strip()}"
+
+
+def _validated(tree: Tree, name: str) -> Config:
     _locate(tree.data, Path())
     try:
         config = Config.model_validate(tree.data)
     except ValidationError as error:
-        _refuse(path, explain(error, tree, schema()))
+        _refuse(name, explain(error, tree, schema()))
         raise
-    _refuse(path, [f"{tree.origin(at)}: {what}" for at, what in faults(config, config_folder())])
+    _refuse(name, [f"{tree.origin(at)}: {what}" for at, what in faults(config, config_folder())])
     return config
 
 
-def _refuse(path: Path, found: Sequence[str]) -> None:
+def _refuse(path: str, found: Sequence[str]) -> None:
     if len(found) == 1:
         raise ConfigError(f"{found[0]}. Nothing was started.") from None
     if found:

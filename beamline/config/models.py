@@ -10,6 +10,7 @@ from beamline.config.devices import DeviceSection
 from beamline.config.monitor import MonitorSection
 from beamline.config.references import ReferencesSection
 from beamline.config.section import Section
+from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
 from recon.base.choices import AUTO
 from recon.methods import DEFAULT, names, streams
@@ -126,7 +127,7 @@ class Optics(Section):
 
 
 class Storage(Section):
-    folder: Annotated[str, Field(min_length=1)] = "runs"
+    folder: Annotated[str, Field(min_length=1)] = RUNS
     preview_bin: PositiveInt = 4
     flush_every: PositiveInt = 16
     """Frames that are flushed together, at most, while others wait to be written; else each is flushed at once."""

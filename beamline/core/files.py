@@ -19,6 +19,8 @@ PART = "part-{}"
 """The folder of a later part of a scan that was resumed, in that of the run."""
 OURS = 0o755
 """Mode of a run's folder: nobody else may put one file in the place of another there, whatever the umask."""
+RUNS = "runs"
+"""The folder for the folders of runs, where a configuration names no other."""
 EVENTS = "events.jsonl"
 """What happened in a run, or in a later part of it, in its folder."""
 

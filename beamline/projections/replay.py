@@ -14,10 +14,12 @@ from beamline.monitor.aside import Aside
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
 from beamline.monitor.digest import digest
-from beamline.monitor.references import full_scale
+from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.rules.references import reference_groups
+from beamline.storage.rules.validate import altered_said
 from drivers.clock import Clock
 from drivers.frame import Frame, FrameKind
 
@@ -63,6 +65,39 @@ class Kind:
     worst: Flag
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """What the monitor says of a scan as a whole.
+
+    Attributes:
+        n_frames: that were looked at.
+        kinds: its flags by check and level, the worst level first.
+        alarmed: numbers of the frames with an alarm, without those that were taken again.
+        retaken: numbers of the views that were taken again.
+        references: what is wrong with darks and flats, a text for each group.
+        altered: what of the file is not as it was written; "" where all is.
+        aside: which checks could not look at which views.
+    """
+
+    n_frames: int
+    kinds: tuple[Kind, ...]
+    alarmed: tuple[int, ...]
+    retaken: tuple[int, ...]
+    references: tuple[str, ...]
+    altered: str
+    aside: tuple[str, ...]
+
+    @property
+    def flags(self) -> Mapping[str, Mapping[str, int]]:
+        """Number of frames by check, then by level."""
+        return counts_of(self.kinds)
+
+    @property
+    def clean(self) -> bool:
+        """No frame has an alarm, and darks and flats are without a fault."""
+        return not self.alarmed and not self.references
+
+
 def replay(
     source: ScanSource,
     checks: Sequence[Check] = CHECKS,
@@ -84,8 +119,22 @@ def replay(
     Raises:
         DataError: a followed file that is not finished and grows no more.
     """
-    monitor, done, waited = start(replace(context_of(source), model=model), checks), 0, 0.0
-    aside = Aside()
+    monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
+    for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
+        seen = digest(frame.counts, monitor.context.saturation, PREVIEW_BIN)
+        monitor, flags = look(monitor, frame, seen)
+        aside = aside.with_frame(monitor.context)
+        yield Judged(frame.index, frame.kind, flags, n, aside)
+
+
+def frames_of(
+    source: ScanSource, *, follow: Clock | None = None, should_stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[Frame, int]]:
+    """Every frame, in the order of the file, and how many the file has so far; arguments and errors as of `replay`.
+
+    A view that was taken again later has the kind that it had when it came.
+    """
+    done, waited = 0, 0.0
     while True:
         ended = follow is None or source.finished  # asked before the frames, so that none can slip in between
         n = source.refresh()
@@ -95,10 +144,7 @@ def replay(
                 return
             if frame.index in again:  # what the monitor saw before it was taken again
                 frame = replace(frame, kind=FrameKind.PROJECTION)
-            seen = digest(frame.counts, monitor.context.saturation, PREVIEW_BIN)
-            monitor, flags = look(monitor, frame, seen)
-            aside = aside.with_frame(monitor.context)
-            yield Judged(frame.index, frame.kind, flags, n, aside)
+            yield frame, n
         if ended:
             return
         assert follow is not None
@@ -110,6 +156,26 @@ def replay(
                 "were looked at."
             )
         follow.sleep(POLL)
+
+
+def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimits | None = None) -> Verdict:
+    """What the checks said of the frames, together with what is wrong with darks, flats and the file.
+
+    Args:
+        limits: of darks and flats; None: those of a new scan.
+    """
+    flags = [flag for each in judged for flag in each.flags]
+    again = frozenset(rows_replaced(source).tolist())
+    groups = reference_groups(source, limits).judged if source.quantity == "counts" else ()
+    return Verdict(
+        n_frames=len(judged),
+        kinds=by_kind(flags),
+        alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
+        retaken=tuple(sorted(again)),
+        references=tuple(group.described() for group in groups if group.faults),
+        altered=altered_said(source) if source.altered else "",
+        aside=tuple(judged[-1].aside.said()) if judged else (),
+    )
 
 
 def judged_flags(source: ScanSource) -> FrameFlags:

@@ -83,7 +83,7 @@ def reconstruct_file(
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
-    options.target.require_room(*(options.disk_needs(volume) if slabs else (volume, 0)))
+    options.target.require_room(*(options.disk_needs(volume) if slabs else (volume * options.target.written, 0)))
     if wanted is not None:  # before the work, not after it
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)

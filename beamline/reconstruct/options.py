@@ -74,12 +74,14 @@ class ReconOptions:
     @property
     def becomes_output(self) -> bool:
         """Whether a volume that is made in slabs becomes the output where it lies."""
-        return self.region is None and can_become(self.target.output)
+        return self.region is None and self.target.written and can_become(self.target.output)
 
     def disk_needs(self, volume: int) -> tuple[int, int]:
         """Bytes on the disk for the result of a volume of so many, in slabs, and for what lies there meanwhile."""
         compared = self.target.report is not None and not self.method.traits.direct
         slabs = self.partial is None  # else they are there
+        if not self.target.written:
+            return 0, (slabs + compared) * volume
         if self.becomes_output:
             return slabs * volume, compared * volume
         return volume, (slabs + compared) * volume

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,15 +36,23 @@ from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
 
+def report_beside(output: Path) -> Path:
+    """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
+    return output.with_name("report.html") if output.stem == "recon" else output.with_suffix(".html")
+
+
 @dataclass(frozen=True)
 class OutputPaths:
     """Where results go. `report` and `pdf` (a logbook page) are None where none is wanted; `replace` takes the place of
-    older results."""
+    older results. `take` gets the result before the file `output` is written. Where that is not to be `written`, its
+    folder is only worked in."""
 
     output: Path
     report: Path | None
     replace: bool = False
     pdf: Path | None = None
+    take: Callable[[ReconRecord], None] = lambda record: None
+    written: bool = True
 
     @property
     def partial(self) -> Path:
@@ -178,10 +186,11 @@ def write_result(
             write_logbook(target.pdf, page, record.volume, prepared.length_unit, clock.now(), replace=target.replace)
             pages.append(target.pdf)
         phases.enter("writing the volume")
-        if partial_volume is None:
-            write_volume(target.output, record, replace=target.replace)
-        else:
+        target.take(record)
+        if partial_volume is not None:
             complete(partial_volume, record, target.output, replace=target.replace)
+        elif target.written:
+            write_volume(target.output, record, replace=target.replace)
     except BaseException:
         for written in pages:
             remove(written)

@@ -9,12 +9,19 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from beamline.config.load import Config
+from beamline.config.load import Config, plan_of
 from beamline.core.events import Emit
+from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, Ending, json_object
 from beamline.core.text import count, size
+from beamline.instrument.connect import describe
+from recon.base.choices import AUTO
+from recon.methods import streams
+
+if TYPE_CHECKING:
+    from beamline.scan.resume import ResumableRun
 
 LiveCommand = Callable[[Path, Path], Sequence[str]]
 """(scan file, output file) -> the command line."""
@@ -122,6 +129,35 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
 def finished_command(config: Config) -> LiveCommand:
     """The command `beamline recon SCAN` for the complete scan, by a method that needs all of it."""
     return lambda scan, output: _words(scan, [], {**_common(config), "-o": output})
+
+
+@dataclass(frozen=True)
+class Commands:
+    """How a scan is reconstructed: while it runs, when it is complete, or (neither) not at all.
+
+    Attributes:
+        remark: for the operator; "" where there is nothing to say.
+    """
+
+    live: LiveCommand | None = None
+    afterwards: LiveCommand | None = None
+    remark: str = ""
+
+
+def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
+    """How the configuration wants its scan, or the run that goes on, to be reconstructed."""
+    method = config.recon.method
+    if not config.recon.live:
+        return Commands()
+    if method == AUTO or not streams(method):
+        remark = f"{method} needs the complete scan: the volume comes after it."
+        return Commands(afterwards=finished_command(config), remark=remark)
+    if series is not None and series.end_references is not None:
+        remark = "Only darks and flats are taken: the volume is made of joined.h5 afterwards."
+        return Commands(afterwards=finished_command(config), remark=remark)
+    _, camera, _ = describe(config)
+    plan = live_plan(camera.shape, plan_of(config).angles.size, free_memory())
+    return Commands(live=follow_command(config, plan, series.parts if series else ()))
 
 
 def _common(config: Config) -> dict[str, object]:

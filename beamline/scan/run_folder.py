@@ -14,11 +14,13 @@ from beamline.core.files import OURS
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
+STAMP = "%Y-%m-%dT%H-%M-%S"
+"""The UTC time at the head of a run folder's name, before "_"."""
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:
     """A new folder `<UTC time>_<sample>` in `runs`; where that exists, a number is appended."""
-    stem = f"{time.strftime('%Y-%m-%dT%H-%M-%S', time.gmtime(seconds))}_{sample}"
+    stem = f"{time.strftime(STAMP, time.gmtime(seconds))}_{sample}"
     runs.mkdir(parents=True, exist_ok=True)
     for number in count(1):
         folder = runs / (stem if number == 1 else f"{stem}-{number}")

@@ -27,6 +27,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon.base.picture import fan, html
+
 F64 = NDArray[np.float64]
 
 _OFF_MIDDLE = 0.05  # of the detector's width: with the axis farther off, a tenth of the field is on one side
@@ -118,6 +120,11 @@ class Geometry:
             f"{self.detector_shape[0]} x {self.detector_shape[1]}, pitch {self.pixel_pitch:.4g}, axis_col "
             f"{self.axis_col:.6g}{''.join(f', with {name}' for name in moved)})"
         )
+
+    def _repr_html_(self) -> str:
+        """For a notebook: directions of the views, and where the axis falls on the detector."""
+        centre = (self.axis_col + 0.5) / self.detector_shape[1]
+        return html("Geometry", fan(self.angles, centre), {"views": repr(self)[9:-1]})
 
     @property
     def n_views(self) -> int:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
+from recon.base.picture import html, middle_slices
 
 # Box of a fit over the field, across, where the sample is wider. Two regions of interest: +2.0 and +3.8 dB; 1.4 gains
 # as much there, and loses 0.5 to 1.5 dB where the matter ends with the box (1.2: 0 and 0.8).
@@ -160,3 +161,10 @@ class Volume:
     def __repr__(self) -> str:
         size, edge = " x ".join(map(str, self.grid.shape)), self.grid.voxel_size
         return f"Volume({size} voxels [z, y, x] of {edge:.4g})"
+
+    def _repr_html_(self) -> str:
+        """For a notebook: the middle slices across z, y and x."""
+        pixels, (low, high) = middle_slices(self.data)
+        z, y, x = (n // 2 for n in self.grid.shape)
+        shown = f"z = {z}, y = {y}, x = {x}; black {low:.4g}, white {high:.4g}"
+        return html("Volume", pixels, {"voxels": repr(self)[7:-1], "slices": shown})

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.cli.recon import report_beside
 from beamline.core.errors import DataError
 from beamline.monitor.check import Level
+from beamline.reconstruct.result import report_beside
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.metrics import psnr

@@ -1,0 +1,65 @@
+"""Python for operators: connect to the instrument, scan, watch, judge and reconstruct, from a script or a notebook.
+
+`docs/python.md` begins with three scripts. Everything here calls what the commands call: files, checks, messages and
+errors are the same. Importing this package loads neither torch nor a driver; what a function needs is loaded when it is
+called first.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from beamline.core.errors import BeamlineError, ConfigError, DataError, ReferencesError, ScanStopped
+from beamline.core.events import Event
+from beamline.core.stop import ScanAborted, StopRequest
+from drivers.errors import DeviceError
+
+if TYPE_CHECKING:
+    from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr
+    from beamline.api.reading import monitor, stream, volumes
+    from beamline.api.reconstruction import ReconResult, reconstruct
+    from beamline.projections.replay import Verdict
+    from beamline.projections.selection import Selection
+
+__all__ = [
+    "BeamlineError",
+    "ConfigError",
+    "DataError",
+    "DeviceError",
+    "Event",
+    "Instrument",
+    "ReconResult",
+    "ReferencesError",
+    "ScanAborted",
+    "ScanResult",
+    "ScanStopped",
+    "Selection",
+    "StopRequest",
+    "Verdict",
+    "connect",
+    "monitor",
+    "reconstruct",
+    "scan",
+    "stream",
+    "to_stderr",
+    "volumes",
+]
+
+_LAZY = {
+    **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan", "to_stderr"), "beamline.api.instrument"),
+    **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reading"),
+    **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
+    "Verdict": "beamline.projections.replay",
+    "Selection": "beamline.projections.selection",
+}
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'beamline.api' has no attribute {name!r}")

@@ -1,0 +1,255 @@
+"""The instrument of a script: devices that stay open over many scans, and what a scan gave."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from beamline.config.load import Config, changed, load, override_of
+from beamline.core.errors import ConfigError, ScanStopped
+from beamline.core.events import Event
+from beamline.core.narration import sentence
+from beamline.core.signals import stop_signals
+from beamline.core.stop import StopRequest
+from beamline.core.text import printable
+from beamline.instrument import connect as devices
+from beamline.scan.live_process import Commands, commands_of
+from beamline.scan.run import run_scan
+from drivers.manual import Ask
+
+Tell = Callable[[str], None]
+
+_OF_A_SCAN = ("roi", "binning", "readout")  # of the camera, which each scan sets anew
+
+
+def to_stderr(text: str) -> None:
+    """Print a sentence as the commands do."""
+    with suppress(OSError, ValueError, AttributeError):  # the terminal was closed, or there is none
+        sys.stderr.write(f"{printable(text)}\n")
+        sys.stderr.flush()
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """What a scan gave.
+
+    Attributes:
+        path: the scan file; its folder holds everything else of the run.
+        sample: its name.
+        frames: in the file.
+        missing: planned rows without a frame.
+        flags: frames that the monitor flagged: their number by check, then by level.
+        alarms: frames with an alarm, without those that were taken again.
+        retaken: views that were taken again, because they had an alarm or gave no frame.
+        reference_faults: what is wrong with darks and flats, a text for each group.
+        status: `complete`, `stopped` or `failed`.
+        seconds: real time of the scan.
+        bytes: of the file.
+        volume: file of the reconstruction; None without one, or where it failed.
+    """
+
+    path: Path
+    sample: str
+    frames: int
+    missing: tuple[int, ...]
+    flags: Mapping[str, Mapping[str, int]]
+    alarms: int
+    retaken: int
+    reference_faults: tuple[str, ...]
+    status: str
+    seconds: float
+    bytes: int
+    volume: Path | None
+
+    @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.path.parent
+
+    @property
+    def clean(self) -> bool:
+        """Complete, and the monitor has nothing against frames, darks and flats."""
+        return self.status == "complete" and not (self.missing or self.alarms or self.reference_faults)
+
+
+class Instrument:
+    """Connected devices. Leaving a `with` block closes them; `connect` makes one.
+
+    Attributes:
+        config: what the devices were opened with.
+        last: result of the newest scan, also of one that raised; None before the first, and where it took no frame.
+    """
+
+    def __init__(self, config: Config, connected: devices.Instrument, tell: Tell | None = to_stderr) -> None:
+        self.config = config
+        self.last: ScanResult | None = None
+        self._devices, self._tell = connected, tell
+        self._open, self._one_at_a_time = True, threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free ports and camera; a second time does nothing."""
+        self._open = False
+        self._devices.close()
+
+    def scan(
+        self,
+        *,
+        sample: str | None = None,
+        energy_kev: float | None = None,
+        set: Mapping[str, object] | None = None,
+        output: str | Path | None = None,
+        live: bool = True,
+        stop: StopRequest | None = None,
+        on_event: Callable[[Event], None] | None = None,
+    ) -> ScanResult:
+        """Run a scan, as `beamline scan` does: a folder of its own, every frame checked, a file readable in any case.
+
+        The first Ctrl-C stops the scan cleanly, the second aborts it; either ends a loop over samples too. (Python
+        catches signals in the main thread alone: elsewhere `stop` does it.)
+
+        Args:
+            sample: name of the sample, in the file and in the folder's name; None: the configured one.
+            energy_kev: of the beam, as the file will say it. It moves no monochromator.
+            set: other values of the configuration for this scan alone, such as {"scan.angles.views": 90}.
+            output: folder for the folders of runs; None: `storage.folder`.
+            live: False: without a reconstruction, even where `recon.live` is on.
+            stop: ends the scan from another thread.
+            on_event: gets every event of the run, in a thread of its own.
+
+        Raises:
+            ConfigError: a wrong value, a broken limit, or one that needs devices opened anew; nothing has moved.
+            DeviceError: a device failed.
+            DataError: frames are missing, or the disk failed.
+            ReferencesError: darks or flats cannot be used.
+            ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended it; ScanAborted: at once.
+            What was acquired is in the file in all these cases: see `last`. A scan that ends because its views were
+            enough (`recon.stop_when`) raises nothing.
+        """
+        if not self._one_at_a_time.acquire(blocking=False):
+            raise ConfigError("a scan of this instrument still runs: wait for its end. Nothing was started.")
+        try:
+            config = self._config_of(sample, energy_kev, set or {})
+            return self._run(config, output, live, stop or StopRequest(), on_event)
+        finally:
+            self._one_at_a_time.release()
+
+    def _config_of(self, sample: str | None, energy_kev: float | None, set: Mapping[str, object]) -> Config:
+        if not self._open:
+            raise ConfigError("the instrument was closed: connect to it again. Nothing was started.")
+        named = {"sample.name": sample, "optics.energy_kev": energy_kev}
+        wanted = {**set, **{key: value for key, value in named.items() if value is not None}}
+        config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
+        if _of_devices(config) != _of_devices(self.config):
+            raise ConfigError(
+                f"of {', '.join(wanted)}, something belongs to devices that are open, and would have no effect: give "
+                "it to `connect`. A scan of its own can have other angles, times, optics, checks, and the camera's "
+                "roi, binning and readout. Nothing was started."
+            )
+        return config
+
+    def _run(
+        self, config: Config, output: str | Path | None, live: bool, stop: StopRequest,
+        on_event: Callable[[Event], None] | None,
+    ) -> ScanResult:  # fmt: skip
+        self.last, said = None, dict[str, Mapping[str, Any]]()
+
+        def remember(event: Event) -> None:
+            if event.event in ("scan_done", "recon_done"):
+                said[event.event] = event.data
+
+        def tell(event: Event) -> None:
+            if self._tell is not None and event.event != "done" and (text := sentence(event)):
+                self._tell(text)
+
+        how = commands_of(config) if live else Commands()
+        if how.remark and self._tell is not None:
+            self._tell(how.remark)
+        try:
+            with stop_signals(stop):
+                run_scan(
+                    config, None if output is None else Path(output),
+                    [remember, tell, *([on_event] if on_event else [])], stop,
+                    live=how.live, afterwards=how.afterwards, instrument=self._devices,
+                )  # fmt: skip
+        except ScanStopped:
+            if not stop.enough:
+                raise
+        finally:
+            self.last = _result(config, said)
+        assert self.last is not None
+        return self.last
+
+
+def connect(
+    config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
+    tell: Tell | None = to_stderr,
+) -> Instrument:  # fmt: skip
+    """Open every device of a configuration. Nothing moves.
+
+    Args:
+        config: its file.
+        set: values that replace those of the file, such as {"scan.angles.views": 90}.
+        ask: puts a request to the operator, where shutter or sample are moved by hand, and returns when it is done;
+            None: at the terminal.
+        tell: gets a sentence on what happens, as the commands print it (`print`, a logger's `info`); None: nobody does.
+
+    Raises:
+        ConfigError: every fault with file, line, key and legal values.
+        DeviceError: a device does not answer; those opened before it are closed again.
+    """
+    read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
+    return Instrument(read, devices.connect(read, ask=ask), tell)
+
+
+def scan(
+    config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
+    tell: Tell | None = to_stderr, **of_scan: Any,
+) -> ScanResult:  # fmt: skip
+    """Connect, run one scan, and close the devices. Arguments and errors are those of `connect` and `Instrument.scan`.
+
+    `set` is for both: it may change what devices are opened with.
+    """
+    with connect(config, set=set, ask=ask, tell=tell) as instrument:
+        return instrument.scan(**of_scan)
+
+
+def _of_devices(config: Config) -> Mapping[str, Any]:
+    """What of a configuration devices were opened with."""
+    used = config.model_dump(mode="json", include={"devices", "simulation"})
+    camera = {name: value for name, value in used["devices"]["camera"].items() if name not in _OF_A_SCAN}
+    pitch = None if config.simulation is None else config.optics.pixel_size_um
+    return {**used, "devices": {**used["devices"], "camera": camera}, "pitch": pitch}
+
+
+def _result(config: Config, said: Mapping[str, Mapping[str, Any]]) -> ScanResult | None:
+    """The result of a scan by its events; None where it ended before its file was made."""
+    done = said.get("scan_done")
+    if done is None:
+        return None
+    volume = said.get("recon_done", {}).get("output")
+    return ScanResult(
+        path=done["path"],
+        sample=config.sample.name,
+        frames=done["n_frames"],
+        missing=tuple(done["missing"]),
+        flags=done["flags"],
+        alarms=done["alarmed_frames"],
+        retaken=done["retaken"],
+        reference_faults=tuple(done["reference_faults"]),
+        status=done["status"],
+        seconds=done["seconds"],
+        bytes=done["bytes"],
+        volume=None if volume is None else Path(volume),
+    )

@@ -1,0 +1,124 @@
+"""Looking at scans, finished or running: the monitor's verdict, the frames, the volume that grows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from beamline.config.load import load, override_of
+from beamline.config.monitor import configured_checks
+from beamline.config.references import reference_limits
+from beamline.core.errors import DataError
+from beamline.core.files import parts_of
+from beamline.monitor.checks import CHECKS
+from beamline.page.run_files import watched
+from beamline.page.volume import newest
+from beamline.projections.replay import Verdict, frames_of, replay, verdict
+from beamline.scan.run_folder import SCAN
+from beamline.scan.runs import describe
+from beamline.scan.states import State
+from beamline.storage.parts import JOINED
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.open import NotReadyError, open_scan
+from beamline.storage.volumes.files import opened_volume
+from drivers.clock import SystemClock
+from drivers.frame import Frame
+from recon.base.volume import Volume
+
+_PATIENCE = 120.0  # real s until a scan that is followed has begun
+_POLL = 0.25  # real s
+
+
+def scan_file(path: str | Path) -> Path:
+    """The scan of a path: the file itself; of the folder of a run, the file with all its parts."""
+    path = Path(path)
+    if not (path / SCAN).is_file():
+        return path
+    return path / JOINED if (path / JOINED).is_file() else path / SCAN
+
+
+def monitor(
+    path: str | Path, *, config: str | Path | None = None, set: Mapping[str, object] | None = None, follow: bool = False
+) -> Verdict:
+    """What the checks of the monitor say of every frame of a scan of any format, as `beamline monitor` prints it.
+
+    Args:
+        path: a scan file, or the folder of a run.
+        config: file whose sections `monitor` and `references` give the limits; None: those of a new scan.
+        set: values that replace those of `config`.
+        follow: wait for the end of a scan that still runs.
+
+    Raises:
+        ConfigError: `config` is wrong. DataError: no scan, or one that died.
+    """
+    checks, limits = CHECKS, None
+    if config is not None:
+        read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
+        checks, limits = configured_checks(read.monitor), reference_limits(read.references)
+    with _opened(scan_file(path), follow) as source:
+        return verdict(source, list(replay(source, checks, follow=SystemClock() if follow else None)), limits)
+
+
+def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
+    """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until its end.
+
+    Frames are counts: `frame.counts` uint16 [row, col]. It only reads: who takes them slowly does not hold the scan up.
+    A running scan is followed from another program than the one that takes it (HDF5 shares a file within a program).
+
+    Args:
+        path: a scan file, or the folder of a run (its newest part). It may not be there yet.
+        follow: False: the frames that are there.
+
+    Raises:
+        DataError: no scan, none that begins within 120 s, or one that died.
+    """
+    path = Path(path)
+    place = parts_of(path)[-1] / SCAN if path.is_dir() and not (path / JOINED).is_file() else scan_file(path)
+    with _opened(place, follow) as source:
+        for frame, _ in frames_of(source, follow=SystemClock() if follow else None):
+            yield frame
+
+
+def volumes(run: str | Path) -> Iterator[Volume]:
+    """The live volume of a run each time that it is written anew, at last the finished one; ends with the run.
+
+    Args:
+        run: its folder. Of a run that is over, the volume that it has.
+
+    Raises:
+        DataError: no folder of a run.
+    """
+    folder, shown = Path(run), None
+    files = watched(folder).volumes
+    while True:
+        over = describe(folder).state in _OVER  # asked before the volume, so that none can slip in between
+        found = newest(files)
+        if found is not None and found != shown:
+            with suppress(DataError), opened_volume(found.path) as record:  # the next one just takes its place
+                volume = replace(record.volume, data=np.array(record.volume.data))
+                shown = found
+            if shown is found:
+                yield volume
+        if over:
+            return
+        time.sleep(_POLL)
+
+
+_OVER = frozenset({"died", *(state.value for state in State if state.ended)})
+
+
+def _opened(path: Path, follow: bool) -> ScanSource:
+    """The scan, as soon as there is one where it is followed."""
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            return open_scan(path, follow=follow)
+        except NotReadyError as error:
+            if time.monotonic() > deadline:
+                raise DataError(f"No scan began in {path} within {_PATIENCE:.0f} s.") from error
+            time.sleep(_POLL)

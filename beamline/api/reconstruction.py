@@ -1,0 +1,167 @@
+"""Reconstruction of a scan file: a volume and its figures, as values; with an output, the files of `beamline recon`."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamline.api.instrument import Tell, to_stderr
+from beamline.api.reading import scan_file
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event
+from beamline.core.narration import sentence
+from beamline.core.signals import StopOnSignal
+from beamline.projections.selection import Selection
+from beamline.reconstruct.finished import reconstruct_file
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.result import OutputPaths, report_beside
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.volumes.files import opened_volume
+from beamline.storage.writers.recon_file import ReconRecord
+from drivers.clock import SystemClock
+from recon.auto import Auto
+from recon.base.choices import AUTO
+from recon.base.method import Method
+from recon.base.volume import Volume
+from recon.methods import by_name
+
+
+@dataclass(frozen=True, eq=False)
+class ReconResult:
+    """A reconstruction of a scan file.
+
+    Attributes:
+        method: its name; of a choice, that of the method chosen.
+        figures: figures of merit by name (residual, snr, seconds, ...), see docs/tradeoff.md.
+        settings: everything that the volume depends on, by name.
+        axis_col: rotation axis in columns of the full detector.
+        units: of the volume, 1/mm, or 1/px where the pixel size is not known.
+        warnings: sentences.
+        ended_early: Ctrl-C ended it with the volume so far.
+        output, report: files; None where none were wanted.
+    """
+
+    method: str
+    figures: Mapping[str, float]
+    settings: Mapping[str, Any]
+    axis_col: float
+    units: str
+    warnings: tuple[str, ...]
+    ended_early: bool
+    output: Path | None
+    report: Path | None
+    _held: Volume | None = field(default=None, repr=False)
+
+    @cached_property
+    def volume(self) -> Volume:
+        """The attenuation, `volume.data` float32 [z, y, x]; read from `output`, where that was wanted, on first use."""
+        if self._held is not None:
+            return self._held
+        assert self.output is not None
+        with opened_volume(self.output) as record:
+            return replace(record.volume, data=np.array(record.volume.data))
+
+    def _repr_html_(self) -> str:
+        figures = ", ".join(f"{name} {value:.4g}" for name, value in self.figures.items())
+        return f"<p>{self.method}: {figures}</p>{self.volume._repr_html_()}"
+
+
+def reconstruct(
+    path: str | Path,
+    method: str | Method = AUTO,
+    *,
+    rows: slice | tuple[int, int] | None = None,
+    views: str | None = None,
+    binning: int | None = None,
+    selection: Selection | None = None,
+    output: str | Path | None = None,
+    tell: Tell | None = to_stderr,
+) -> ReconResult:
+    """Reconstruct a finished scan of any format, as `beamline recon` does.
+
+    The first Ctrl-C during a fit or iterations ends with the volume so far (`ended_early`), the second discards it.
+
+    Args:
+        path: a scan file, or the folder of a run.
+        method: "auto", a name (`recon.methods.names()`), or a method with settings, such as `recon.R2(seconds=30)`.
+        rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
+        views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
+        binning: pixels that are averaged, a side.
+        selection: everything else, such as Selection(axis_col=1023.5, rings="vo"); the arguments above go before it.
+        output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
+            A scan that does not fit into the memory needs one.
+        tell: gets a sentence on what happens; None: nobody does.
+
+    Raises:
+        ConfigError: a method or a selection that cannot be. DataError: no scan, data that give no volume, or an output
+            that exists or cannot be written. Nothing is written then.
+    """
+    place, chosen = scan_file(path), _method(method)
+    done: dict[str, Any] = {}
+    warned: list[str] = []
+    settings: dict[str, Any] = {}
+    held: list[Volume] = []
+
+    def sink(event: Event) -> None:
+        if event.event == "done":
+            done.update(event.data)
+        elif event.event == "warning":
+            warned.append(str(event.data["message"]))
+        if tell is not None and event.event not in ("done", "progress") and (text := sentence(event)):
+            tell(text)
+
+    def take(record: ReconRecord) -> None:
+        settings.update(record.parameters)
+        if output is None:
+            held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a file that goes
+
+    source = SourceOptions(place)
+    said: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
+    wanted = replace(selection or Selection(), **{name: value for name, value in said.items() if value is not None})
+    with ExitStack() as opened:
+        if output is None:
+            work = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="beamline-")))
+            target = OutputPaths(work / "volume.h5", None, written=False, take=take)
+        else:
+            target = OutputPaths(Path(output), report_beside(Path(output)), take=take)
+        command = f"beamline.api.reconstruct({str(place)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
+        options = ReconOptions(source, target, wanted, chosen, command=command)
+        figures = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
+    return ReconResult(
+        method=done["method"],
+        figures=figures,
+        settings=settings,
+        axis_col=done["axis_col"],
+        units=done["units"],
+        warnings=tuple(warned),
+        ended_early=bool(done.get("ended_early")),
+        output=None if output is None else Path(output),
+        report=target.report,
+        _held=held[0] if held else None,
+    )
+
+
+def _method(method: str | Method) -> Method:
+    if not isinstance(method, str):
+        return method
+    try:
+        return Auto() if method == AUTO else by_name(method)()
+    except ValueError as error:
+        raise ConfigError(f"{error}. Nothing was written.") from error
+
+
+def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, int]:
+    if not isinstance(rows, slice):
+        return rows
+    with source.open() as opened:
+        first, end, step = rows.indices(opened.shape[0])
+    if step != 1:
+        raise ConfigError(f"rows {rows}: rows are taken one after the other; leave the step out. Nothing was written.")
+    return first, end

@@ -1,0 +1,219 @@
+"""Runs of a folder: what each is of and what became of it, by its log of events, or its file where that ends early."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from calendar import timegm
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import EVENTS, parts_of
+from beamline.scan.control import running, state_of
+from beamline.scan.run_folder import CONTROL, SCAN, STAMP
+from beamline.scan.states import State
+
+DIED = "died"
+"""State of a run whose process has ended without a word."""
+
+_HEAD, _TAIL = 2**16, 2**17  # bytes of a log that are read: the sample stands at its head, what came of it at its end
+_ENDING = 600.0  # real s since the last line of a log, within which a scan that is complete may still be ending
+_OF_STATUS = {"complete": State.DONE, "stopped": State.STOPPED, "failed": State.FAILED}
+
+Flags = Mapping[str, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run, with all its parts.
+
+    Attributes:
+        folder: of the run.
+        sample: its name.
+        time: s since the Unix epoch, when it began.
+        frames: in its files; None: not known.
+        planned: frames that the first part was to have; None: not known.
+        flags: frames that the monitor flagged: their number by check, then by level.
+        state: that of its newest part, see docs/states.md; `died` where its process ended without a word.
+        bytes: of all files in the folder.
+        parts: 1, and one for each time that it was resumed.
+    """
+
+    folder: Path
+    sample: str
+    time: float
+    frames: int | None
+    planned: int | None
+    flags: Flags
+    state: str
+    bytes: int
+    parts: int
+
+
+def runs_in(folder: Path) -> list[Path]:
+    """The folders of runs in a folder, newest first."""
+    found = [run for run in folder.glob("*/") if _is_run(run)]
+    return sorted(found, key=lambda run: (_began(run), _numbered(run)), reverse=True)
+
+
+def newest(folder: Path) -> Path:
+    """The running scan of a folder, else its newest run. ConfigError where there is none."""
+    found = running(folder)[-1:] or runs_in(folder)
+    if not found:
+        raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")
+    return found[0]
+
+
+def describe(run: Path) -> Run:
+    """What the log of a run says, or its files where that ended early. No pixel is read."""
+    parts = parts_of(run)
+    heads = [_head(part) for part in parts]
+    frames: int | None = 0
+    flags: dict[str, dict[str, int]] = {}
+    state = ""
+    for part in parts:
+        state, n, joined, found = _part(part)
+        frames = n if joined or frames is None or n is None else frames + n
+        for check, levels in found.items():
+            for level, count in levels.items():
+                flags.setdefault(check, {}).setdefault(level, 0)
+                flags[check][level] += count
+    return Run(
+        folder=run,
+        sample=str(heads[0].get("sample") or run.name.partition("_")[2] or run.name),
+        time=_began(run),
+        frames=frames,
+        planned=_whole(heads[0].get("n_frames")),
+        flags=flags,
+        state=state,
+        bytes=sum(_sizes(run)),
+        parts=len(parts),
+    )
+
+
+def _is_run(run: Path) -> bool:
+    try:
+        return (run / EVENTS).is_file()
+    except OSError:  # not ours to look into
+        return False
+
+
+def _began(run: Path) -> float:
+    """By the folder's name, which a simulated clock does not change; of one with another name, by its log."""
+    with suppress(ValueError):
+        return timegm(time.strptime(run.name.partition("_")[0], STAMP))
+    return float(_head(run).get("time") or 0.0)
+
+
+def _numbered(run: Path) -> tuple[int, str]:
+    """The number that tells runs of one second and sample apart, then the name."""
+    number = run.name.rpartition("-")[2]
+    return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name
+
+
+def _part(part: Path) -> tuple[str, int | None, bool, Flags]:
+    """State, frames, whether these are of all parts so far, and flags."""
+    said = _said(part)
+    done = said.get("done") or said.get("scan_done") or {}
+    state = str(said.get("state", {}).get("state", ""))
+    if not (state in _ENDED or "failed" in said):
+        state = _unended(part, done)
+    if (frames := _whole(done.get("n_frames"))) is not None:
+        flags = done.get("flags")
+        return state, frames, Path(str(done.get("path"))).name != SCAN, _flags(flags)
+    if state != DIED and state not in _ENDED:  # it runs
+        return state, _whole(said.get("frame", {}).get("n")) or 0, False, {}
+    frames, flags = _of_file(part / SCAN)
+    return state, frames, False, flags
+
+
+_ENDED = frozenset(state for state in State if state.ended)
+
+
+def _unended(part: Path, done: Mapping[str, Any]) -> str:
+    """The state of a part whose log has no end: it runs, or its process has died."""
+    from beamline.storage.writer_lock import held
+
+    if not (part / CONTROL).is_dir():
+        return DIED
+    if held(part / SCAN):
+        return state_of(part)
+    if not done:
+        return DIED
+    with suppress(OSError):  # the volume is finished after the scan's file was closed
+        if time.time() - (part / EVENTS).stat().st_mtime < _ENDING:
+            return State.FINISHING
+    return _OF_STATUS.get(str(done.get("status")), State.FAILED)
+
+
+def _of_file(scan: Path) -> tuple[int | None, Flags]:
+    """Frames and flags by the head of a scan file; None where it does not open."""
+    from beamline.storage import hdf5
+    from beamline.storage.flag_legend import read_flags
+    from beamline.storage.writers import layout
+
+    with suppress(DataError, OSError), hdf5.open_hdf5(scan, follow=True) as file, hdf5.readable(scan):
+        n = int(file[layout.COMMITTED][()])
+        return n, read_flags(file, n).counts() if n else {}
+    return None, {}
+
+
+def _head(part: Path) -> Mapping[str, Any]:
+    """The event that a run begins with; nothing where there is none."""
+    with suppress(OSError), (part / EVENTS).open("rb") as file:
+        for line in file.readlines(_HEAD):
+            if (event := _event(line, ("run_started",))) is not None:
+                return event
+    return {}
+
+
+def _said(part: Path) -> Mapping[str, Mapping[str, Any]]:
+    """The last event of each kind that tells what became of a part, from the end of its log."""
+    said: dict[str, Mapping[str, Any]] = {}
+    with suppress(OSError), (part / EVENTS).open("rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
+        for line in reversed(file.read(_TAIL).splitlines()):
+            kinds = tuple(kind for kind in ("done", "failed", "scan_done", "state", "frame") if kind not in said)
+            if (event := _event(line, kinds)) is not None and "source" not in event:  # that is the live volume's
+                said[event["event"]] = event
+            if said.keys() & {"done", "scan_done"} and "state" in said:
+                break
+    return said
+
+
+def _event(line: bytes, kinds: Iterable[str]) -> dict[str, Any] | None:
+    """The event in a line, where it is of one of these kinds; their order within a line is that of `Event.to_json`."""
+    if not any(line.startswith(f'{{"event": "{kind}"'.encode()) for kind in kinds):
+        return None
+    with suppress(ValueError):  # a line that is just being written, or was cut
+        event = json.loads(line)
+        return event if isinstance(event, dict) else None
+    return None
+
+
+def _whole(value: object) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def _flags(value: object) -> Flags:
+    found = value if isinstance(value, dict) else {}
+    return {
+        str(check): {str(level): n for level, n in levels.items() if isinstance(n, int)}
+        for check, levels in found.items()
+        if isinstance(levels, dict)
+    }
+
+
+def _sizes(folder: Path) -> Iterator[int]:
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            with suppress(OSError):
+                if entry.is_dir(follow_symlinks=False):
+                    yield from _sizes(Path(entry.path))
+                else:
+                    yield entry.stat(follow_symlinks=False).st_size

@@ -1,0 +1,24 @@
+"""A day of samples: one scan each, a table at the end. A sample that fails does not cost those after it.
+
+python day_of_samples.py my.yaml cathode-1 cathode-2 cathode-3
+"""
+
+import sys
+
+from beamline import api
+
+config, *samples = sys.argv[1:]
+done = []
+
+with api.connect(config) as instrument:
+    for sample in samples:
+        # Here the sample is changed: by a robot, or by you, with input("Mount it, close the hutch, press Enter ").
+        try:
+            done.append(instrument.scan(sample=sample))
+        except api.DataError as error:  # frames are missing, or the disk failed; a failed device ends the day
+            print(f"{sample}: {error}")
+            if instrument.last is not None:
+                done.append(instrument.last)
+
+for scan in done:
+    print(f"{scan.sample:<20}{scan.status:<10}{scan.frames:>6} frames, {scan.alarms} with an alarm  {scan.path}")

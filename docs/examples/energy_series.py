@@ -1,0 +1,30 @@
+"""An energy series: the same sample at several energies, reconstructed, and what each volume's matter absorbs.
+
+python energy_series.py my.yaml 24.9 25.1 25.3
+"""
+
+import sys
+
+import numpy as np
+
+import recon
+from beamline import api
+
+
+def move_monochromator(energy_kev: float) -> None:
+    """Your control system moves it, such as with `epics.caput(...)`, and returns when it stands."""
+
+
+config, *energies = sys.argv[1:]
+scans = []
+
+with api.connect(config, set={"recon.live": False}) as instrument:
+    for energy in map(float, energies):
+        move_monochromator(energy)
+        scans.append(instrument.scan(sample=f"cathode_{energy:g}keV", energy_kev=energy))
+
+for energy, scan in zip(energies, scans, strict=True):
+    # The same method for all: "auto" may choose another one at each energy.
+    result = api.reconstruct(scan.path, recon.Fbp(), output=scan.folder / "fbp.h5")
+    absorption = np.percentile(result.volume.data, 99)
+    print(f"{energy} keV: {absorption:.3f} {result.units} where most is absorbed, {result.output}")

@@ -1,0 +1,78 @@
+"""Pictures of values in a notebook: three slices of a volume, the views of a geometry, as a PNG within HTML."""
+
+from __future__ import annotations
+
+import base64
+import struct
+import zlib
+from collections.abc import Mapping
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+U8 = NDArray[np.uint8]
+_SIDE = 256  # pixels of a slice's longer side, at most
+_GAP = 4  # pixels between slices
+_SEEN = (0.5, 99.8)  # percentiles that are black and white
+
+
+def html(title: str, pixels: U8, facts: Mapping[str, str]) -> str:
+    """A title, a grey picture [row, col], and facts by name."""
+    rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in facts.items())
+    image = base64.b64encode(png(pixels)).decode()
+    return (
+        f'<div><b>{escape(title)}</b><br><img alt="{escape(title)}" src="data:image/png;base64,{image}"/>'
+        f"<table>{rows}</table></div>"
+    )
+
+
+def png(pixels: U8) -> bytes:
+    """A grey picture [row, col] as PNG (ISO/IEC 15948): signature, header, rows that each begin with filter 0, end."""
+    height, width = pixels.shape
+    rows = np.concatenate((np.zeros((height, 1), np.uint8), pixels), axis=1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunks = (b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes())), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
+    """The middle slices across z, y and x of a volume [z, y, x], side by side, and the values of black and white.
+
+    y and z point downwards. Voxels are left out where a side is longer than 256 of them; what is not finite is black.
+    """
+    nz, ny, nx = data.shape
+    step = -(-max(data.shape) // _SIDE)
+    slices = [data[nz // 2, ::step, ::step], data[::step, ny // 2, ::step], data[::step, ::step, nx // 2]]
+    parts = [np.asarray(part, np.float64) for part in slices]
+    values = np.concatenate([part[np.isfinite(part)] for part in parts])
+    low, high = np.percentile(values, _SEEN) if values.size else (0.0, 0.0)
+    sheet = np.full((max(len(part) for part in parts), sum(part.shape[1] for part in parts) + 2 * _GAP), 255, np.uint8)
+    left = 0
+    for part in parts:
+        with np.errstate(invalid="ignore"):
+            grey = 255 * np.clip((part - low) / (high - low if high > low else 1.0), 0, 1)
+        sheet[: len(part), left : left + part.shape[1]] = np.nan_to_num(grey).astype(np.uint8)
+        left += part.shape[1] + _GAP
+    return sheet, (float(low), float(high))
+
+
+def fan(angles: NDArray[np.float64], centre: float) -> U8:
+    """Directions of the rays of views, as dark lines through the rotation axis; x to the right, y downwards.
+
+    Args:
+        angles: [view] radians.
+        centre: where the axis falls on the detector, from 0 at its left to 1 at its right edge; drawn below.
+    """
+    half, side = _SIDE // 4, _SIDE // 2
+    sheet = np.full((side + 12, side), 255, np.uint8)
+    away = np.linspace(0.25, 0.95, side) * (half - 1)
+    rows = np.rint(half + np.cos(angles)[:, None] * away).astype(int)
+    cols = np.rint(half - np.sin(angles)[:, None] * away).astype(int)
+    sheet[rows, cols] = 60
+    sheet[side + 4 : side + 8] = 190
+    if 0 <= centre <= 1:
+        sheet[side + 1 : side + 11, round(centre * (side - 1))] = 0
+    return sheet

@@ -1,0 +1,236 @@
+"""Scans from Python: devices stay open, each scan has its own values, Ctrl-C ends the loop and keeps the data."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from beamline import api
+from beamline.config.load import config_folder
+from beamline.scan.live_process import Commands
+from beamline.storage.readers.open import open_scan
+from drivers.errors import DeviceError
+from tests.beamline.fakes import FakeInstrument, Faults
+
+SIMULATED = config_folder() / "simulated.yaml"
+SMALL = {
+    "scan.angles.views": 12,
+    "scan.period_s": 0.5,
+    "scan.exposure_s": 0.02,
+    "scan.darks.count": 3,
+    "scan.flats": {"count": 2, "at": "start"},
+    "recon.live": False,
+}
+FRAMES = 3 + 2 + 12
+
+Connected = Callable[..., api.Instrument]
+
+
+@pytest.fixture
+def closed() -> list[FakeInstrument]:
+    """Fake instruments whose devices were closed."""
+    return []
+
+
+@pytest.fixture
+def connected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: list[FakeInstrument]) -> Connected:
+    """`connect` that finds a fake instrument where the devices would be; runs come into `tmp_path`."""
+
+    def connect(fake: FakeInstrument | None = None, **values: object) -> api.Instrument:
+        fake = fake or FakeInstrument()
+        monkeypatch.setattr(
+            "beamline.instrument.connect.connect",
+            lambda config, ask=None: replace(fake.connected(), close=lambda: closed.append(fake)),
+        )
+        return api.connect(SIMULATED, set={**SMALL, "storage.folder": str(tmp_path), **values}, tell=None)
+
+    return connect
+
+
+def test_scans_in_a_row_carry_their_own_sample_energy_time_and_views(
+    connected: Connected, closed: list[FakeInstrument]
+) -> None:
+    with connected() as instrument:
+        first = instrument.scan(sample="cathode-1", energy_kev=24.9)
+        again = instrument.scan(sample="cathode-2", energy_kev=25.1, set={"scan.angles.views": 6})
+        third = instrument.scan()
+        assert not closed
+    assert len(closed) == 1
+    with open_scan(first.path) as one, open_scan(again.path) as two, open_scan(third.path) as three:
+        sources = (one, two, three)
+        assert [source.attributes["sample"] for source in sources] == ["cathode-1", "cathode-2", "battery"]
+        assert [source.energy_kev for source in sources] == [24.9, 25.1, 25.0]
+        assert [len(source.plan["angles_deg"]) for source in sources] == [12, 6, 12]
+        times = [frame.time for source in sources for frame in source.frames()]
+    assert times == sorted(times) and len(set(times)) == len(times)
+    assert (first.sample, first.frames, again.frames, third.frames) == ("cathode-1", FRAMES, FRAMES - 6, FRAMES)
+    assert first.folder != again.folder and first.folder.name.endswith("_cathode-1")
+    assert first.clean and first.missing == () and first.status == "complete" and first.volume is None
+    assert instrument.last == third
+
+
+def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected, closed: list[FakeInstrument]) -> None:
+    fake = FakeInstrument(on_frame=lambda number: signal.raise_signal(signal.SIGINT) if number == 8 else None)
+    before, taken = signal.getsignal(signal.SIGINT), []
+    with pytest.raises(api.ScanStopped), connected(fake) as instrument:
+        for sample in ("a", "b", "c"):
+            taken.append(sample)
+            instrument.scan(sample=sample)
+    assert taken == ["a"] and closed == [fake]
+    assert signal.getsignal(signal.SIGINT) is before
+    assert instrument.last is not None and instrument.last.status == "stopped"
+    with open_scan(instrument.last.path) as source:
+        assert source.finished and len(source.image_key) == instrument.last.frames < FRAMES
+
+
+def test_a_second_ctrl_c_aborts(connected: Connected) -> None:
+    def twice(number: int) -> None:
+        if number == 8:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(api.ScanAborted), connected(FakeInstrument(on_frame=twice)) as instrument:
+        instrument.scan()
+    assert instrument.last is not None and instrument.last.frames == 9
+
+
+def test_in_another_thread_a_request_stops_it_and_no_signal_is_caught(connected: Connected) -> None:
+    stop, raised = api.StopRequest(), []
+    fake = FakeInstrument(on_frame=lambda number: stop.stop("the button") if number == 8 else None)
+
+    def work() -> None:
+        with connected(fake) as instrument:
+            try:
+                instrument.scan(stop=stop)
+            except api.ScanStopped as error:
+                raised.append(str(error))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join(60)
+    assert len(raised) == 1 and "the button" in raised[0]
+
+
+def test_lost_frames_raise_what_the_command_says_and_leave_the_result(connected: Connected) -> None:
+    with connected(FakeInstrument(Faults(lost={9}))) as instrument:
+        with pytest.raises(api.DataError, match="1 of 12 projections are missing"):
+            instrument.scan()
+        assert instrument.last is not None
+        assert (instrument.last.missing, instrument.last.status, instrument.last.clean) == ((9,), "failed", False)
+        assert instrument.scan(sample="next").clean  # the fault was of the first trigger of that number
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"scan.angles.views": 0}, "--set scan.angles.views=0"),
+        ({"scan.angels": 3}, "--set scan.angels=3"),
+        ({"sample.name": "a/b"}, "a/b"),
+        ({"scan.period_s": object()}, "is no value of a configuration"),
+        ({"devices.stage.max_speed_deg_s": 3}, "belongs to devices that are open"),
+        ({"simulation.seed": 3}, "belongs to devices that are open"),
+        ({"scan.period_s": 1e-3}, "nothing was started"),
+    ],
+)
+def test_a_wrong_value_starts_nothing(
+    connected: Connected, tmp_path: Path, values: dict[str, object], said: str
+) -> None:
+    with connected() as instrument:
+        with pytest.raises(api.ConfigError, match=said):
+            instrument.scan(set=values)
+        assert list(tmp_path.iterdir()) == [] and instrument.last is None
+        assert instrument.scan(set={"devices.camera.readout": "ultra_quiet"}).clean
+
+
+def test_a_closed_instrument_and_a_second_scan_at_a_time_are_refused(connected: Connected) -> None:
+    said: list[str] = []
+
+    def another(number: int) -> None:
+        if number == 3:
+            with pytest.raises(api.ConfigError, match="still runs"):
+                instrument.scan(sample="second")
+            said.append("refused")
+
+    with connected(FakeInstrument(on_frame=another)) as instrument:
+        assert instrument.scan().clean and said == ["refused"]
+    with pytest.raises(api.ConfigError, match="was closed"):
+        instrument.scan()
+
+
+def test_events_and_sentences_are_those_of_the_command(
+    connected: Connected, capsys: pytest.CaptureFixture[str]
+) -> None:
+    heard: list[str] = []
+    with connected() as instrument:
+        instrument.scan(on_event=lambda event: heard.append(event.event))
+        assert capsys.readouterr() == ("", "")
+        instrument._tell = api.to_stderr
+        instrument.scan()
+    assert {"run_started", "state", "scan_done", "done"} <= set(heard)
+    out, err = capsys.readouterr()
+    assert out == "" and f"Scan complete: {FRAMES} frames" in err
+
+
+def test_the_simulated_instrument_on_a_virtual_clock(tmp_path: Path) -> None:
+    values = {
+        **SMALL,
+        "scan.angles": {"scheme": "fixed", "views": 45, "span_deg": 45, "start_deg": 10},
+        "simulation.clock": "virtual",
+        "storage.folder": tmp_path,
+        "devices.camera.roi": [1144, 2024, 16, 48],
+    }
+    with api.connect(SIMULATED, set=values, tell=None) as instrument:
+        results = [instrument.scan(sample=f"cell-{n}") for n in (1, 2)]
+    assert [result.frames for result in results] == [50, 50]
+    first, second = (list(api.stream(result.path)) for result in results)
+    assert second[0].time > first[-1].time
+
+
+def test_the_live_volume_is_asked_for_as_configured_and_named(
+    connected: Connected, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = """import json; print(json.dumps({"event": "state", "state": "ready", "message": ""}))
+print(json.dumps({"event": "done", "output": "recon.h5"}))"""
+    live = Commands(live=lambda scan, output: [sys.executable, "-c", done], remark="A remark.")
+    monkeypatch.setattr("beamline.api.instrument.commands_of", lambda config: live)
+    with connected() as instrument:
+        assert instrument.scan().volume == Path("recon.h5")
+        assert instrument.scan(live=False).volume is None
+
+
+def test_one_scan_connects_and_closes(connected: Connected, closed: list[FakeInstrument], tmp_path: Path) -> None:
+    connected()  # the fake instrument stands in from now on
+    values = {**SMALL, "devices.stage.max_speed_deg_s": 20}
+    result = api.scan(SIMULATED, set=values, sample="one", output=tmp_path / "elsewhere", tell=None)
+    assert result.sample == "one" and result.folder.parent.name == "elsewhere" and len(closed) == 1
+
+
+def test_a_device_that_does_not_answer_is_the_projects_own_error(tmp_path: Path) -> None:
+    port = str(tmp_path / "no-port")
+    text = (config_folder() / "instrument.yaml").read_text()
+    config = tmp_path / "my.yaml"
+    config.write_text(text)
+    with pytest.raises(DeviceError, match="no-port"):
+        api.connect(config, set={"devices.stage.port": port})
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    heavy = {"torch", "numba", "matplotlib", "h5py", "pydantic", "click", "scipy"}
+    code = f"import sys, beamline.api; print(sorted({heavy} & set(sys.modules)))"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.strip() == "[]"
+    code = "import sys, beamline.api as api; api.connect; api.stream; print('torch' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.strip() == "False"
+
+
+def test_every_name_is_there_and_typed() -> None:
+    for name in api.__all__:
+        assert getattr(api, name).__doc__
