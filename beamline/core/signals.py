@@ -29,7 +29,8 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
     """Within the context the first Ctrl-C requests a stop, the second an abort.
 
     SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
-    other signals that would end the process request a stop.
+    other signals that would end the process request a stop. Ctrl-Z suspends nothing: the shutter would stay open, and
+    the watchdog would take the scan for dead.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -43,9 +44,13 @@ def stop_signals(stop: StopRequest) -> Iterator[None]:
     def terminate(number: int, frame: FrameType | None) -> None:
         stop.stop(f"the process received {signal.Signals(number).name}")
 
+    def keep_on(number: int, frame: FrameType | None) -> None:
+        _say("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
+
+    suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
     there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
     ending = [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
-    with _caught({signal.SIGINT: interrupt, **dict.fromkeys(ending, terminate)}):
+    with _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(ending, terminate)}):
         yield
 
 
