@@ -1,0 +1,19 @@
+"""Ctrl-Z suspends no scan: the stage would go on turning in front of an open shutter."""
+
+import os
+import signal
+import sys
+
+import pytest
+
+from beamline.core.signals import stop_signals
+from beamline.core.stop import StopRequest
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no Ctrl-Z")
+def test_ctrl_z_neither_suspends_nor_stops(capfd: pytest.CaptureFixture[str]) -> None:
+    stop = StopRequest()
+    with stop_signals(stop):
+        os.kill(os.getpid(), signal.SIGTSTP)
+    assert not stop.stopping
+    assert "`beamline pause` pauses it" in capfd.readouterr().err
