@@ -23,7 +23,7 @@ from recon.voxels.methods.fista_tv import FistaTv
 
 
 def _candidates() -> tuple[Method, ...]:
-    # OS-SIRT-TV, a third of the cost, was nowhere the best by more than 0.02 dB (docs/exploration.md).
+    # OS-SIRT-TV, a third of the cost, was nowhere the best by more than 0.02 dB (docs/notes/exploration.md).
     return R2(), FistaTv(), Fbp()
 
 
@@ -36,7 +36,7 @@ class Auto:
     the first candidate takes them; and of a sample that is wider than the field, which only a fit models. A volume that
     is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so neither is
     preferred. Where methods are level, the first one is taken that leaves no structure in its own views and does
-    not dull edges (docs/exploration.md).
+    not dull edges (docs/notes/exploration.md).
 
     Attributes:
         candidates: the methods, by preference.

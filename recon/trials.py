@@ -67,7 +67,7 @@ class Score:
     @property
     def penalised(self) -> float:
         """The residual times `overfit`: line integrals average over the noise that a volume follows, so that views
-        held out say too little of it (docs/exploration.md)."""
+        held out say too little of it (docs/notes/exploration.md)."""
         return self.residual * self.overfit
 
 

@@ -32,4 +32,4 @@ N_GAUSSIANS, SIDE = 50_000, 256
 """Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view."""
 
 FEW_PHOTONS = 100
-"""In a pixel of the open beam: below, counts are better than their logarithm (docs/exploration.md, "Few photons")."""
+"""In a pixel of the open beam: below, counts are better than their logarithm (docs/notes/exploration.md)."""

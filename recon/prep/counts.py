@@ -15,7 +15,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 # Smoothing of the counts that the likelihood is expanded around, in pixels: from 1, 1.5, 2 and 3 by the error of the
-# expansion on three samples at 10 to 10 000 photons, see docs/exploration.md. So are the other two.
+# expansion on three samples at 10 to 10 000 photons, see docs/notes/exploration.md. So are the other two.
 _SIGMA, _SPREAD = 1.5, 2.0
 _DETAIL = 1.5  # variance over that of counting beyond which a place has detail
 _FEWEST = 0.25  # photons: the least that a ray is taken to expect

@@ -123,7 +123,7 @@ def finish(
     Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`, or is the one that views held
     out prefer, see `preferred_weight`. Measured on 26 small scans, with the former: 0.5 to 7 dB above the fit in 25 of
-    them, 0.9 below it in one of 500 photons a pixel; level on a measured walnut (docs/exploration.md).
+    them, 0.9 below it in one of 500 photons a pixel; level on a measured walnut (docs/notes/exploration.md).
     Memory: 8 volumes and 5 times the projections.
 
     Args:

@@ -16,7 +16,7 @@ NAMES = ("means", "log_scales", "quaternions", "raw")
 """Parameters of the model, in the order of their rates."""
 
 # Total variation is a prior: it weighs the more, the noisier a pixel (variance) and the fewer pixels a Gaussian has.
-# Factor and bounds from scans of four kinds with 25 to 90 views, see docs/exploration.md.
+# Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
 _TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
 # A box of a 64th of the grid: seen more seldom, total variation comes in kicks that Adam's moments take for steepness
 # and that brake all the rest (-1.8 dB on a battery of 256³ voxels).
@@ -40,7 +40,7 @@ class FitSettings:
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
             Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there; 26 times with a
-            higher last rate gives in 400 steps and a finish what 20 gives in 500 (see docs/exploration.md).
+            higher last rate gives in 400 steps and a finish what 20 gives in 500 (see docs/notes/exploration.md).
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.

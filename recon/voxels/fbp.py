@@ -147,7 +147,7 @@ def fbp_memory(views: int, cols: int) -> int:
 
 
 def fbp_nanoseconds(views: int, cols: int, slices: int) -> float:
-    """What FBP of so many slices [cols, cols] costs, on the machine of docs/performance.md."""
+    """What FBP of so many slices [cols, cols] costs, on the machine of docs/notes/performance.md."""
     response = partial(_transfer, pixel_pitch=1.0, filter="hann")
     return min(nanoseconds(views, cols, (cols, cols), slices, response)) * -(-slices // SLICES)
 

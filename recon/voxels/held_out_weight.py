@@ -34,7 +34,7 @@ _NEARER = 0.99  # of the residual before: what further sweeps have to bring
 _LEVEL = 0.002  # residuals of views held out that differ by less are equal
 
 # Weights of the two runs of `bregman`, in that of one run, and by how much the residual of views held out has to fall:
-# less is chance (docs/exploration.md).
+# less is chance (docs/notes/exploration.md).
 _HEAVY, _LESS_HEAVY = 3.0, 2.5
 _GAIN, _FURTHER_GAIN = 0.003, 0.001
 _MATTER = 0.1  # of the largest line integrals
@@ -131,7 +131,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
 def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
     """The weight of `bregman` that predicts views held out better than one run with `weight`; None: none does.
 
-    At the same noise two runs show more of a crack than one, most where views are few (docs/exploration.md).
+    At the same noise two runs show more of a crack than one, most where views are few (docs/notes/exploration.md).
     """
     error = _Trial.of(problem)
     once, heavy = error(weight), error(_HEAVY * weight, twice=True)
@@ -158,7 +158,7 @@ def sweeps_by_noise(problem: VoxelProblem, start: F32, weight: float, sweeps: in
 
     Most samples come no nearer by more sweeps, and leave a fit that is better than total variation alone (a teapot:
     39.6 dB after 8, 37.5 after 24); a battery, where fits of few views are far off, does (33.3, 36.1). So views held
-    out have to be predicted better by one per cent, which parts the two (docs/exploration.md).
+    out have to be predicted better by one per cent, which parts the two (docs/notes/exploration.md).
     """
     if not (_can_hold_out(problem.projector.geometry) and weight > 0):
         return sweeps

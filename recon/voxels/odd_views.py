@@ -20,7 +20,7 @@ from recon.voxels.projector import project
 F32 = NDArray[np.float32]
 
 LIMIT = 12.0
-"""Standard deviations of what is usual at a place: three clean real scans stay below 9.4 (docs/exploration.md)."""
+"""Standard deviations of what is usual there: three clean real scans stay below 9.4 (docs/notes/exploration.md)."""
 
 _CELLS = 128  # columns of cells, at least, where the detector has so many pixels
 _BLUR = 4  # pixels that a blur by one reaches
