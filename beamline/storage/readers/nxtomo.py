@@ -103,7 +103,7 @@ class NXtomoSource(ScanReader):
             if n < 0:
                 raise ValueError(f"{n} frames are committed")
             if n > self.n:
-                for item in (places.data, key, places.angle):
+                for item in (places.data, key, places.angle, None if key is places.image_key else places.image_key):
                     if item is not None:
                         item.refresh()
         else:

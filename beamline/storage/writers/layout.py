@@ -197,7 +197,8 @@ def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
     columns = {}
     for path in (*RECORDED, RECORD_CHECKSUM):
         column = file[path]
-        column.refresh()
+        if len(column) < end:  # HDF5 2.0 reads wrong values where a dataset is refreshed that is open twice
+            column.refresh()
         columns[path] = column[first:end]
         if columns[path].shape != (end - first,) or column.dtype != COLUMNS[path][0]:
             raise ValueError(f"{path} is {column.dtype} {column.shape}, expected {COLUMNS[path][0]} of {end} rows")
