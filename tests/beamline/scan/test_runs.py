@@ -119,6 +119,7 @@ def test_a_damaged_log_hides_no_run(tmp_path: Path, log: bytes) -> None:
     assert (found.sample, found.frames, found.state) == ("cell", None, "died")
 
 
+@pytest.mark.bench
 def test_five_hundred_runs_take_less_than_two_seconds(tmp_path: Path) -> None:
     """A tenth of them have no end in their log; each log has a megabyte of frames in its middle."""
     run = _run(tmp_path / "one", 9)
