@@ -80,7 +80,7 @@ class PageBeside:
         if event.event != "run_started":
             return
         page = ["watch", str(event.data["folder"]), "--control", "--until-stdin-ends"]
-        command = [sys.executable, "-P", "-m", "beamline.cli.main", *page]
+        command = [sys.executable, "-m", "beamline.cli.main", *page]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
             self._held.enter_context(ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True))
@@ -94,7 +94,7 @@ class PageBeside:
 
 
 def _end_with_stdin() -> None:
-    """End this process when whoever started it has died."""
+    """End this process when the process that started it has died."""
     sys.stdin.read()
     os._exit(0)
 

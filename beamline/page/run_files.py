@@ -112,7 +112,7 @@ class Reader:
         return self._thread.submit(lambda: read(self._open())).result()
 
     def on_volume(self, read: Callable[[ShownVolume], _Result]) -> _Result:
-        """Likewise of the newest volume. DataError where there is none."""
+        """The result of `read` on the newest volume, likewise. DataError: there is no volume."""
         return self._thread.submit(lambda: read(self._newest_volume())).result()
 
     def state(self) -> dict[str, Any]:

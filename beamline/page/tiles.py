@@ -34,7 +34,7 @@ class Region:
         return self.last_row - self.first_row, self.last_col - self.first_col
 
     def binning(self, most: int = MOST) -> int:
-        """The least binning by which it has at most `most` pixels along an axis."""
+        """The smallest binning that leaves at most `most` pixels along each axis."""
         return max(1, -(-max(self.shape) // most))
 
 

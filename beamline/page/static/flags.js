@@ -1,8 +1,8 @@
 // The flags of the monitor along the scan: frames across, a line a check; a click goes to the frame.
 
 export class Timeline {
-  constructor(canvas, { go, about }) {
-    Object.assign(this, { canvas, go, about, flags: [], planned: 1, current: 0 });
+  constructor(canvas, { go }) {
+    Object.assign(this, { canvas, go, flags: [], planned: 1, current: 0 });
     new ResizeObserver(() => this.draw()).observe(canvas);
     canvas.addEventListener("click", (event) => this.pick(event));
     canvas.addEventListener("keydown", (event) => {
