@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import import_module
 
+from drivers.plugins import plugins
 from drivers.stages.settings import StageSettings
 
 REGISTRY = {  # kind, as a configuration names it: class in the kind's module `settings`
@@ -16,6 +17,7 @@ REGISTRY = {  # kind, as a configuration names it: class in the kind's module `s
     "zaber": "ZaberSettings",
 }
 STAGES: Mapping[str, type[StageSettings]] = {
-    kind: getattr(import_module(f"drivers.stages.{kind}.settings"), name) for kind, name in REGISTRY.items()
+    **{kind: getattr(import_module(f"drivers.stages.{kind}.settings"), name) for kind, name in REGISTRY.items()},
+    **plugins("stage", REGISTRY),
 }
 """Kind -> the settings."""

@@ -12,6 +12,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
+from drivers.plugins import plugins
 from simulators.frame.domain import Domain
 
 
@@ -35,7 +36,7 @@ class Entry:
 
 _BEAM = frozenset({"beam_profile", "beam_bend", "narrow_field"})
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
-CATALOGUE: Mapping[str, Entry] = MappingProxyType(
+_OURS: Mapping[str, Entry] = MappingProxyType(
     {
         "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
         "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
@@ -110,6 +111,25 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
 )
 
 
+def _fitting(name: str, effect: type[Any]) -> type[Any]:
+    """The class of another package's effect, which says itself what our entries say of ours."""
+    if effect.name != name:
+        raise ValueError(f"its class calls itself {effect.name!r}; expected the entry point's name")
+    _entry_of(effect)
+    return effect
+
+
+def _entry_of(effect: type[Any]) -> Entry:
+    summary, follows = (effect.__doc__ or "").partition("\n")[0], frozenset(getattr(effect, "follows", ()))
+    return Entry(Domain(effect.domain), summary, follows, getattr(effect, "reason", "its package says so"))
+
+
+_PLUGGED: Mapping[str, type[Any]] = plugins("effect", _OURS, _fitting)
+CATALOGUE: Mapping[str, Entry] = MappingProxyType(
+    {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()}}
+)
+
+
 def order_error(earlier: str, later: str) -> str:
     """Why two effects of one domain cannot come in this order; empty where they can."""
     entry = CATALOGUE.get(earlier)
@@ -120,5 +140,7 @@ def order_error(earlier: str, later: str) -> str:
 
 def load_effect(name: str) -> type[Any]:
     """The class (see chain.AnyEffect) of an effect; this imports its module."""
+    if name in _PLUGGED:
+        return _PLUGGED[name]
     module = import_module(f"simulators.effects.{name}")
     return getattr(module, name.title().replace("_", ""))

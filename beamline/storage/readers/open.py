@@ -23,6 +23,7 @@ from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_te
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeries
 from drivers.frame import FrameKind
+from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
@@ -33,8 +34,11 @@ REGISTRY = (  # modules in this folder, asked in this order
     "nxtomo",
     "dxchange",
 )
-FORMATS: tuple[Format, ...] = tuple(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY)
-"""Every format that is read; adding one takes its file in this folder and its line in REGISTRY."""
+FORMATS: tuple[Format, ...] = (
+    *(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY),
+    *plugins("reader", REGISTRY).values(),
+)
+"""Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 
 Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [frame, row, col]
 
