@@ -43,7 +43,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.method import MethodResult, Traits, TrialSettings
+from recon.base.method import MethodResult, Traits
 from recon.base.volume import Volume
 
 
@@ -51,7 +51,6 @@ from recon.base.volume import Volume
 class Grey:
     name: ClassVar[str] = "grey"
     label: ClassVar[str] = "Grey"
-    colour: ClassVar[str] = "grey"
     traits: ClassVar[Traits] = Traits(direct=True)
     iterations: int = 1
     shade: float = 0.5
@@ -62,15 +61,8 @@ class Grey:
     def toy(self):
         return self
 
-    @classmethod
-    def trials(cls, gaussians, depth):
-        return [TrialSettings("method"), TrialSettings("shade", {"shade": 0.7})]
-
     def memory(self, geometry, grid, weighted):
         return 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
-
-    def work(self, n_views, binning):
-        return 1.0
 """
     },
     (
@@ -99,7 +91,7 @@ white = methods.build(methods.by_name("grey"), {"shade": 1.0})
 assert (recon.reconstruct(data, views, white).volume.data == 1).all()
 trials = plan(("grey", "fbp"), 60, 1000, "quick")
 labels = {t.label for t in trials if t.method == "grey"}
-assert labels == {"grey, 60 views", "grey, 30 views", "grey, 60 views, shade 0.7"}, labels
+assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output

@@ -35,8 +35,7 @@ from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
 from drivers.clock import Clock, SystemClock
-from recon.assess.plans import Quality
-from recon.base.choices import AUTO, Filter
+from recon.base.choices import AUTO, Filter, Quality
 from recon.methods import DEFAULT, names
 
 if TYPE_CHECKING:

@@ -28,14 +28,13 @@ from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
 from drivers.clock import Clock
-from recon.auto import Auto
-from recon.base.method import DataUse, Method, Progress, RunControl
+from recon.base.method import CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.methods import with_trait
 from recon.reconstruction import Reconstruction
 from recon.splatting.backend import backend_for
-from recon.splatting.r2 import R2
+from recon.splatting.fit_method import FitMethod
 from recon.warm_up import warm_up
 
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
@@ -77,7 +76,7 @@ def reconstruct_file(
     selection = options.selection
     if options.cluster is not None and not slabs:
         warn("The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs.")
-    if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
+    if options.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
@@ -197,7 +196,7 @@ class _Job:
         It must not count in the time of the run, nor in its estimate of the time left.
         """
         method, budget = self.options.method, self.options.budget
-        methods = method.candidates if budget is not None and isinstance(method, Auto) else (method,)
+        methods = candidates_of(method) if budget is not None else (method,)
         for one in methods if self.options.cluster is None else ():
             with self.refused(f" by {one.name}"):
                 warm_up(
@@ -248,9 +247,38 @@ class _Job:
 
 
 def _at_once(job: _Job) -> ReconOutcome:
-    """Run a method on the whole volume."""
-    method = job.options.method_for(job.prepared.geometry)
-    return _by_fit(job, method) if isinstance(method, R2) else _by_method(job, method)
+    """Run a method on the whole volume; save checkpoints and continue from one if asked to."""
+    options, prepared, checkpoints = job.options, job.prepared, job.options.checkpoints
+    method = options.method_for(prepared.geometry)
+    origin, resume, steps = {}, None, 0
+    if checkpoints.wanted:
+        assert isinstance(method, CheckpointedMethod)  # others are refused before
+        settings, others = method.made_by
+        origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
+        resume = checkpoints.begin(origin, steps, job.warn)
+    keep = partial(checkpoints.write, origin, steps, job.warn)
+    control = RunControl(
+        on_progress=job.listener(getattr(method, "seconds", None)),
+        on_checkpoint=None if checkpoints.path is None else keep,
+        resume=resume,
+    )
+    result = job.run(method, control)
+    if result.checkpoint is not None:
+        keep(result.checkpoint)
+    chosen, started_from = _chosen(result), int(result.settings.get("gaussians_at_start", 0))
+    asked = getattr(method, "gaussians", None) if options.quality is None else None
+    if options.quality is not None:
+        chosen = f"{options.quality}: {getattr(method, 'steps', None)} steps from {started_from} Gaussians"
+    if isinstance(asked, int) and resume is None and started_from < asked:
+        job.warn(f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more.")
+    if method.traits.held_out:
+        result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
+    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
+    # The sweeps of a finish follow the last step, and can be stopped as well.
+    finishes = isinstance(method, FitMethod) and method.finish_sweeps(prepared.geometry)
+    early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
+    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
+    return job.outcome(result, early, chosen, **resumed)
 
 
 def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
@@ -275,57 +303,11 @@ def _chosen(result: Reconstruction) -> str:
     return "" if because is None else f"{result.method}: {because}"
 
 
-def _by_method(job: _Job, method: Method) -> ReconOutcome:
-    """Run a method that has no presets and no checkpoints."""
-    result = job.run(method, RunControl(on_progress=job.listener()))
-    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    return job.outcome(result, job.stop_latch.cut(reached, planned), _chosen(result))
-
-
-def _by_fit(job: _Job, method: R2) -> ReconOutcome:
-    """Fit Gaussians; save checkpoints and continue from one if asked to."""
-    options, prepared = job.options, job.prepared
-    asked, chosen = method.gaussians if options.quality is None else None, ""
-    steps, checkpoints = method.planned_steps or 0, options.checkpoints
-    origin, resume = {}, None
-    if checkpoints.wanted:
-        assert method.gaussians is None or isinstance(method.gaussians, int)
-        others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
-        origin = origin_of(prepared, method.fit, others)
-        resume = checkpoints.begin(origin, steps, job.warn)
-    keep = partial(checkpoints.write, origin, steps, job.warn)
-    control = RunControl(
-        on_progress=job.listener(method.seconds),
-        on_checkpoint=None if checkpoints.path is None else keep,
-        resume=resume,
-    )
-    result = job.run(method, control)
-    if result.checkpoint is not None:
-        keep(result.checkpoint)
-    started_from = int(result.settings["gaussians_at_start"])
-    if options.quality is not None:
-        chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
-    if isinstance(asked, int) and resume is None and started_from < asked:
-        job.warn(f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more.")
-    result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
-    # The sweeps follow the last step, and can be stopped as well.
-    early = (
-        job.stop_latch.stopped
-        if method.finish_sweeps(prepared.geometry)
-        else job.stop_latch.cut(result.history[-1].step, steps)
-    )
-    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return job.outcome(result, early, chosen, **resumed)
-
-
 def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
     """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the binning of their pixels."""
-    method = job.options.method
-    methods = method.candidates if isinstance(method, Auto) else (method,)
+    methods, largest = candidates_of(job.options.method), None if job.region is None else 1
     control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
-        done = within(
-            budget, job.prepared, methods, job.options.seed, control, job.warn, None if job.region is None else 1
-        )
+        done = within(budget, job.prepared, methods, job.options.seed, control, job.warn, largest)
     outcome = job.outcome(done.result, job.stop_latch.stopped, done.summary(budget), **done.settings(budget))
     return replace(outcome, seconds=done.seconds), done.prepared, done.choice.binning

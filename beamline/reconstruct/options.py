@@ -13,14 +13,14 @@ from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.partial_volume import can_become
-from recon.assess.plans import Quality
+from recon.base.choices import Quality
 from recon.base.geometry import Geometry
-from recon.base.method import Method
+from recon.base.method import Method, PresetMethod
 from recon.base.volume import Grid
 from recon.methods import names, streams
+from recon.splatting.fit_method import StreamingMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
-from recon.splatting.streaming_method import StreamingMethod
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
@@ -103,9 +103,14 @@ class ReconOptions:
 
     def method_for(self, geometry: Geometry) -> Method:
         """The method for these views, with the steps and Gaussians of the preset, if there is one."""
-        if self.quality is None or not isinstance(self.method, R2):
+        if self.quality is None or not isinstance(self.method, PresetMethod):
             return self.method
         return self.method.with_quality(self.quality, default_count(Grid.of_field(geometry, geometry.sample_pitch)))
+
+    @property
+    def stops_early(self) -> bool:
+        """The method ends where views held out say so."""
+        return getattr(self.method, "early_stop", False)
 
     @property
     def streaming(self) -> StreamingMethod:

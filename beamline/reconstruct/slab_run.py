@@ -23,13 +23,11 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import for_part
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, Value
-from recon.auto import Auto
 from recon.base.decisions import Decisions
 from recon.base.method import Method, Progress, RunControl
 from recon.base.slabs import Slab, part_of
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
-from recon.splatting.r2 import R2
 from recon.voxels.methods.fista_tv import FistaTv
 
 _LOOKED_AT = 8  # views by which the rows with most matter are found
@@ -97,7 +95,7 @@ def in_slabs(
             return by(method, part, box, one), ""
         except DataError as error:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
-            if not follows or not isinstance(options.method, R2 | Auto):
+            if not follows or not options.method.traits.needs_matter:
                 raise
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
             return by(FistaTv(), part, box, one), remark

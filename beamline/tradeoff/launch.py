@@ -13,7 +13,7 @@ from typing import Any
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
 from beamline.tradeoff.trials import Outcome, Status, Trial
-from recon.base.method import PRECISION
+from beamline.tradeoff.varied import PRECISION
 
 
 def command(job: Path) -> Sequence[str]:

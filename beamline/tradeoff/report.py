@@ -22,8 +22,8 @@ from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
 from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
 from beamline.tradeoff.trials import Outcome
+from beamline.tradeoff.varied import PRECISION
 from recon.assess.time_model import duration_text
-from recon.base.method import PRECISION
 
 _FIELDS = ("group", "method", "views", "binning")
 _WIDTH = 120  # characters

@@ -27,8 +27,8 @@ from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
+from beamline.tradeoff.varied import Depth
 from drivers.clock import Clock
-from recon.base.method import Depth
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting.initialise import default_count

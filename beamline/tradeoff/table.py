@@ -9,7 +9,7 @@ from typing import Any
 
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
-from recon.base.method import PRECISION
+from beamline.tradeoff.varied import PRECISION
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from recon.base.method import PRECISION, Depth, Method, Plain
+from beamline.tradeoff.varied import PRECISION, Depth, trials_of, work_of
+from recon.base.method import Method, Plain
 from recon.methods import build, by_name
 
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
@@ -146,7 +147,7 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     for method in methods:
         base, *others = (
             Trial(tried.varies, method, n_views, tried.binning, tried.settings)
-            for tried in by_name(method).trials(gaussians, depth)
+            for tried in trials_of(method, gaussians, depth)
         )
         first.append(replace(base, halves=True))
         rest += [replace(base, group="views", views=n) for n in counts]
@@ -159,7 +160,7 @@ def work(trial: Trial) -> float:
     """A rough number for how long a trial takes, to be compared within one method only."""
     if trial.group == PRECISION:
         return float(trial.views)
-    return trial.build().work(trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
+    return work_of(trial.build(), trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
 
 
 @dataclass(frozen=True)

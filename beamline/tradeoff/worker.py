@@ -28,12 +28,13 @@ from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
 from beamline.tradeoff.data import Data, geometry_in
 from beamline.tradeoff.trials import Trial
+from beamline.tradeoff.varied import PRECISION
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import PRECISION, DataUse, RunControl
+from recon.base.method import DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction

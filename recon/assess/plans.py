@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
-Quality = Literal["preview", "standard", "best"]
+from recon.base.choices import Quality
 
 _MOST_BINNED = 2  # of the measured curves
 

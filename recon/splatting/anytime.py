@@ -9,7 +9,7 @@ rates were planned to end there (docs/notes/performance.md, "Streaming").
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.optimise import FitState
@@ -21,6 +21,15 @@ _EVERY = 4  # steps between two of the mean
 
 WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
 """The rates of a fit to all views, to a lower end; density control at any rate, as far as the rounds make room."""
+
+
+def while_views_come(settings: FitSettings) -> FitSettings:
+    """The same, with what a caller's settings have other than the defaults."""
+    usual = FitSettings()
+    chosen = {
+        f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
+    }
+    return replace(WHILE_VIEWS_COME, **chosen)
 
 
 def fallen(steps: int, decay: float) -> float:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import TrialSettings
 from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.direct import direct, has_direct_method
@@ -140,10 +139,3 @@ def iterative_memory(
     wide = max(geometry.detector_shape[1], grid.shape[2])
     beside = fbp_memory(geometry.n_views, wide) if filtered else 0
     return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside
-
-
-def iteration_trials(numbers: Sequence[int]) -> list[TrialSettings]:
-    """Trials of numbers of iterations: the middle one is the baseline."""
-    base = numbers[len(numbers) // 2]
-    others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
-    return [TrialSettings("method", {"iterations": base}), *others]

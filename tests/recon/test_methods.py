@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import recon
 from recon import methods
 from recon.base.method import Method, Traits
-from recon.splatting.streaming_method import StreamingMethod
+from recon.splatting.fit_method import StreamingMethod
 from recon.voxels.projector import Projector
 
 ROOT = Path(__file__).parents[2]
@@ -67,22 +67,9 @@ def test_all_methods_but_the_direct_one_may_allow_negative_densities() -> None:
 @pytest.mark.parametrize("name", methods.names())
 def test_what_the_registry_says_is_what_the_class_is(name: str) -> None:
     method = methods.by_name(name)
-    assert method.name == name and method.label and method.colour
+    assert method.name == name and method.label
     assert is_dataclass(method) and getattr(recon, method.__name__) is method
     assert methods.streams(name) is isinstance(method(), StreamingMethod)
-    assert len({methods.by_name(other).colour for other in methods.names()}) == len(methods.names())
-
-
-@pytest.mark.parametrize("name", methods.names())
-@pytest.mark.parametrize("depth", ["quick", "full"])
-def test_every_trial_is_settings_that_the_method_has(name: str, depth: str) -> None:
-    method = methods.by_name(name)
-    base, *others = method.trials(5000, depth)  # type: ignore[arg-type]
-    assert base.varies == "method" and base.binning == 1
-    for tried in (base, *others):
-        built = methods.build(method, tried.settings)
-        assert isinstance(built, method) and built.work(60, tried.binning) > 0
-    assert methods.build(method, base.settings).toy().work(60, 1) <= methods.build(method, base.settings).work(60, 1)
 
 
 def test_settings_are_built_by_name() -> None:
@@ -130,6 +117,6 @@ def test_names_load_nothing_that_computes() -> None:
 
 
 def test_the_protocol_is_met_by_every_method() -> None:
-    wanted = set(Method.__annotations__) | {"run", "toy", "trials", "work"}
+    wanted = set(Method.__annotations__) | {"run", "toy", "memory"}
     for name in methods.names():
         assert wanted <= set(vars(methods.by_name(name)))  # of its own: nothing is inherited

@@ -17,7 +17,7 @@ from beamline.report.slice_sheet import Slices
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Trial, plan
-from recon.base.method import Depth
+from beamline.tradeoff.varied import Depth
 from recon.methods import names
 from tests.beamline.html_page import parsed_page
 
