@@ -16,6 +16,7 @@ from beamline.core.events import Event
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
+from beamline.storage.volumes.registry import suffixes_text
 from drivers.clock import SystemClock
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def window_of(text: str) -> tuple[float, float]:
     metavar="PATH",
     callback=parsed(volume_path),
     required=True,
-    help="Its suffix names the format: .tif, .npy, .nrrd, .zarr, .h5, or none: a folder of TIFFs.",
+    help=f"Its suffix names the format: {suffixes_text()}.",
 )
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values.")
 @click.option(
@@ -55,7 +56,7 @@ def window_of(text: str) -> tuple[float, float]:
 def export(
     volume: Path, output: Path, bits: str, window: tuple[float, float] | None, dataset: str | None, as_json: bool
 ) -> None:
-    """Copy VOLUME to another format: TIFF (BigTIFF from 4 GB on), folder of TIFFs, NRRD, npy, OME-Zarr or NXtomoproc.
+    """Copy VOLUME to another format.
 
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
     Nothing is overwritten, and a failure leaves nothing.

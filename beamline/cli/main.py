@@ -70,9 +70,7 @@ _COMMANDS = {
     "archive": _Entry("files", "Write a compressed copy of a scan file, compared with it frame by frame."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor.", files=False),
     "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
-    "export": _Entry(
-        "export", "Copy a volume to another format: TIFF, npy, NRRD, OME-Zarr, with grey values if wanted."
-    ),
+    "export": _Entry("export", "Copy a volume to another format, with grey values if wanted."),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 

@@ -34,6 +34,7 @@ from beamline.core.files import named_on_failure, refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
+from beamline.storage.volumes.registry import suffixes_text
 from drivers.clock import Clock, SystemClock
 from recon.base.choices import AUTO, Filter, Quality
 from recon.methods import DEFAULT, names
@@ -131,8 +132,8 @@ _SHEET = ".png"
     "--output",
     metavar="PATH",
     callback=parsed(output_path),
-    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, .zarr, or no suffix: a folder of TIFFs; of --axis try a "
-    ".png. Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
+    help=f"Output: {suffixes_text()}; of --axis try a .png. "
+    "Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
 )
 @click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
 @click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
+from beamline.storage.volumes.registry import REGISTRY
 from beamline.storage.writers.recon_file import ReconRecord
 
 _CHUNK = 16, 256, 256  # voxels
@@ -33,7 +34,7 @@ class OmeZarr:
     """OME-Zarr; every scale halves the one before by means of 2 x 2 x 2; the facts are JSON in `splatline`."""
 
     name: str = "OME-Zarr"
-    suffixes: tuple[str, ...] = (".zarr",)
+    suffixes: tuple[str, ...] = REGISTRY["ome_zarr"].suffixes
     greys: bool = True
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
