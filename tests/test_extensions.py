@@ -258,28 +258,13 @@ assert describe("scan.npy")["format"] == "npy_stack"
 STAGE = Extension(
     {
         "drivers/stages/turn/__init__.py": '"""A dummy controller, which answers with its counts."""\n',
-        "drivers/stages/turn/settings.py": '''
+        "drivers/stages/turn/stage.py": '''
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import serial
 
 from drivers.stages.settings import StageFigures, Wiring, key
-
-
-class TurnStage:
-    name = "stage"
-
-    def __init__(self, url, settings):
-        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
-        self._gear = settings.gear
-
-    def position(self):
-        self._line.write(b"?")
-        return int(self._line.read(4)) / self._gear
-
-    def close(self):
-        self._line.close()
 
 
 @dataclass(frozen=True)
@@ -294,8 +279,20 @@ class TurnSettings:
     def limits(self):
         return self.figures.limits(self.figures.acceleration, 0.0)
 
-    def connect(self, url, clock):
-        return TurnStage(url, self)
+
+class TurnStage:
+    name, Settings = "stage", TurnSettings
+
+    def __init__(self, url, settings, clock):
+        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
+        self._gear = settings.gear
+
+    def position(self):
+        self._line.write(b"?")
+        return int(self._line.read(4)) / self._gear
+
+    def close(self):
+        self._line.close()
 ''',
         "simulators/wires/turn/__init__.py": '"""The dummy controller."""\n',
         "simulators/wires/turn/wire.py": """
@@ -330,7 +327,7 @@ class TurnBuild:
 """,
     },
     (
-        ("drivers/stages/registry.py", '    "zaber": "ZaberSettings",', '    "turn": "TurnSettings",'),
+        ("drivers/stages/registry.py", '    "zaber": "ZaberStage",', '    "turn": "TurnStage",'),
         ("simulators/wires/registry.py", '    "zaber": "ZaberBuild",', '    "turn": "TurnBuild",'),
     ),
     """

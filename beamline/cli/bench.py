@@ -121,7 +121,7 @@ def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
         config.scan.exposure_s, TriggerSource.EXTERNAL, camera.roi, camera.binning, camera.readout
     )
     work = Load(
-        orca_quest.timing(settings).shape, storage.preview_bin, storage.flush_every, configured_checks(config.monitor)
+        camera.timing_of(settings).shape, storage.preview_bin, storage.flush_every, configured_checks(config.monitor)
     )
     return work if shape is None else replace(work, shape=shape)
 

@@ -71,7 +71,7 @@ def simulated_devices(
     except ValueError as error:
         raise ConfigError(f"devices.stage.{error}. Nothing was started.") from error
     # A name of its own for every connection: two in one process must not share a controller.
-    stage = chosen.settings.connect(register(f"{chosen.kind}-{uuid4().hex}", controller), clock)
+    stage = chosen.connect(clock, register(f"{chosen.kind}-{uuid4().hex}", controller))
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
     blade: BeamGate = shutter

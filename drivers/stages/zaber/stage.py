@@ -41,6 +41,8 @@ class ZaberStage:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
+    Settings = ZaberSettings
+
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
         self._clock, self._url, self._settings = clock, url, settings
@@ -62,6 +64,12 @@ class ZaberStage:
             self.close()
             raise
         self._travel = Travel(name, replace(settings.limits(), trigger_output=self._identity.has_triggers))
+
+    @staticmethod
+    def halt(url: str, settings: ZaberSettings, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageDriver` has it."""
+        with contextlib.closing(ZaberAxis(url, settings, clock, "stage")) as axis:
+            axis.stop("stop")
 
     @property
     def limits(self) -> StageLimits:

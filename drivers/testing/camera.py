@@ -5,8 +5,9 @@ A subclass gives `bench`, a fixture that makes a CameraBench anew for each test.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,14 +23,23 @@ class CameraBench:
 
     Attributes:
         pulse: put rising edges on the camera's trigger input, at these times on the clock.
+        settings: that it takes: externally triggered, a small region, 10 ms or so.
+        refused: changes of them that it refuses, and a pattern for its words.
+        binnings: beside 1 that it has.
     """
 
     camera: Camera
     clock: Clock
     pulse: Callable[[Sequence[float]], None]
+    settings: CameraSettings
+    refused: Sequence[tuple[Mapping[str, Any], str]]
+    binnings: Sequence[int] = ()
 
-
-SETTINGS = CameraSettings(exposure=0.01, trigger=TriggerSource.EXTERNAL, roi=(1120, 2008, 48, 64))
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        assert self.settings.roi is not None
+        return self.settings.roi[2:]
 
 
 class CameraConformance:
@@ -49,52 +59,42 @@ class CameraConformance:
         return [bench.camera.next_frame(timeout=5.0) for _ in range(n)]
 
     def test_configure_reads_back_and_timing_follows(self, bench: CameraBench) -> None:
-        accepted = bench.camera.configure(SETTINGS)
-        assert accepted.exposure == pytest.approx(SETTINGS.exposure, rel=0.01)
-        assert (accepted.trigger, accepted.roi, accepted.binning) == (SETTINGS.trigger, SETTINGS.roi, 1)
+        accepted = bench.camera.configure(bench.settings)
+        assert accepted.exposure == pytest.approx(bench.settings.exposure, rel=0.01)
+        assert (accepted.trigger, accepted.roi, accepted.binning) == (bench.settings.trigger, bench.settings.roi, 1)
         timing = bench.camera.timing
-        assert timing.shape == (48, 64)
+        assert timing.shape == bench.shape
         assert timing.min_period >= accepted.exposure
         assert timing.readout > 0
-        assert timing.row_period * 48 <= timing.readout * 1.01
-        longer = bench.camera.configure(replace(SETTINGS, exposure=0.02))
+        assert timing.row_period * bench.shape[0] <= timing.readout * 1.01
+        longer = bench.camera.configure(replace(bench.settings, exposure=2 * bench.settings.exposure))
         assert bench.camera.timing.min_period - timing.min_period == pytest.approx(longer.exposure - accepted.exposure)
-        bench.camera.configure(replace(SETTINGS, binning=2))
-        assert bench.camera.timing.shape == (24, 32)
+        for binning in bench.binnings:
+            bench.camera.configure(replace(bench.settings, binning=binning))
+            assert bench.camera.timing.shape == (bench.shape[0] // binning, bench.shape[1] // binning)
 
-    @pytest.mark.parametrize(
-        ("changes", "words"),
-        [
-            ({"roi": (1120, 2008, 47, 64)}, "steps of 4"),
-            ({"roi": (2300, 2008, 48, 64)}, "does not lie on the sensor"),
-            ({"binning": 3}, "legal: 1, 2, 4"),
-            ({"exposure": 1e-9}, "1800 s"),
-            ({"exposure": 1e5}, "1800 s"),
-            ({"readout": "loud"}, "legal: standard, ultra_quiet"),
-        ],
-    )
-    def test_refuses_what_it_cannot_and_stays_as_it_was(
-        self, bench: CameraBench, changes: dict[str, object], words: str
-    ) -> None:
-        bench.camera.configure(SETTINGS)
+    def test_refuses_what_it_cannot_and_stays_as_it_was(self, bench: CameraBench) -> None:
+        assert bench.refused
+        bench.camera.configure(bench.settings)
         before = bench.camera.timing
-        with pytest.raises(DeviceRefused, match=words):
-            bench.camera.configure(replace(SETTINGS, **changes))  # type: ignore[arg-type]
-        assert bench.camera.timing == before
+        for changes, words in bench.refused:
+            with pytest.raises(DeviceRefused, match=words):
+                bench.camera.configure(replace(bench.settings, **changes))
+            assert bench.camera.timing == before
 
     def test_every_pulse_is_a_frame_in_order(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.arm(6)
         times = self._pulses(bench, 6)
         frames = self._take(bench, 6)
         assert [frame.framestamp for frame in frames] == list(range(6))
         assert [frame.time for frame in frames] == pytest.approx(times, abs=2e-4)
-        assert {(frame.counts.shape, frame.counts.dtype) for frame in frames} == {((48, 64), np.dtype(np.uint16))}
+        assert {(frame.counts.shape, frame.counts.dtype) for frame in frames} == {(bench.shape, np.dtype(np.uint16))}
         # A frame cannot be there before it is exposed and read out.
-        assert bench.clock.now() >= times[-1] + SETTINGS.exposure + bench.camera.timing.readout - 1e-6
+        assert bench.clock.now() >= times[-1] + bench.settings.exposure + bench.camera.timing.readout - 1e-6
 
     def test_pulses_that_come_too_early_are_ignored(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.arm(6)
         times = self._pulses(bench, 9, period=0.6 * bench.camera.timing.min_period)
         frames = self._take(bench, 5)  # every other pulse
@@ -104,7 +104,7 @@ class CameraConformance:
             bench.camera.next_frame(timeout=0.2)
 
     def test_an_overrun_ring_is_one_error_and_the_rest_can_be_taken(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.arm(1)
         times = self._pulses(bench, 200)
         bench.clock.sleep(times[-1] - bench.clock.now() + 1.0)
@@ -119,7 +119,7 @@ class CameraConformance:
         )
 
     def test_pulses_before_arm_are_lost(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         self._pulses(bench, 2, delay=0.0)
         bench.clock.sleep(1.0)
         bench.camera.arm(1)
@@ -127,7 +127,7 @@ class CameraConformance:
             bench.camera.next_frame(timeout=0.1)
 
     def test_a_frame_that_does_not_come_is_a_timeout_in_time(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.arm(1)
         start = bench.clock.now()
         with pytest.raises(DeviceTimeout, match=r"0\.3 s"):
@@ -137,7 +137,7 @@ class CameraConformance:
         assert bench.camera.next_frame(timeout=1.0).framestamp == 0
 
     def test_software_triggers(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.SOFTWARE))
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.SOFTWARE))
         bench.camera.arm(3)
         for k in range(3):
             at = bench.clock.now()
@@ -148,7 +148,7 @@ class CameraConformance:
             bench.clock.sleep(bench.camera.timing.min_period)
 
     def test_software_trigger_is_refused_where_it_means_nothing(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         with pytest.raises(DeviceRefused, match="not armed"):
             bench.camera.software_trigger()
         bench.camera.arm(1)
@@ -156,23 +156,23 @@ class CameraConformance:
             bench.camera.software_trigger()
 
     def test_free_run_gives_the_frames_asked_for(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.INTERNAL))
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
         bench.camera.arm(4)
         frames = self._take(bench, 4)
         assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
         gaps = np.diff([frame.time for frame in frames])
-        assert (gaps >= SETTINGS.exposure - 2e-6).all()  # a camera's clock may tick in microseconds
+        assert (gaps >= bench.settings.exposure - 2e-6).all()  # a camera's clock may tick in microseconds
         assert gaps == pytest.approx(gaps[0], abs=2e-4)
 
     def test_framestamps_start_anew_with_every_arm(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.INTERNAL))
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
         for _ in range(2):
             bench.camera.arm(2)
             assert [frame.framestamp for frame in self._take(bench, 2)] == [0, 1]
             bench.camera.disarm()
 
     def test_frames_own_their_memory(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.INTERNAL))
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
         bench.camera.arm(2)
         first, second = self._take(bench, 2)
         assert not np.shares_memory(first.counts, second.counts)
@@ -182,7 +182,7 @@ class CameraConformance:
 
     def test_disarm_is_legal_in_every_state(self, bench: CameraBench) -> None:
         bench.camera.disarm()
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.disarm()
         bench.camera.arm(3)
         self._pulses(bench, 3)
@@ -191,13 +191,13 @@ class CameraConformance:
         bench.camera.disarm()
         with pytest.raises(DeviceRefused, match="not armed"):
             bench.camera.next_frame(timeout=0.1)
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
 
     def test_an_armed_camera_takes_no_settings_and_no_second_arm(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.arm(2)
         with pytest.raises(DeviceRefused, match="disarm"):
-            bench.camera.configure(replace(SETTINGS, exposure=0.02))
+            bench.camera.configure(replace(bench.settings, exposure=2 * bench.settings.exposure))
         with pytest.raises(DeviceRefused, match="disarm"):
             bench.camera.arm(2)
         bench.camera.disarm()
@@ -205,20 +205,20 @@ class CameraConformance:
             bench.camera.arm(0)
 
     def test_describes_itself_for_the_file(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         text = bench.camera.describe()
         assert {type(value) for value in text.values()} <= {str, int, float}
         assert text["model"]
-        assert 0.05 < float(text["conversion_factor"]) < 0.2  # electrons a count
-        assert 50 < float(text["conversion_offset"]) < 500  # counts
+        assert float(text["conversion_factor"]) > 0  # electrons a count
+        assert float(text["conversion_offset"]) >= 0  # counts
 
     def test_a_closed_camera_says_so(self, bench: CameraBench) -> None:
-        bench.camera.configure(SETTINGS)
+        bench.camera.configure(bench.settings)
         bench.camera.arm(1)
         bench.camera.close()
         bench.camera.close()
         bench.camera.disarm()
         with pytest.raises(DeviceError, match="closed"):
-            bench.camera.configure(SETTINGS)
+            bench.camera.configure(bench.settings)
         with pytest.raises(DeviceError, match="closed"):
             bench.camera.arm(1)
