@@ -16,6 +16,7 @@ import recon
 from recon import methods
 from recon.base.method import Method, Traits
 from recon.splatting.fit_method import StreamingMethod
+from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
 
 ROOT = Path(__file__).parents[2]
@@ -120,3 +121,16 @@ def test_the_protocol_is_met_by_every_method() -> None:
     wanted = set(Method.__annotations__) | {"run", "toy", "memory"}
     for name in methods.names():
         assert wanted <= set(vars(methods.by_name(name)))  # of its own: nothing is inherited
+
+
+class TestConformance(MethodConformance):
+    """Ours pass the suite that is shipped."""
+
+    @pytest.fixture(params=[*methods.names(), "auto"])
+    def method(self, request: pytest.FixtureRequest) -> Method:
+        fit = recon.R2(steps=40, gaussians=200, finish=2)
+        if request.param == "auto":
+            return recon.Auto((fit, recon.FistaTv(iterations=3), recon.Fbp()))
+        method = methods.by_name(request.param)
+        short = {"iterations": 5} if methods.has_setting(method, "iterations") else {}
+        return fit if request.param == fit.name else methods.build(method, short)
