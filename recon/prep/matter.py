@@ -26,7 +26,7 @@ _NODES = 513  # energies of a tube
 _SOFTEST_KEV, _NOTHING = 1.0, 1e-7  # a tube's lowest energy; the share of its light below which an energy is left out
 _LP30 = {"LiPF6": 151.9, "C3H4O3": 574.05, "C3H6O3": 574.05}  # g/l: 1 mol/l in equal masses of two carbonates
 
-_KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
+KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
     {
         "LiCoO2": (5.05011, {"LiCoO2": 1}),
         "graphite": (2.26, {"C": 1}),
@@ -100,9 +100,9 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
     energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (x + 1) / 2
     depth = np.zeros(_NODES)
     for name, mm in filters.items():
-        if name not in _KNOWN:
-            raise ValueError(f"the filter {name!r} has no known density; expected one of {', '.join(_KNOWN)}")
-        depth += 0.1 * mm * _KNOWN[name][0] * mass_attenuation(name, energies)
+        if name not in KNOWN:
+            raise ValueError(f"the filter {name!r} has no known density; expected one of {', '.join(KNOWN)}")
+        depth += 0.1 * mm * KNOWN[name][0] * mass_attenuation(name, energies)
     weights = w * (kv - energies) / energies * np.exp(-depth)
     if not weights.any():
         raise ValueError(f"no light of the tube's {kv:g} kV passes its filters {dict(filters)} mm")
@@ -117,7 +117,7 @@ def _fractions(name: str) -> dict[int, float]:
         total = sum(map(int, nmc.groups()))
         metals = [f"{symbol}{int(n) / total:.9f}" for symbol, n in zip(("Ni", "Mn", "Co"), nmc.groups(), strict=True)]
         name = f"Li{''.join(metal for metal in metals if float(metal[2:]) > 0)}O2"
-    parts = _KNOWN[name][1] if name in _KNOWN else {name: 1.0}
+    parts = KNOWN[name][1] if name in KNOWN else {name: 1.0}
     shares: dict[int, float] = {}
     for formula, mass in parts.items():
         try:

@@ -7,9 +7,9 @@ import pytest
 import xraylib
 
 from recon.prep.hardening import curve_of_spectrum
-from recon.prep.matter import delta_beta, mass_attenuation, tube_spectrum
+from recon.prep.matter import KNOWN, delta_beta, mass_attenuation, tube_spectrum
 from simulators.light.beam import Beam, Tube
-from simulators.light.palette import Palette, known_names
+from simulators.light.palette import Palette
 from simulators.light.spectrum import light
 
 
@@ -21,7 +21,7 @@ def test_the_ratio_is_that_of_the_refractive_index(name: str, formula: str, ener
     assert delta_beta(name, energy) == pytest.approx(delta / beta, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", [*known_names(), "NMC622"])
+@pytest.mark.parametrize("name", [*KNOWN, "NMC622"])
 def test_corrections_and_simulator_share_tables_compositions_and_densities(name: str) -> None:
     """The one thing that both know: a wrong cross section would be in the data and in the correction."""
     simulated, energies = Palette()(name), np.array([8.0, 25.0, 120.0])
