@@ -195,7 +195,7 @@ def _phase(rest: dict[str, Any]) -> Phase | None:
     try:
         ratio = float(material)
     except ValueError:
-        from beamline.simulate.matter import delta_beta
+        from recon.prep.matter import delta_beta
 
         return Phase(material, partial(delta_beta, material), *others)
     if not 0 <= ratio < math.inf:
@@ -218,7 +218,7 @@ def _hardening(value: str | None) -> Hardening | None:
 
     if value is None or value == "fit":
         return None if value is None else Hardening(value)
-    from beamline.simulate.matter import in_beam
+    from beamline.projections.beam import in_beam
 
     try:
         return Hardening(value, in_beam(*value.split(":", 1)))

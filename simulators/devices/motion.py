@@ -41,8 +41,17 @@ class TrapezoidMove:
     phases: tuple[Phase, ...]
 
     @classmethod
-    def between(cls, start: float, target: float, speed: float, acceleration: float, begin: float) -> TrapezoidMove:
-        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration.
+    def between(
+        cls,
+        start: float,
+        target: float,
+        speed: float,
+        acceleration: float,
+        begin: float,
+        deceleration: float | None = None,
+    ) -> TrapezoidMove:
+        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration, or
+        <= deceleration where it slows down (None: the same).
 
         Raises:
             ValueError: speed or acceleration is not positive.
@@ -50,12 +59,14 @@ class TrapezoidMove:
         if not (speed > 0 and acceleration > 0):
             raise ValueError(f"speed and acceleration must be positive, not {speed} and {acceleration}")
         distance, sign = abs(target - start), math.copysign(1.0, target - start)
-        peak = min(speed, math.sqrt(distance * acceleration))
-        ramp = peak / acceleration
-        cruise = max(0.0, distance / peak - ramp) if peak > 0 else 0.0
-        up = Phase(0.0, ramp, start, 0.0, sign * acceleration)
-        flat = Phase(ramp, cruise, start + sign * 0.5 * peak * ramp, sign * peak, 0.0)
-        down = Phase(flat.end, ramp, target - sign * 0.5 * peak * ramp, sign * peak, -sign * acceleration)
+        slow = deceleration or acceleration
+        mean = acceleration if slow == acceleration else 2 * acceleration * slow / (acceleration + slow)
+        peak = min(speed, math.sqrt(distance * mean))
+        rise, fall = peak / acceleration, peak / slow
+        cruise = max(0.0, distance / peak - (rise + fall) / 2) if peak > 0 else 0.0
+        up = Phase(0.0, rise, start, 0.0, sign * acceleration)
+        flat = Phase(rise, cruise, start + sign * 0.5 * peak * rise, sign * peak, 0.0)
+        down = Phase(flat.end, fall, target - sign * 0.5 * peak * fall, sign * peak, -sign * slow)
         return cls(begin, start, target, tuple(phase for phase in (up, flat, down) if phase.duration > 0))
 
     @property
@@ -79,6 +90,11 @@ class TrapezoidMove:
             return self.start if time < self.begin else self.target
         low, high = sorted((self.start, self.target))
         return min(max(phase.position_after(time - self.begin - phase.begin), low), high)
+
+    def counts(self, time: float) -> int:
+        """The last whole position passed on the way."""
+        exact = self.position(time)
+        return math.floor(exact) if self.direction >= 0 else math.ceil(exact)
 
     def velocity(self, time: float) -> float:
         phase = self._phase(time)
@@ -120,6 +136,17 @@ class TrapezoidMove:
             ValueError: the move does not pass there.
         """
         return TrapezoidMove(self.begin, self.start, position, self._until(self.time_at(position)))
+
+    def slowed(self, time: float, deceleration: float) -> TrapezoidMove:
+        """The same move until `time`, then slowed down with `deceleration` (> 0) to the last whole position that still
+        comes on the way."""
+        position, velocity = self.position(time), self.velocity(time)
+        stand = position + self.direction * velocity**2 / (2 * deceleration)
+        last = math.floor(stand) if self.direction > 0 else math.ceil(stand)
+        if self.direction * (last - position) <= 0:
+            return self.halted(self.counts(time))
+        braked = self.braked(time, velocity**2 / (2 * abs(last - position)))
+        return TrapezoidMove(braked.begin, braked.start, last, braked.phases)
 
     def _phase(self, time: float) -> Phase | None:
         """The phase at `time`; None while it stands: before, and from `end` on as that number is rounded."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from drivers.orca_quest import BITS
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import CannotExposeError, Image, Shot
 
 
 @dataclass(frozen=True)
-class Adc:
+class Adc(ImageEffect):
     """Counts in steps of 2^(16 - bits), from 0 to the last step: the codes are the upper bits of 16, so that conversion
     factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits; photon numbers
     can be resolved only then, since fewer bits have steps wider than an electron.
@@ -26,10 +26,6 @@ class Adc:
 
     bits: Literal[8, 12, 16] = 16
     nonlinearity: float = 0.0
-
-    name: ClassVar[str] = "adc"
-    domain: ClassVar[Domain] = Domain.COUNTS
-    final: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 12, 16):

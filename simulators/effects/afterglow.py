@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import SamplingEffect
 from simulators.frame.shot import Moments, Shot
 
 Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Afterglow:
+class Afterglow(SamplingEffect):
     """Light of time t is prompt by 1 - sum of shares; a share p comes from t - s, s exponential with its decay time.
 
     The delays of all components and the moments of earlier effects (name it after motion_blur) form one distribution of
@@ -39,10 +38,6 @@ class Afterglow:
     shares: tuple[float, ...]
     decay_times: tuple[float, ...]
     samples: int = 3
-
-    name: ClassVar[str] = "afterglow"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not self.shares or len(self.shares) != len(self.decay_times):

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
 
+from simulators.effects.chain import ImageEffect
 from simulators.frame.detector import Detector
-from simulators.frame.domain import Domain
 from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged
@@ -27,7 +27,7 @@ not alias either."""
 
 
 @dataclass(frozen=True)
-class PhaseFringes:
+class PhaseFringes(ImageEffect):
     """Fresnel propagation of the wave exp(-d/2 (1 + i delta/beta)) behind an object of one material.
 
     With the refractive index 1 - delta + i beta and mu = 4 pi beta / wavelength, the depth d = mu t gives amplitude and
@@ -59,10 +59,6 @@ class PhaseFringes:
     energy: float
     oversampling: int = 1
     method: Literal["wave", "transport"] = "wave"
-
-    name: ClassVar[str] = "phase_fringes"
-    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.delta_beta >= 0 and self.distance >= 0 and self.energy > 0):
