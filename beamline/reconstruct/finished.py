@@ -300,8 +300,7 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
         resume=resume,
     )
     result = job.run(method, control)
-    if result.checkpoint is not None:
-        keep(result.checkpoint)
+    lost = "" if result.checkpoint is None else keep(result.checkpoint)
     started_from = int(result.settings["gaussians_at_start"])
     if options.quality is not None:
         chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
@@ -314,8 +313,8 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
         if method.finish_sweeps(prepared.geometry)
         else job.stop_latch.cut(result.history[-1].step, steps)
     )
-    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return job.outcome(result, early, chosen, **resumed)
+    said = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
+    return job.outcome(result, early, chosen, **said, **({"checkpoint_lost": lost} if lost else {}))
 
 
 def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
