@@ -68,7 +68,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until its end.
 
     Frames are counts: `frame.counts` uint16 [row, col]. It only reads: who takes them slowly does not hold the scan up.
-    A running scan is followed from another program than the one that takes it (HDF5 shares a file within a program).
+    In the program that takes the scan, reading and writing wait for each other: a fast scan is read from another one.
 
     Args:
         path: a scan file, or the folder of a run (its newest part). It may not be there yet.

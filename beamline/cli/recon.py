@@ -28,7 +28,7 @@ from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
 from beamline.cli.recipe import Repeatable, config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import LogLines, Terminal, counting, results
-from beamline.core.errors import QualityError, ScanStopped, user_message
+from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out, while_it_works
 from beamline.core.files import named_on_failure, refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
@@ -329,6 +329,8 @@ def recon(
             metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
     if not as_json:
         click.echo(results(last[-1].data))
+    if lost := last[-1].data.get("checkpoint_lost"):
+        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
     if last[-1].data.get("ended_early"):
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:

@@ -62,11 +62,11 @@ class Recording:
 
     def progress(self) -> Progress:
         committed = self._file[layout.COMMITTED]
-        committed.refresh()
+        hdf5.look_again(committed)
         finished = self._file[layout.FINISHED]
-        finished.refresh()
+        hdf5.look_again(finished)
         status = self._file[layout.STATUS]
-        status.refresh()
+        hdf5.look_again(status)
         return Progress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
 
     def facts(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class Recording:
         region = region.inside(self.shape)
         rows, cols = slice(region.first_row, region.last_row), slice(region.first_col, region.last_col)
         factor = region.binning()
-        self._data.refresh()
+        hdf5.look_again(self._data)
         pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
         if corrected and (found := self._references(frames)) is not None:
             dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in found)
@@ -146,7 +146,7 @@ class Recording:
         packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost a whole frame
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
         at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
-        source.refresh()
+        hdf5.look_again(source)
         factor = max(1, -(-source.shape[2] // MOST))
         lines = [bin_mean(source[int(view), at : at + 1], (1, factor)) for view in views]
         return (
@@ -161,7 +161,7 @@ class Recording:
                                                              region.first_col, region.last_col)))  # fmt: skip
         block = block.inside((self._preview.shape[1], self._preview.shape[2]))
         rows, cols = slice(block.first_row, block.last_row), slice(block.first_col, block.last_col)
-        self._preview.refresh()
+        hdf5.look_again(self._preview)
         return [float(self._preview[frame, rows, cols].mean()) for frame in range(first, self.progress().frames)]
 
     def _legend(self) -> Any:
@@ -169,7 +169,7 @@ class Recording:
 
     def _column(self, path: str, first: int, frames: int) -> list[Any]:
         column = self._file[path]
-        column.refresh()
+        hdf5.look_again(column)
         values = column[first:frames]
         return [None if value != value else value.item() for value in values]  # NaN has no place in JSON
 

@@ -123,14 +123,16 @@ class CheckpointOptions:
             warn(f"The checkpoint is of a fit {plans}: its learning rates go on where the new plan has them.")
         return kept.state
 
-    def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> None:
-        """Keep the state; where the disk refuses, that is told and the fit goes on."""
+    def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
+        """Keep the state; where the disk refuses, that is told and returned, and the fit goes on. "": it did not."""
         if self.path is None:
-            return
+            return ""
         try:
             write_checkpoint(self.path, Checkpoint(state, origin, steps))
         except DataError as error:
             warn(f"A checkpoint was left out: {error}")
+            return str(error)
+        return ""
 
 
 def _whole(path: Path) -> tuple[Checkpoint, FitState]:

@@ -263,8 +263,7 @@ def _at_once(job: _Job) -> ReconOutcome:
         resume=resume,
     )
     result = job.run(method, control)
-    if result.checkpoint is not None:
-        keep(result.checkpoint)
+    lost = "" if result.checkpoint is None else keep(result.checkpoint)
     chosen, started_from = _chosen(result), int(result.settings.get("gaussians_at_start", 0))
     asked = getattr(method, "gaussians", None) if options.quality is None else None
     if options.quality is not None:
@@ -277,8 +276,8 @@ def _at_once(job: _Job) -> ReconOutcome:
     # The sweeps of a finish follow the last step, and can be stopped as well.
     finishes = isinstance(method, FitMethod) and method.finish_sweeps(prepared.geometry)
     early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
-    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return job.outcome(result, early, chosen, **resumed)
+    said = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
+    return job.outcome(result, early, chosen, **said, **({"checkpoint_lost": lost} if lost else {}))
 
 
 def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:

@@ -209,7 +209,8 @@ def write_result(
         "times": phases.seconds,
         **own,
     }
-    summary |= {name: made.settings[name] for name in ("ended_early", "resumed_from") if name in made.settings}
+    said = ("ended_early", "resumed_from", "checkpoint_lost")
+    summary |= {name: made.settings[name] for name in said if name in made.settings}
     if hiding:
         summary["hiding"] = hiding
     if made.chosen:

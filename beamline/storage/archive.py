@@ -34,6 +34,7 @@ from beamline.storage.compressed_copy import (
 )
 from beamline.storage.parts import joined_file_of, other_parts
 from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import altered_said
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 
@@ -50,6 +51,7 @@ class Archived:
         frames: in the file.
         sources: the raw file, then those that it draws frames from; raw_bytes: of all of them.
         damaged: rows whose pixels differ from the checksum that was written with them, in the raw file already.
+        altered: rows of which the file says something else than was written, by that checksum; likewise.
     """
 
     path: Path
@@ -58,6 +60,7 @@ class Archived:
     raw_bytes: int
     bytes: int
     damaged: tuple[int, ...]
+    altered: tuple[int, ...]
 
 
 def archive(
@@ -69,14 +72,17 @@ def archive(
 
     Args:
         codec: a name in `codecs.CODECS`.
-        keep_damaged: frames that differ from their stored checksum are copied as they are, and so is the checksum.
+        keep_damaged: frames that differ from their stored checksum, or of which the file says something else than was
+            written, are copied as they are, and so are the checksums.
         progress: counts the MB of images twice, when they are written and when they are compared.
 
     Raises:
         DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan; the disk
             is too small; what was read back differs. Nothing is left of `out`, and the scan is untouched.
     """
-    frames = _frames_of_archivable(scan)
+    frames, altered, said = _frames_of_archivable(scan)
+    if altered and not keep_damaged:
+        raise DataError(f"{said} To archive what there is: --keep-damaged. Nothing was written.")
     with whole_file(out) as partial, hdf5.open_hdf5(scan) as raw, hdf5.readable(scan):
         datasets = image_datasets(raw)
         _require_room(datasets, out, codec)
@@ -100,16 +106,17 @@ def archive(
         parts = (scan.parent / name for dataset in datasets for name in drawn_from(dataset))
         sources = tuple(dict.fromkeys((scan, *parts)))
         raw_bytes = sum(path.stat().st_size for path in sources)
-    return Archived(out, frames, sources, raw_bytes, out.stat().st_size, tuple(sorted(copy.damaged)))
+    return Archived(out, frames, sources, raw_bytes, out.stat().st_size, tuple(sorted(copy.damaged)), altered)
 
 
-def _frames_of_archivable(scan: Path) -> int:
-    """How many frames the scan has; DataError where it is not one to archive."""
+def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
+    """How many frames the scan has, and which are altered, in words, too; DataError where it is not one to archive."""
     if scan.exists() and not (scan.is_file() and hdf5.is_hdf5(scan)):
         raise DataError(f"{scan} is no HDF5 scan. `beamline ingest` makes one of it. Nothing was written.")
     head = superblock(scan) if scan.is_file() else None
     with open_scan(scan) as source:
-        frames, finished = int(source.image_key.size), source.finished
+        frames, finished, altered = int(source.image_key.size), source.finished, tuple(sorted(source.altered))
+        said = altered_said(source) if altered else ""
     if not finished or (head is not None and head.open_for_writing):
         raise DataError(
             f"{scan} is being written, or its writer died. Let the scan end, or run `beamline recover` first. Nothing "
@@ -123,7 +130,7 @@ def _frames_of_archivable(scan: Path) -> int:
             f"{scan} is a part of a run that was resumed, as {others[0]} is, and its parts are not joined. "
             "`beamline recover RUN` joins them; then archive joined.h5. Nothing was written."
         )
-    return frames
+    return frames, altered, said
 
 
 def _damaged(scan: Path, rows: set[int]) -> DataError:

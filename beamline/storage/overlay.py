@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from beamline.storage.disk_file import UnderHdf5
 from beamline.storage.journal import Change, Changes
 
 _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piece, as far as any does
 
 
-class Overlay:
+class Overlay(UnderHdf5):
     """Bytes of a file under those that were written since, for h5py.File(overlay).
 
     Args:
@@ -21,49 +22,24 @@ class Overlay:
     """
 
     def __init__(self, path: Path, changes: Sequence[Change] = (), length: int = 0) -> None:
-        self.path = path
-        self._file = path.open("rb", buffering=0)
+        super().__init__(path, "r", length)
         self._there = os.fstat(self._file.fileno()).st_size
-        self._size, self._at = max(self._there, length), 0
         self._pages: dict[int, bytearray] = {}
         for change in changes:
             self.put(change.at, change.new)
 
-    def __repr__(self) -> str:
-        return str(self.path)  # which h5py takes for the name of the file
-
-    def __del__(self) -> None:
-        if file := vars(self).get("_file"):
-            file.close()
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
-        return self._at
-
-    def tell(self) -> int:
-        return self._at
-
-    def read(self, n: int) -> bytes:
-        out = bytearray(n)
-        self.readinto(out)
-        return bytes(out)
-
-    def readinto(self, buffer: Any) -> int:
-        out = memoryview(buffer).cast("B")
-        self._from_disk(self._at, out)
-        end = self._at + len(out)
-        for page in _pages(self._at, end) if self._pages else ():
+    def _read(self, at: int, out: memoryview) -> None:
+        self._from_disk(at, out)
+        end = at + len(out)
+        for page in _pages(at, end) if self._pages else ():
             if page in self._pages:
                 begin = page * _PAGE
-                first, last = max(self._at, begin), min(end, begin + _PAGE)
-                out[first - self._at : last - self._at] = self._pages[page][first - begin : last - begin]
-        self._at = end
-        return len(out)
+                first, last = max(at, begin), min(end, begin + _PAGE)
+                out[first - at : last - at] = self._pages[page][first - begin : last - begin]
 
     def write(self, data: Any) -> int:
         given = bytes(data)
         self.put(self._at, given)
-        self._at += len(given)
         return len(given)
 
     def put(self, at: int, data: bytes) -> None:
@@ -80,9 +56,6 @@ class Overlay:
     def truncate(self, length: int | None = None) -> int:
         self._size = self._at if length is None else length
         return self._size
-
-    def flush(self) -> None:
-        """Nothing goes to the disk."""
 
     def changes(self) -> Changes:
         """What was written and differs from what the disk has; never less than there is."""
@@ -101,13 +74,6 @@ class Overlay:
         out = bytearray(_PAGE)
         self._from_disk(page * _PAGE, memoryview(out))
         return out
-
-    def _from_disk(self, at: int, out: memoryview) -> None:
-        self._file.seek(at)
-        done = 0
-        while done < len(out) and (n := self._file.readinto(out[done:])):
-            done += n
-        out[done:] = bytes(len(out) - done)
 
 
 def _pages(begin: int, end: int) -> range:

@@ -24,7 +24,7 @@ from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
 from beamline.storage.journal import Changes
 from beamline.storage.overlay import Overlay
-from beamline.storage.parts import views_in, views_planned
+from beamline.storage.parts import require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import WriterLock, held
@@ -46,6 +46,7 @@ class Recovered:
         missing: views that were planned and not taken; None where the file does not hold its plan.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames, of the last 2 GB, that differ from their checksum; they are kept.
+        altered: frames of which the file says something else than was written, by that checksum; likewise kept.
         remark: what could not be done though the frames are in order; "" where all was done.
     """
 
@@ -56,18 +57,21 @@ class Recovered:
     missing: int | None
     lost: tuple[int, ...] = ()
     damaged: tuple[int, ...] = ()
+    altered: tuple[int, ...] = ()
     remark: str = ""
 
     def said(self) -> str:
         """A line for people."""
+        wrong = f"what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
-            said = f"{self.path} is in order, with {count(self.frames, 'frame')}; nothing was changed."
+            order = "cannot be mended" if wrong else "is in order"
+            said = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong and ': ' + wrong}; nothing was changed."
         else:
             gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
             lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""
             damaged = f"; frames {spans(self.damaged)} differ from their checksum" if self.damaged else ""
             views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
-            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{views}."
+            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong and '; ' + wrong}{views}."
         return f"{said} {self.remark}".strip()
 
 
@@ -124,7 +128,9 @@ def _finished(path: Path) -> bool:
 
 def _as_it_is(path: Path, changed: bool) -> Recovered:
     with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
-        return Recovered(path, changed, int(file[layout.COMMITTED][()]), 0, _views_missing(file) if changed else None)
+        require_joined(file)
+        frames, missing = int(file[layout.COMMITTED][()]), _views_missing(file) if changed else None
+        return Recovered(path, changed, frames, 0, missing, altered=_altered(file, frames))
 
 
 def _with_view(done: Recovered, mended: Changes, say: Callable[[str], None]) -> Recovered:
@@ -185,7 +191,9 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, Changes]:
         with h5py.File(overlay, "r") as file:
             _read(file)
             lost, dropped = tuple(range(frames, committed)), max(0, written - committed)
-            done = Recovered(path, True, frames, dropped, _views_missing(file), lost, _damaged(file))
+            done = Recovered(
+                path, True, frames, dropped, _views_missing(file), lost, _damaged(file), _altered(file, frames)
+            )
     except hdf5.ALTERED as error:
         raise DataError(
             f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
@@ -250,6 +258,10 @@ def _damaged(file: h5py.File) -> tuple[int, ...]:
         if not whole:
             found.append(row)
     return tuple(found)
+
+
+def _altered(file: h5py.File, frames: int) -> tuple[int, ...]:
+    return tuple(layout.altered_rows(file, 0, frames).tolist())
 
 
 def _views_missing(file: h5py.File) -> int | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 SIZE = 48
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
+_GROWS = 4
 _WORD = 0xFFFFFFFF
 
 
@@ -31,6 +32,11 @@ class Superblock:
     def open_for_writing(self) -> bool:
         """A program is writing the file, or died while it did."""
         return self.head[_FLAGS] != 0
+
+    @property
+    def grows(self) -> bool:
+        """It is being written so that others may read it meanwhile (SWMR)."""
+        return bool(self.head[_FLAGS] & _GROWS)
 
     @property
     def missing(self) -> int:

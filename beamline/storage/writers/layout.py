@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from beamline.core.version import version
 from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
+from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -197,8 +198,8 @@ def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
     columns = {}
     for path in (*RECORDED, RECORD_CHECKSUM):
         column = file[path]
-        if len(column) < end:  # HDF5 2.0 reads wrong values where a dataset is refreshed that is open twice
-            column.refresh()
+        if len(column) < end:  # a reader has some of them open already, see look_again
+            hdf5.look_again(column)
         columns[path] = column[first:end]
         if columns[path].shape != (end - first,) or column.dtype != COLUMNS[path][0]:
             raise ValueError(f"{path} is {column.dtype} {column.shape}, expected {COLUMNS[path][0]} of {end} rows")

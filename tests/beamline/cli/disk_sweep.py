@@ -53,6 +53,13 @@ def digest(path: Path) -> str:
     return found.hexdigest()
 
 
+def _digest_or_damaged(path: Path) -> str:
+    try:
+        return digest(path)
+    except OSError as error:
+        return f"damaged: {error}"
+
+
 def main() -> None:
     folder, points, command = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
     library = ctypes.CDLL(os.environ["LD_PRELOAD"])
@@ -78,7 +85,7 @@ def main() -> None:
                 counted.write_text(str(library.faulty_disk_count()))
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         hidden = sum(path.name.startswith(".") for path in out.iterdir())
-        found = {path.name: digest(path) for path in sorted(out.iterdir()) if not path.name.startswith(".")}
+        found = {path.name: _digest_or_damaged(path) for path in sorted(out.iterdir()) if not path.name.startswith(".")}
         said = Path("stderr").read_text()
         line = {"fault": fault, "n": n, "code": code, "stderr": said, "outputs": found, "hidden": hidden}
         print(json.dumps(line), flush=True)

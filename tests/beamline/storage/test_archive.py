@@ -23,6 +23,7 @@ from beamline.storage.archive import archive
 from beamline.storage.codecs import CODECS
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recover import recover
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -154,8 +155,11 @@ def test_a_joined_scan_becomes_one_file(tmp_path: Path) -> None:
     assert done.sources == (joined, *parts)
     assert done.raw_bytes == sum(path.stat().st_size for path in (joined, *parts))
     expected = content(joined)
-    for path in (joined, *parts):
-        path.unlink()
+    for part in parts:
+        part.unlink()
+    with pytest.raises(DataError, match=r"its part .*one\.h5 is not there.* copy the folder of the run as a whole"):
+        recover(joined)
+    joined.unlink()
     assert content(done.path) == expected
     with h5py.File(done.path) as file:
         assert not file[layout.DATA].is_virtual
