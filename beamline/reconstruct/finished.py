@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
+from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
@@ -52,7 +54,7 @@ def reconstruct_file(
         ConfigError, DataError: with nothing written.
         ScanStopped: interrupted, with slabs to go on from.
     """
-    started, phases = clock.now(), Phases(sink, clock)
+    started, worked, phases = clock.now(), time.process_time(), Phases(sink, clock)
     phases.enter("opening the scan")
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
@@ -91,8 +93,15 @@ def reconstruct_file(
         phases.enter("compiling kernels")
         _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region).compile_kernels()
         phases.enter("reconstruction")
+        deadline = Deadline()
+        if isinstance(options.method, R2) and options.method.seconds is not None:
+            method, deadline = fit_within(
+                options.method, prepared, options.target, (started, worked), clock, warn
+            )  # fmt: skip
+            options = replace(options, method=method)
         # A direct method and a slab have no volume so far: a signal interrupts them.
-        with (never_stopped if options.method.traits.direct or slabs else stop_scope)() as stopped:
+        stopping = never_stopped if options.method.traits.direct or slabs else stop_scope
+        with stopping() as stopped, warnings_told(warn):
             job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
             if options.budget is not None:
                 outcome, prepared, factor = _within_budget(job, options.budget)
@@ -114,6 +123,7 @@ def reconstruct_file(
             recipe=options.recipe,
             region=region,
             phases=phases,
+            leaves=deadline.leaves,
         )
         partial_volume = options.partial_path if slabs and options.becomes_output else None
         metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)

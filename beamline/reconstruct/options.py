@@ -33,7 +33,7 @@ class ReconOptions:
         source: the scan.
         target: where results go.
         selection: which part of the scan, and its correction.
-        method: with its settings; `R2.seconds` of a followed scan count from its end.
+        method: with its settings; `R2.seconds` are those of the whole call, of a followed scan from its end.
         budget: s for everything from line integrals to volume; chooses the method and all settings.
         quality: a preset instead of the fit's steps, Gaussians.
         device: to compute on.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -135,6 +135,7 @@ class ReportContext:
     region: RegionOfRows | None = None
     live_picture: str = ""  # file name of the last picture of a volume that grew with its scan
     phases: Phases = field(default_factory=Phases)
+    leaves: Callable[[float], bool] = lambda seconds: True  # whether there is time for so much before the report
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."

@@ -17,7 +17,7 @@ from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
-from beamline.reconstruct.measure import measure, regions
+from beamline.reconstruct.measure import measure, regions, residual_share
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.reconstruct.remarks import hiding_warning, lost_mass_warning, odd_views_warning
 from beamline.report.html import write_report
@@ -34,6 +34,9 @@ from recon.methods import BASELINE, by_name
 from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
+
+# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+_ODD_VIEWS, _DIRECT = 1.5, 2.5
 
 
 def report_beside(output: Path) -> Path:
@@ -122,14 +125,20 @@ def write_result(
     region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
 
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
-        return {**measure(volume, None if region_only else prepared, truth, mask), "seconds": seconds}
+        found = measure(volume, None if region_only else prepared, truth, mask, phases.told)
+        return {**found, "seconds": seconds}
 
     left = unexplained(
         made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed),
         prepared.ray_factors(),
     )  # fmt: skip
     mask = regions(truth or made.volume, context.seed)  # after what takes most memory
+    before = clock.now()
     metrics = {made.method: judged(made.volume, made.seconds)}
+    all_rays = (clock.now() - before) / residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
+    # Who stopped it waits for it, and a volume that was stopped differs from its views in many places.
+    waited_for, direct_method = "ended_early" in made.settings, by_name(made.method).traits.direct
+    left_out = []
     hiding = ""
     if left is not None:
         metrics[made.method]["unexplained"] = left.share
@@ -137,17 +146,23 @@ def write_result(
         if hiding:
             sink(Event("warning", clock.now(), {"message": hiding}))
             context = replace(context, warnings=[*context.warnings, hiding])
-    if odd := odd_views_warning(made, prepared, context.selection):
-        sink(Event("warning", clock.now(), {"message": odd}))
-        context = replace(context, warnings=[*context.warnings, odd])
+    if not (direct_method or waited_for):
+        if not context.leaves(_ODD_VIEWS * all_rays):
+            left_out.append("the look for views that do not fit the volume")
+        elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
+            sink(Event("warning", clock.now(), {"message": odd}))
+            context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
-    if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
+    compared = not direct_method and target.report is not None and has_direct_method(prepared.geometry)
+    if compared and (waited_for or not context.leaves(_DIRECT * all_rays)):
+        left_out.append("FBP for comparison")
+    elif compared:
         phases.enter("FBP for comparison")
         before = clock.now()
         grid, out = made.volume.grid, None
         if isinstance(made.volume.data, np.memmap):
             out = scratch_array(target.output.parent, grid.shape)
-        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, out=out)
+        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.told, out)
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     if BASELINE in volumes:  # it is the first
@@ -159,6 +174,11 @@ def write_result(
             if lost := lost_mass_warning(made, beside_fbp):
                 sink(Event("warning", clock.now(), {"message": lost}))
                 context = replace(context, warnings=[*context.warnings, lost])
+    if left_out:
+        why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
+        remark = f"Left out, as {why}: {', '.join(left_out)}."
+        sink(Event("state", clock.now(), {"state": "left_out", "message": remark}))
+        context = replace(context, warnings=[*context.warnings, remark])
     own = metrics[made.method]
     phases.enter("report")
     parameters = parameters_of(made, prepared, context)

@@ -68,9 +68,9 @@ def direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
 ) -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone takes `on_block` and `out`, and `fdk`."""
+    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone takes `out`, and `fdk`."""
     if geometry.is_cone:
-        return fdk(projections, geometry, grid, filter)
+        return fdk(projections, geometry, grid, filter, on_block)
     return fbp(projections, geometry, grid, filter, on_block, out)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit, prange
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, OPTIONS
+from recon.kernels.cpu.joseph import calls
 from recon.voxels.fbp import Filter, filter_projections
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import circle_weights, fan_shares
@@ -64,7 +66,11 @@ def _back_project(
 
 
 def fdk(
-    projections: NDArray[np.float32], geometry: Geometry, grid: Grid | None = None, filter: Filter = "ram-lak"
+    projections: NDArray[np.float32],
+    geometry: Geometry,
+    grid: Grid | None = None,
+    filter: Filter = "ram-lak",
+    on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> NDArray[np.float32]:
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
@@ -77,6 +83,7 @@ def fdk(
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
         grid: voxels wanted; None: `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
+        on_block: told how many of how many layers are there, by the views that they have.
 
     Returns:
         float32 [z, y, x], 1/mm.
@@ -111,10 +118,13 @@ def fdk(
         prepared = _prepared(projections[start : start + slab], part, rays, (before, after), filter)
         if not np.isfinite(prepared).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
-        _back_project(
-            prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0] + before,
-            part.axis_row + part.shifts[:, 1], part.sod, part.sdd, part.pixel_pitch, x, y, z, volume,
-        )  # fmt: skip
+        for layers in calls(y.size, part.n_views * x.size * z.size):
+            some = slice(layers.start, layers.stop)
+            _back_project(
+                prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0] + before,
+                part.axis_row + part.shifts[:, 1], part.sod, part.sdd, part.pixel_pitch, x, y[some], z, volume[some],
+            )  # fmt: skip
+            on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
     return volume_slices(volume)
 
 
