@@ -14,7 +14,7 @@ Loss = Literal["l1", "l2", "poisson"]
 Noise = Literal["auto", "log", "counts"]
 Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
 FlatFields = Literal["groups", "dynamic"]
-Start = Literal["fbp", "tv"]
+Start = Literal["fbp", "tv", "published"]
 
 KERNEL = Kernel.COMPACT
 """Of a fit's Gaussians."""
