@@ -73,6 +73,8 @@ _COMMANDS = {
     "export": _Entry(
         "export", "Copy a volume to another format: TIFF, npy, NRRD, OME-Zarr, with grey values if wanted."
     ),
+    "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
+    "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 

@@ -244,6 +244,7 @@ class _Job:
             settings={**result.settings, **settings, **({"ended_early": True} if early else {})},
             filter=self.options.filter,
             chosen=chosen,
+            gaussians=result.gaussians,
         )
 
 

@@ -77,6 +77,15 @@ class Projector:
         lines = projection_lines(_fitting(projections, self.projection_shape, "projections"))
         return volume_slices(self.adjoint_lines(lines), out)
 
+    def __call__(self, volume: F32) -> F32:
+        """A x, as `forward`."""
+        return self.forward(volume)
+
+    @property
+    def T(self) -> Callable[[F32], F32]:  # noqa: N802 - the transpose, as numpy spells it
+        """Aᵀ: `A.T(p)` is `A.adjoint(p)`."""
+        return self.adjoint
+
     def forward_lines(self, volume: F32, out: F32 | None = None) -> F32:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape

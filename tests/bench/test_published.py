@@ -17,7 +17,7 @@ from recon.splatting.density_control import DensityPolicy
 from recon.splatting.published import R2Published, published_fit
 from tests.bench.quality_cases import Case, cone
 
-pytestmark = pytest.mark.bench
+pytestmark = [pytest.mark.bench, pytest.mark.timeout(0)]
 VIEWS, SIZE = 50, 128
 PUBLISHED, FIT = R2Published(gaussians=20_000), published_fit()
 DEPARTURES = {
