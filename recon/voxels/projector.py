@@ -9,7 +9,7 @@ A ray has no width: pixels should not be much larger than voxels, or voxels betw
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
