@@ -23,15 +23,18 @@ class Entry:
     Attributes:
         module, cls: of its settings class, see `recon.base.method.Method`.
         streams: it has `stream`, so that its volume can grow while views arrive.
+        compared: a trade-off tries it where no methods are named; not one that takes many times as long as all others.
     """
 
     module: str
     cls: str
     streams: bool = False
+    compared: bool = True
 
 
 REGISTRY: dict[str, Entry] = {
     "r2": Entry("recon.splatting.r2", "R2", streams=True),
+    "r2-published": Entry("recon.splatting.published", "R2Published", streams=True, compared=False),
     "fbp": Entry("recon.voxels.direct", "Fbp"),
     "sirt": Entry("recon.voxels.methods.sirt", "Sirt"),
     "sart": Entry("recon.voxels.methods.sart", "Sart"),
@@ -51,6 +54,11 @@ BASELINE = "fbp"
 def names() -> tuple[str, ...]:
     """Names of all methods; loads none of ours."""
     return tuple(_entries())
+
+
+def names_compared() -> tuple[str, ...]:
+    """Names of the methods that a trade-off tries where none are named; loads none of them."""
+    return tuple(name for name, entry in REGISTRY.items() if entry.compared)
 
 
 def streams(name: str) -> bool:

@@ -71,6 +71,8 @@ _COMMANDS = {
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor.", files=False),
     "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
     "export": _Entry("export", "Copy a volume to another format, with grey values if wanted."),
+    "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
+    "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 

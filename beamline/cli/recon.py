@@ -21,6 +21,8 @@ from beamline.cli.method_options import (
     method_options,
     method_with,
     options_of_a_method,
+    preset_of,
+    preset_option,
     refuse_contradictions,
     resumes_slabs,
 )
@@ -109,6 +111,7 @@ _SHEET = ".png"
 )
 @selection_options
 @method_options
+@preset_option
 @click.option(
     "--filter",
     "ramp",
@@ -198,6 +201,8 @@ _SHEET = ".png"
 def recon(
     file: Path,
     method: str | None,
+    preset: str | None,
+    any_setting: dict[str, Any],
     budget: float | None,
     quality: Quality | None,
     device: str,
@@ -243,8 +248,9 @@ def recon(
 
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
+    method = preset_of(method, preset)
     if method is None:
-        method = DEFAULT if follow or set(options_of_a_method(context)) - {"budget"} else AUTO
+        method = DEFAULT if follow or any_setting or set(options_of_a_method(context)) - {"budget"} else AUTO
     refuse_contradictions(context, method, follow)
     if follow and values["flags"] == "judge":
         raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")
@@ -288,7 +294,7 @@ def recon(
         source=replace(source, earlier=earlier),
         target=OutputPaths(output, page, pdf=sheet),
         selection=selection,
-        method=method_with(method, {**settings, "filter": ramp}),
+        method=method_with(method, {**settings, "filter": ramp, "any_setting": any_setting}),
         budget=budget,
         quality=quality,
         checkpoints=CheckpointOptions(checkpoint, None if partial else resume),

@@ -30,6 +30,7 @@ SAY_EVERY = 0.2
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
 _OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
+_OF_ITSELF = ("axes", "slices", "views")  # stages named after what their progress counts
 _OF_TRIALS = {
     "tradeoff": "trials",
     "study": "trials",
@@ -102,8 +103,9 @@ class Terminal:
             self._show("written and compared", event.data["n"], event.data["of"], rate_text(event.data, "MB"))
         elif event.event == "progress" and event.data.get("stage") == "phase":
             self._show_phase(event.data)
-        elif event.event == "progress" and event.data.get("stage") == "axes":
-            self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
+        elif event.event == "progress" and event.data.get("stage") in _OF_ITSELF:
+            what = event.data["stage"]
+            self._show(what, event.data["n"], event.data["of"], rate_text(event.data, what))
         elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:
             what = _OF_TRIALS[event.data["stage"]]
             self._show(what, event.data["n"], event.data["of"], trials(event.data, what))

@@ -17,13 +17,13 @@ from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
 from beamline.core.signals import terminated_like_interrupted
 from drivers.clock import SystemClock
-from recon.methods import names
+from recon.methods import names, names_compared
 
 
 def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    """Names of methods, separated by commas; all if none are given."""
+    """Names of methods, separated by commas; those that are compared unasked if none are given."""
     if value is None:
-        return names()
+        return names_compared()
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     unknown = [name for name in wanted if name not in names()]
     if unknown:
@@ -40,7 +40,11 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 )
 @selection_options
 @click.option(
-    "--methods", callback=listed, metavar="A,B,...", help=f"Methods to compare, of {', '.join(names())}. Default: all."
+    "--methods",
+    callback=listed,
+    metavar="A,B,...",
+    help=f"Methods to compare, of {', '.join(names())}. "
+    f"Default: all but {', '.join(name for name in names() if name not in names_compared())}.",
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
 @click.option(

@@ -94,7 +94,7 @@ def reconstruct_file(
         _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region).compile_kernels()
         phases.enter("reconstruction")
         deadline = Deadline()
-        if isinstance(options.method, R2) and options.method.seconds is not None:
+        if isinstance(options.method, FitMethod) and options.method.seconds is not None:
             method, deadline = fit_within(
                 options.method, prepared, options.target, (started, worked), clock, warn
             )  # fmt: skip
@@ -253,6 +253,7 @@ class _Job:
             settings={**result.settings, **settings, **({"ended_early": True} if early else {})},
             filter=self.options.filter,
             chosen=chosen,
+            gaussians=result.gaussians,
         )
 
 

@@ -336,7 +336,7 @@ class ScanFollower:
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
         method, seconds = self._options.method.name, self._clock.now() - self._begin
-        made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter)
+        made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter, gaussians=gaussians)
         return made, prepared
 
     def _joined(self) -> Projections:

@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections
@@ -16,9 +16,10 @@ from beamline.reconstruct.result import OutputPaths
 from drivers.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.volume import Grid
+from recon.methods import with_settings
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import first_sweep_seconds
 from recon.splatting.initialise import sweeps_of_start
-from recon.splatting.r2 import R2
 
 _REPORT = 5.0  # s, its pictures
 _BYTES = 1e8  # of a volume, written and read back in a second
@@ -47,13 +48,13 @@ class Deadline:
 
 
 def fit_within(
-    method: R2,
+    method: FitMethod,
     prepared: PreparedProjections,
     target: OutputPaths,
     started: tuple[float, float],
     clock: Clock,
     warn: Warn,
-) -> tuple[R2, Deadline]:
+) -> tuple[FitMethod, Deadline]:
     """The fit with the seconds that its call leaves it, before measuring, report and writing; and when the call ends.
 
     Where they are too few, `warn` is told before the fit how long the call will take.
@@ -82,7 +83,7 @@ def fit_within(
             f"start from coarse pixels the end is in about {duration_text(least + measuring + after)}."
         )
     deadline = Deadline(started[0] + method.seconds, after, clock.now)
-    return replace(method, seconds=max(left, 0.0)), deadline
+    return with_settings(method, {"seconds": max(left, 0.0)}), deadline
 
 
 @contextmanager

@@ -31,6 +31,7 @@ from recon.assess.time_model import NextDecibel, duration_text, next_decibel, ne
 from recon.base.method import Progress
 from recon.base.volume import Volume
 from recon.methods import BASELINE, by_name
+from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import Filter
 from recon.voxels.unexplained import LIMIT, Unexplained
@@ -74,6 +75,7 @@ class ReconOutcome:
         filter: of the FBP (also of the one it is compared with).
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
         chosen: what a budget or a preset chose, in a line; empty where the settings were given.
+        gaussians: the model behind the volume, before its finish on voxels; None where there is none.
     """
 
     volume: Volume
@@ -84,6 +86,7 @@ class ReconOutcome:
     filter: Filter = "hann"
     psnr: Sequence[tuple[float, float]] = ()
     chosen: str = ""
+    gaussians: Gaussians | None = None
 
     @property
     def next_decibel(self) -> NextDecibel | None:

@@ -18,6 +18,7 @@ from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import measure, regions, residual_share
+from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.reconstruct.remarks import hiding_warning, lost_mass_warning, odd_views_warning
 from beamline.report.html import write_report
@@ -194,6 +195,7 @@ def write_result(
         parameters=parameters,
         metrics=own,
         history=history_arrays(made.history),
+        model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
     )
     pages: list[Path] = []
     try:

@@ -65,7 +65,9 @@ class Recovered:
         wrong = f"what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"
-            said = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong and ': ' + wrong}; nothing was changed."
+            said = (
+                f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong and ': ' + wrong}; nothing was changed."
+            )
         else:
             gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
             lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""

@@ -18,7 +18,7 @@ _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
-    "loss": "X", "start": "*",
+    "loss": "X", "start": "*", "rectification": "h",
 }  # fmt: skip
 
 

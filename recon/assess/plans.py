@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.base.choices import Quality
+from recon.base.choices import DEFAULT_STEPS, Quality
 
 _MOST_BINNED = 2  # of the measured curves
 
@@ -193,7 +193,8 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
 
 def best_steps(method: str) -> int:
     """Steps of this method beyond which no measured curve gains: more follow the noise."""
-    return max(max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
+    found = (max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
+    return max(found, default=DEFAULT_STEPS)
 
 
 def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choice | None:

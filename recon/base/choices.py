@@ -15,7 +15,7 @@ Noise = Literal["auto", "log", "counts"]
 Quality = Literal["preview", "standard", "best"]
 Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
 FlatFields = Literal["groups", "dynamic"]
-Start = Literal["fbp", "tv"]
+Start = Literal["fbp", "tv", "published"]
 
 KERNEL = Kernel.COMPACT
 """Of a fit's Gaussians."""

@@ -29,12 +29,18 @@ def while_views_come(settings: FitSettings) -> FitSettings:
     chosen = {
         f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
     }
+    if isinstance(policy := chosen.get("policy"), DensityPolicy):  # how many steps there will be is not known
+        chosen["policy"] = replace(policy, start=0.0, stop=2.0)
     return replace(WHILE_VIEWS_COME, **chosen)
 
 
-def fallen(steps: int, decay: float) -> float:
-    """How far the rates have come after so many steps on their logarithmic way to `decay` of the first ones, 0..1."""
-    return min(1.0, math.log1p(steps / HALF) / max(-math.log(decay), 1e-9))
+def fallen(steps: int, settings: FitSettings) -> float:
+    """How far the rates have come after so many steps on their logarithmic way to the last ones, 0..1.
+
+    Rates that are lower from the start fall as much later.
+    """
+    half = HALF * WHILE_VIEWS_COME.pace / settings.pace
+    return min(1.0, math.log1p(steps / half) / max(-math.log(settings.decay), 1e-9))
 
 
 def average(state: FitState, since: int) -> None:

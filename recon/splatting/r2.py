@@ -21,7 +21,7 @@ from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
 from recon.splatting.schedule import DEFAULT_STEPS
-from recon.splatting.settings import FitSettings
+from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import Clock, StreamingFit
 from recon.splatting.train import run_fit
 from recon.voxels.voxel_problem import iterative_memory
@@ -81,6 +81,13 @@ class R2:
             raise ValueError(f"finish must be 0 sweeps or more, got {self.finish}")
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
             raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
+
+    @staticmethod
+    def published() -> R2:
+        """The fit with the published settings, the method `r2-published`."""
+        from recon.splatting.published import R2Published  # here: it is an R2
+
+        return R2Published()
 
     @property
     def planned_steps(self) -> int | None:
@@ -144,5 +151,6 @@ class R2:
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or default_count(grid)
-        of_gaussians = 1000 * min(count, math.prod(grid.shape))
+        grown = growth(self.fit) / DensityPolicy.growth
+        of_gaussians = round(1000 * grown * min(count, math.prod(grid.shape)))
         return of_gaussians + iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)

@@ -277,7 +277,7 @@ class StreamingFit:
 
     def _fraction(self) -> float:
         assert self._state is not None
-        return fallen(self._state.step - self._schedule_step, self._settings.decay)
+        return fallen(self._state.step - self._schedule_step, self._settings)
 
     def _begin_round(self, force: bool = False) -> None:
         theta = np.asarray(self._angles)

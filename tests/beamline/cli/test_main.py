@@ -184,5 +184,5 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
 
     assert completed("doctor", "--se") == ["--session", "--set"]
     monkeypatch.setattr(module, "import_module", None)
-    assert completed("re") == ["resume", "recon", "recover"]
+    assert completed("re") == ["resume", "recon", "recover", "render"]
     assert completed("--v") == ["--version"]
