@@ -19,7 +19,7 @@ from beamline.core.files import SETTINGS, require_regular, text_in
 
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
-    "output", "as_json", "report", "pdf", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
+    "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
     "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats",
 )  # fmt: skip
 """Options that are of one scan or one call, not of a recipe."""
