@@ -161,5 +161,5 @@ def _text(path: Path) -> str:
 
     with opened_reconstruction(path) as record:
         if "recipe" not in record.parameters:
-            raise click.BadParameter(f"{path} holds no recipe; an older version wrote it")
+            raise click.BadParameter(f"{path} holds no recipe; expected a volume that `beamline recon` wrote")
         return str(record.parameters["recipe"])
