@@ -108,13 +108,13 @@ def acquire(
 
 def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
     from beamline.config.load import load
-    from beamline.config.models import Storage
+    from beamline.config.models import StorageSection
     from beamline.config.monitor import configured_checks
     from beamline.scan.rate import Load
     from drivers.protocols import CameraSettings, TriggerSource
 
     if file is None:
-        return Load(shape or orca_quest.SENSOR_SHAPE, Storage().preview_bin, Storage().flush_every)
+        return Load(shape or orca_quest.SENSOR_SHAPE, StorageSection().preview_bin, StorageSection().flush_every)
     config = load(file)
     camera, storage = config.devices.camera, config.storage
     settings = CameraSettings(

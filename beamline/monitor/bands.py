@@ -72,7 +72,7 @@ class BandsState:
 
 
 @dataclass(frozen=True)
-class Bands:
+class BandsCheck:
     """Score: fraction of its light that a preview row or column has lost (negative: gained).
 
     The default: two black rows across two preview blocks of 8 take an eighth of the light of each.

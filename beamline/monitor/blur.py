@@ -19,7 +19,7 @@ from pydantic import Field
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import Scatter
+from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import Cells
 from drivers.frame import Frame, FrameKind
 
@@ -51,15 +51,15 @@ class BlurState:
     counted: int = 0
     dark: Cells | None = None
     flat: Cells | None = None
-    across: Scatter = field(default_factory=Scatter)
-    down: Scatter = field(default_factory=Scatter)
-    first: tuple[Scatter, Scatter] | None = None
+    across: FrameScatter = field(default_factory=FrameScatter)
+    down: FrameScatter = field(default_factory=FrameScatter)
+    first: tuple[FrameScatter, FrameScatter] | None = None
     blurred: int = 0
     said: bool = False
 
 
 @dataclass(frozen=True)
-class Blur:
+class BlurCheck:
     """Score: share of its fine contrast that a view has lost against the views before.
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
@@ -83,7 +83,7 @@ class Blur:
         if context.view is None:
             return Look(state)
         if not context.follows:  # a sample may be less sharp from there
-            state = replace(state, across=Scatter(), down=Scatter(), blurred=0)
+            state = replace(state, across=FrameScatter(), down=FrameScatter(), blurred=0)
         across, down = sharpness(_lines(frame), state.dark, state.flat)
         after = replace(state, kind=frame.kind, across=_updated(state.across, across), down=_updated(state.down, down))
         if not after.across.ready:
@@ -105,7 +105,7 @@ class Blur:
         )
         return Look(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 
-    def _limit(self, usual: Scatter) -> float:
+    def _limit(self, usual: FrameScatter) -> float:
         return max(self.warn, SIGMAS * usual.sigma / usual.mean) if usual.mean > 0 else 1.0
 
     def _slow(self, state: BlurState, row: int) -> Look[BlurState]:
@@ -168,13 +168,13 @@ def _mean(so_far: Cells | None, lines: Cells, n: int) -> Cells:
     return lines if so_far is None or n == 1 else so_far + (lines - so_far) / np.float32(n)
 
 
-def _updated(usual: Scatter, figure: float) -> Scatter:
+def _updated(usual: FrameScatter, figure: float) -> FrameScatter:
     if not math.isfinite(figure):
         return usual
-    return usual.with_figure(figure) if usual.n else Scatter(1, figure)
+    return usual.with_figure(figure) if usual.n else FrameScatter(1, figure)
 
 
-def _loss(now: float, usual: Scatter) -> float:
+def _loss(now: float, usual: FrameScatter) -> float:
     return 1 - now / usual.mean if usual.mean > 0 else 0.0
 
 

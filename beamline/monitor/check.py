@@ -15,10 +15,10 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.change import Change
+from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.spots import NO_SPOTS, Spots
-from beamline.monitor.view import Cells, Grid, Region, View
+from beamline.monitor.view import CellGrid, Cells, CellView, Region
 from drivers.frame import Frame
 
 State = TypeVar("State")
@@ -111,13 +111,13 @@ class ScanContext:
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan
-    grid: Grid | None = None
+    grid: CellGrid | None = None
     spots: Spots = NO_SPOTS
     follows: bool = True
     light_left: float = 1.0
-    view: View | None = None
+    view: CellView | None = None
     truncated: bool = False
-    change: Change | None = None
+    change: SampleChange | None = None
 
 
 @dataclass(frozen=True, eq=False)

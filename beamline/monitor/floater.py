@@ -21,7 +21,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
-from beamline.monitor.view import Cells, Grid, View
+from beamline.monitor.view import CellGrid, Cells, CellView
 from drivers.frame import Frame
 
 LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
@@ -60,7 +60,7 @@ class FloaterState:
         peaks: of the last views.
     """
 
-    raw: tuple[View, ...] = ()
+    raw: tuple[CellView, ...] = ()
     indices: tuple[int, ...] = ()
     depths: tuple[Cells, ...] = ()
     filters: Filters | None = None
@@ -72,7 +72,7 @@ class FloaterState:
 
 
 @dataclass(frozen=True)
-class Floater:
+class FloaterCheck:
     """Score: mean of the filters' outputs along the trail, in standard deviations of what they usually give there."""
 
     name: ClassVar[str] = "floater"
@@ -117,7 +117,7 @@ class Floater:
             return Look(replace(state, peaks=no_peaks()))
         return self._linked(state, frame.index, peaks[:n], grid)
 
-    def _linked(self, state: FloaterState, now: int, new: Peaks, grid: Grid) -> Look[FloaterState]:
+    def _linked(self, state: FloaterState, now: int, new: Peaks, grid: CellGrid) -> Look[FloaterState]:
         """Link the peaks of the view that is judged with those of the views before."""
         judged = state.indices[-1 - LATER]
         new[:, 0] = judged
@@ -136,7 +136,7 @@ class Floater:
         return Look(state, flag)
 
 
-def _with_view(state: FloaterState, view: View, noise: float) -> FloaterState:
+def _with_view(state: FloaterState, view: CellView, noise: float) -> FloaterState:
     """The state with the view before the newest, without its zingers: they are in neither of its neighbours."""
     if len(state.raw) < 2:
         return replace(state, raw=(*state.raw, view))

@@ -62,7 +62,7 @@ class GhostState:
 
 
 @dataclass(frozen=True)
-class Ghost:
+class GhostCheck:
     """Score: relative change of the light in the middle of the ghost, without its sign: in the few views of a window, a
     ghost that leaves a place looks like a shadow that comes.
     """

@@ -36,7 +36,7 @@ class ModelState:
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelCheck:
     """Score: largest difference from the volume, in standard deviations of what it usually is at its place.
 
     The default: a frame has up to 18,000 cells, of which noise takes one beyond 5 standard deviations in 100 views;

@@ -40,7 +40,7 @@ class PixelsState:
 
 
 @dataclass(frozen=True)
-class Pixels:
+class PixelsCheck:
     """Score: fraction of the pixels that are dead: in all flats of the group at the scan's begin they have less than a
     fifth of the light around them. It is said at the first view, as a fact where they are few. In a view also the
     fraction that holds no number (NaN, infinite) but does in the darks and flats.

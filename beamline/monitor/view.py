@@ -29,7 +29,7 @@ Region = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class CellGrid:
     """The cells of a frame, and the light in them without a sample.
 
     Attributes:
@@ -67,7 +67,7 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CellView:
     """A projection on the grid.
 
     Attributes:
@@ -93,7 +93,7 @@ class View:
 
 def grid_of(
     preview: tuple[int, int], block: int, dark: NDArray[np.float32] | None, flat: NDArray[np.float32] | None
-) -> Grid:
+) -> CellGrid:
     """The grid of frames whose preview has this shape, with blocks of `block` pixels a side."""
     blocks = max(1, preview[1] // COLS)
     blocks = min(blocks, preview[0])
@@ -110,10 +110,10 @@ def grid_of(
         full = np.where(lit > 0, full, np.float32(1))
     wide = np.flatnonzero(lit.mean(axis=0) > 0.5)
     left, right = (int(wide[0]), int(wide[-1])) if wide.size else (0, lit.shape[1] - 1)
-    return Grid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
+    return CellGrid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
 
 
-def view_of(preview: NDArray[np.float32], grid: Grid, index: int, angle: float, more_light: float) -> View:
+def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
     """A projection on the grid; `more_light`: its exposure over that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
     depth, weight = np.empty_like(counts), np.empty_like(counts)
@@ -123,10 +123,10 @@ def view_of(preview: NDArray[np.float32], grid: Grid, index: int, angle: float, 
     )
     left, right = depth[:, grid.left : grid.left + EDGE], depth[:, grid.right + 1 - EDGE : grid.right + 1]
     edges = float(np.median(left)), float(np.median(right))
-    return View(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
+    return CellView(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
 
 
-def light_left(view: View, last: View | None, grid: Grid) -> float:
+def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
     """Light in nine tenths of the places at most, over that of the last good view; before any, over the flats.
 
     A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.

@@ -17,10 +17,10 @@ from beamline.core.machine import machine_line
 from beamline.core.version import version
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
-from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
+from beamline.tradeoff.table import MEMORY, TIME, TrialCost, TrialTable
 from beamline.tradeoff.trials import Outcome
 from recon.assess.time_model import duration_text
 from recon.base.method import PRECISION
@@ -160,7 +160,7 @@ def to_csv(table: TrialTable) -> str:
     return out.getvalue()
 
 
-def write_figures(folder: Path, table: TrialTable, slices: Slices) -> None:
+def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
     """Write the pictures, as far as there are data for them, and the page; `slices` of each baseline, and the truth."""
     pictures = []
     for cost in (TIME, MEMORY):
@@ -187,7 +187,7 @@ def write_figures(folder: Path, table: TrialTable, slices: Slices) -> None:
     _write(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]))
 
 
-def _pareto(table: TrialTable, cost: Cost) -> bytes:
+def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
     points = zip(table.compared, table.costs(cost), table.qualities, strict=True)
     return pareto_plot(
         [(outcome.trial, value * cost.scale, quality) for outcome, value, quality in points],

@@ -13,7 +13,7 @@ from recon.base.method import PRECISION
 
 
 @dataclass(frozen=True)
-class Cost:
+class TrialCost:
     """A cost of a trial, and how a picture shows it.
 
     Attributes:
@@ -31,8 +31,8 @@ class Cost:
     of: Callable[[Outcome], float]
 
 
-TIME = Cost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds)
-MEMORY = Cost(
+TIME = TrialCost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds)
+MEMORY = TrialCost(
     "memory", "memory", "peak memory of the process (MB)", 1e-6,
     lambda outcome: math.nan if outcome.peak_bytes is None else float(outcome.peak_bytes),
 )  # fmt: skip
@@ -81,11 +81,11 @@ class TrialTable:
     def quality_name(self) -> str:
         return "PSNR" if self.by == "psnr" else "−20 log₁₀ of the held-out residual"
 
-    def costs(self, cost: Cost) -> list[float]:
+    def costs(self, cost: TrialCost) -> list[float]:
         """The cost of each trial in `compared`."""
         return [cost.of(outcome) for outcome in self.compared]
 
-    def front(self, cost: Cost) -> list[int]:
+    def front(self, cost: TrialCost) -> list[int]:
         """Positions in `compared` of the trials on the front of quality and `cost`.
 
         Costs are compared to 1 %: smaller differences between two trials are chance.

@@ -17,7 +17,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.xafs.contrast import Curve, Regions
+from beamline.xafs.contrast import ContrastRegions, XafsCurve
 from beamline.xafs.radiographs import Part, Radiographs, reals
 from beamline.xafs.series import Series
 
@@ -92,7 +92,7 @@ class FileOptions:
 
 
 @contextmanager
-def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
+def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve]:
     """The curve or the radiographs of a file, which is open within the context.
 
     Raises:
@@ -111,14 +111,14 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
         if isinstance(source, AbsorptionTable):
             if options.region or options.around:
                 raise ConfigError(f"{path} has no frames, so that regions do not apply. Nothing was written.")
-            yield Curve(energies, source.absorption[kept], unit="as in the file")
+            yield XafsCurve(energies, source.absorption[kept], unit="as in the file")
             return
         inside = _mask(source.shape, options.region or (0, source.shape[0], 0, source.shape[1]))
         around = None if options.around is None else _mask(source.shape, options.around) & ~inside
         if around is not None and not around.any():
             raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
         part = _bounds(inside if around is None else inside | around)
-        regions = Regions(inside[part], None if around is None else around[part])
+        regions = ContrastRegions(inside[part], None if around is None else around[part])
         yield Series(path.name, kept.size, source.line_integrals(kept.tolist(), part), regions)
 
 

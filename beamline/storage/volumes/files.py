@@ -16,12 +16,12 @@ from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_rec
 from beamline.storage.volumes.nxtomoproc import NXtomoproc
 from beamline.storage.volumes.ome_zarr import OmeZarr
 from beamline.storage.volumes.plain import Npy, Nrrd
-from beamline.storage.volumes.tiff import TiffFile, TiffFolder
+from beamline.storage.volumes.tiff import TiffFolderVolume, TiffVolume
 from beamline.storage.writers.recon_file import ReconRecord
 
 _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 
-FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffFile(), TiffFolder(), Npy(), Nrrd(), OmeZarr())
+FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffVolume(), TiffFolderVolume(), Npy(), Nrrd(), OmeZarr())
 """Every format that volumes are written in."""
 
 

@@ -10,10 +10,10 @@ import pytest
 from beamline.config.load import config_folder, load, resolved_yaml, schema
 from beamline.config.monitor import configured_checks, policies
 from beamline.core.errors import ConfigError
-from beamline.monitor.beam import Beam
+from beamline.monitor.beam import BeamCheck
 from beamline.monitor.check import Policy
 from beamline.monitor.checks import CHECKS
-from beamline.monitor.mass import Mass
+from beamline.monitor.mass import MassCheck
 
 
 @pytest.mark.parametrize("name", ["demo", "simulated", "instrument"])
@@ -23,7 +23,7 @@ def test_the_shipped_files_have_the_defaults_of_the_checks(name: str) -> None:
 
 def test_limits_reach_their_check_and_no_other() -> None:
     words = ["monitor.beam.drift=0.08", "monitor.mass={frames: 5}"]
-    changed = {"beam": Beam(drift=0.08), "mass": Mass(frames=5)}
+    changed = {"beam": BeamCheck(drift=0.08), "mass": MassCheck(frames=5)}
     expected = [changed.get(check.name, check) for check in CHECKS]
     assert list(configured_checks(load(config_folder() / "demo.yaml", words, {}).monitor)) == expected
 

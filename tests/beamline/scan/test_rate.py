@@ -19,7 +19,7 @@ from drivers.frame import Frame, FrameKind
 LOAD = Load((24, 40), preview_bin=4, flush_every=16)
 
 
-def measured(folder: Path, rounds: int = 2) -> list[rate.Taken]:
+def measured(folder: Path, rounds: int = 2) -> list[rate.StageRun]:
     return list(rates(LOAD, folder, SystemClock(), 1e-3, rounds, lambda n, of, stage: None))
 
 

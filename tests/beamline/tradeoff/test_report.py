@@ -13,7 +13,7 @@ import pytest
 
 from beamline.core.machine import machine
 from beamline.report.html import Picture
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff.report import conclusions, finite, text, to_csv, to_html, write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Trial, plan
@@ -104,11 +104,11 @@ def test_the_page_has_every_part_and_requests_nothing() -> None:
 
 
 def test_pictures_are_of_what_there_is(tmp_path: Path) -> None:
-    write_figures(tmp_path, _table(Outcome(BASE, "failed")), Slices())
+    write_figures(tmp_path, _table(Outcome(BASE, "failed")), SliceSheet())
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html"}
     curve = ((0.1, 3.0), (0.2, 4.0))
     write_figures(
-        tmp_path, _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")), Slices()
+        tmp_path, _table(replace(_done(BASE, 2.0, 20.0, memory=None), curve=curve, curve_of="views used")), SliceSheet()
     )
     assert {path.name for path in tmp_path.iterdir()} == {"tradeoff.html", "quality_seconds.png", "curves.png"}
 
