@@ -26,11 +26,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from beamline.monitor.view import PixelBox
     from beamline.xafs.contrast import XafsCurve
     from beamline.xafs.results import XafsResult
     from beamline.xafs.series import Series, SeriesResult
-
-Box = tuple[int, int, int, int]
 
 MOST = 5000
 _SCENES = (".yaml", ".yml", "")
@@ -39,7 +38,7 @@ _OF_FILES = ("region", "around", "unit", "quantity")
 _BOX = "ROW:END,COL:END"
 
 
-def box(ctx: click.Context, param: click.Parameter, value: str | None) -> Box | None:
+def box(ctx: click.Context, param: click.Parameter, value: str | None) -> PixelBox | None:
     """`first:end,first:end` of rows and columns."""
     if value is None:
         return None
@@ -86,8 +85,8 @@ def xafs(
     material: str | None,
     angle: float | None,
     seed: int | None,
-    region: Box | None,
-    around: Box | None,
+    region: PixelBox | None,
+    around: PixelBox | None,
     unit: str | None,
     quantity: str | None,
     output: Path | None,

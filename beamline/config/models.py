@@ -85,7 +85,7 @@ class FileAngles(Section):
     """Relative to the configuration file."""
 
 
-Angles = Annotated[
+AnglesSection = Annotated[
     FixedAngles | SectorAngles | RandomAngles | InterlacedAngles | GoldenAngles | FileAngles,
     Field(discriminator="scheme"),
 ]
@@ -104,7 +104,7 @@ class Fields(Section):
 
 class ScanSection(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
-    angles: Angles
+    angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds
     """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""

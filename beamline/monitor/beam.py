@@ -20,7 +20,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light, more_light
 from beamline.monitor.scatter import FrameScatter
-from beamline.monitor.view import CellGrid, Cells, CellView
+from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.frame import Frame, FrameKind
 
 PLACES = (4, 16)  # parts of the field, down and across, the brightest of which is air
@@ -159,7 +159,7 @@ def _air(view: CellView, grid: CellGrid) -> float:
     return float(means.min()) if means.size else 0.0
 
 
-def _places(image: Cells, down: int, across: int) -> Cells:
+def _places(image: CellValues, down: int, across: int) -> CellValues:
     """Sums over a grid of places."""
     rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)

@@ -20,7 +20,7 @@ from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter
-from beamline.monitor.view import Cells
+from beamline.monitor.view import CellValues
 from drivers.frame import Frame, FrameKind
 
 PIXELS = 2**16  # of a frame that are looked at, about
@@ -49,8 +49,8 @@ class BlurState:
 
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
-    dark: Cells | None = None
-    flat: Cells | None = None
+    dark: CellValues | None = None
+    flat: CellValues | None = None
     across: FrameScatter = field(default_factory=FrameScatter)
     down: FrameScatter = field(default_factory=FrameScatter)
     first: tuple[FrameScatter, FrameScatter] | None = None
@@ -122,7 +122,7 @@ class BlurCheck:
         return Look(replace(state, said=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
 
 
-def sharpness(lines: NDArray[Any], dark: Cells | None, flat: Cells | None) -> tuple[float, float]:
+def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
     """Fine contrast over coarse, along the rows and along the columns; NaN where there is none.
 
     Args:
@@ -164,7 +164,7 @@ def _with_reference(state: BlurState, frame: Frame) -> BlurState:
     return state
 
 
-def _mean(so_far: Cells | None, lines: Cells, n: int) -> Cells:
+def _mean(so_far: CellValues | None, lines: CellValues, n: int) -> CellValues:
     return lines if so_far is None or n == 1 else so_far + (lines - so_far) / np.float32(n)
 
 

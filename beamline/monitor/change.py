@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from beamline.core.jit import njit
-from beamline.monitor.view import CellGrid, Cells, CellView
+from beamline.monitor.view import CellGrid, CellValues, CellView
 
 SPAN = 4  # views before, of which the velocity is the mean of three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
@@ -43,7 +43,7 @@ class SampleChange:
     across: float
     down: float
     turn: float
-    residual: Cells
+    residual: CellValues
     noise: float
     causes: Causes | None = None
 
@@ -79,13 +79,13 @@ class Causes:
         cell: pixels a side.
     """
 
-    image: Cells
-    turning: Cells
-    weight: Cells
+    image: CellValues
+    turning: CellValues
+    weight: CellValues
     steps: float
     cell: int
 
-    def basis(self) -> Cells:
+    def basis(self) -> CellValues:
         """[cause, row, col]: what a pixel across, a pixel down and a turn of a step change."""
         down, across = np.gradient(self.image)
         return np.stack([-across / self.cell, -down / self.cell, self.turning * np.float32(self.steps)])

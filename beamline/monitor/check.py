@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.spots import NO_SPOTS, Spots
-from beamline.monitor.view import CellGrid, Cells, CellView, Region
+from beamline.monitor.view import CellGrid, CellValues, CellView, PixelBox
 from drivers.frame import Frame
 
 State = TypeVar("State")
@@ -61,7 +61,7 @@ class Flag:
     score: float
     limit: float
     advice: str
-    region: Region | None = None
+    region: PixelBox | None = None
     first: int | None = None
 
     @property
@@ -107,7 +107,7 @@ class ScanContext:
     stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None
-    model: Callable[[float, int], Cells] | None = None
+    model: Callable[[float, int], CellValues] | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan

@@ -21,7 +21,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
-from beamline.monitor.view import CellGrid, Cells, CellView
+from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.frame import Frame
 
 LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
@@ -62,12 +62,12 @@ class FloaterState:
 
     raw: tuple[CellView, ...] = ()
     indices: tuple[int, ...] = ()
-    depths: tuple[Cells, ...] = ()
+    depths: tuple[CellValues, ...] = ()
     filters: Filters | None = None
     step: float = math.nan
     rim: float = math.nan
     light: float = 1.0
-    usual: Cells | None = None
+    usual: CellValues | None = None
     peaks: Peaks = field(default_factory=no_peaks)
 
 
@@ -159,7 +159,7 @@ def _designed(rim: float, noise: float) -> Filters:
     return filters(LAGS, Clutter(MARGIN * rim, STRUCTURE, COMMON, noise**2), signals, speeds)
 
 
-def _smooth(depth: Cells) -> Cells:
+def _smooth(depth: CellValues) -> CellValues:
     """Matched along the columns to SIZE; white noise keeps its variance."""
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / SIZE) ** 2)
     return scipy.ndimage.convolve1d(

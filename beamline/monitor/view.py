@@ -23,8 +23,8 @@ EDGE = 2  # cells at either edge that say whether the sample ends within the fie
 SEEN = 0.02  # transmission from which a place shows whether the beam is there
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
 
-Cells = NDArray[np.float32]
-Region = tuple[int, int, int, int]
+CellValues = NDArray[np.float32]
+PixelBox = tuple[int, int, int, int]
 """Pixels of a frame: (first row, row after the last, first column, column after the last)."""
 
 
@@ -45,12 +45,12 @@ class CellGrid:
 
     cell: int
     blocks: int
-    dark: Cells
-    full: Cells
-    lit: Cells
+    dark: CellValues
+    full: CellValues
+    lit: CellValues
     flats: bool
-    row_dark: Cells
-    col_dark: Cells
+    row_dark: CellValues
+    col_dark: CellValues
     left: int
     right: int
 
@@ -58,7 +58,7 @@ class CellGrid:
     def shape(self) -> tuple[int, int]:
         return self.full.shape
 
-    def region(self, row: float, col: float, height: float, width: float) -> Region:
+    def region(self, row: float, col: float, height: float, width: float) -> PixelBox:
         """Pixels of a box of cells around a place, within the grid."""
         rows, cols = self.shape
         top, left = max(0, math.floor(row + 0.5 - height / 2)), max(0, math.floor(col + 0.5 - width / 2))
@@ -83,10 +83,10 @@ class CellView:
 
     index: int
     angle: float
-    depth: Cells
-    weight: Cells
-    rows: Cells
-    cols: Cells
+    depth: CellValues
+    weight: CellValues
+    rows: CellValues
+    cols: CellValues
     edges: tuple[float, float]
     brighter: float = 0.0
 
@@ -147,13 +147,13 @@ def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
     return math.exp(float(np.percentile((last.depth - view.depth)[seen][::3], BRIGHT)))
 
 
-def cell_noise(depth: Cells, weight: Cells) -> float:
+def cell_noise(depth: CellValues, weight: CellValues) -> float:
     """Standard deviation of a cell of weight 1: from third differences along the columns, which edges move little."""
     third = np.diff(depth, 3, axis=1) * np.sqrt(weight[:, 1:-2])
     return 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
 
 
-def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[Cells, Cells, Cells]:
+def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, CellValues, CellValues]:
     """Means of the cells, and of each preview row and column."""
     rows, cols = preview.shape
     cells = np.zeros((rows // blocks, cols // blocks), np.float32)

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
+from beamline.monitor.view import PixelBox
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.xafs.contrast import ContrastRegions, XafsCurve
-from beamline.xafs.radiographs import Part, Radiographs, reals
+from beamline.xafs.radiographs import FramePart, Radiographs, reals
 from beamline.xafs.series import Series
 
 Reals = NDArray[np.float64]
-Box = tuple[int, int, int, int]
 
 EV_BEYOND, KEV_BELOW = 500.0, 0.05
 """keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
@@ -85,8 +85,8 @@ class FileOptions:
 
     low: float = 0.0
     high: float = np.inf
-    region: Box | None = None
-    around: Box | None = None
+    region: PixelBox | None = None
+    around: PixelBox | None = None
     unit: str | None = None
     quantity: str | None = None
 
@@ -122,13 +122,13 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve
         yield Series(path.name, kept.size, source.line_integrals(kept.tolist(), part), regions)
 
 
-def _bounds(mask: NDArray[np.bool_]) -> Part:
+def _bounds(mask: NDArray[np.bool_]) -> FramePart:
     """The rows and columns of the mask and its neighbouring pixels: no more of a frame is read."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
 
 
-def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
+def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
     if box[1] > shape[0] or box[3] > shape[1]:
         raise ConfigError(
             f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is not in frames of {shape[0]} x {shape[1]} pixels. "

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
-class Phase:
+class MotionPhase:
     """Constant acceleration for a while. Times are s after the move began; the rest is in the unit of the position."""
 
     begin: float
@@ -38,7 +38,7 @@ class TrapezoidMove:
     begin: float
     start: float
     target: float
-    phases: tuple[Phase, ...]
+    phases: tuple[MotionPhase, ...]
 
     @classmethod
     def between(cls, start: float, target: float, speed: float, acceleration: float, begin: float) -> TrapezoidMove:
@@ -53,9 +53,9 @@ class TrapezoidMove:
         peak = min(speed, math.sqrt(distance * acceleration))
         ramp = peak / acceleration
         cruise = max(0.0, distance / peak - ramp) if peak > 0 else 0.0
-        up = Phase(0.0, ramp, start, 0.0, sign * acceleration)
-        flat = Phase(ramp, cruise, start + sign * 0.5 * peak * ramp, sign * peak, 0.0)
-        down = Phase(flat.end, ramp, target - sign * 0.5 * peak * ramp, sign * peak, -sign * acceleration)
+        up = MotionPhase(0.0, ramp, start, 0.0, sign * acceleration)
+        flat = MotionPhase(ramp, cruise, start + sign * 0.5 * peak * ramp, sign * peak, 0.0)
+        down = MotionPhase(flat.end, ramp, target - sign * 0.5 * peak * ramp, sign * peak, -sign * acceleration)
         return cls(begin, start, target, tuple(phase for phase in (up, flat, down) if phase.duration > 0))
 
     @property
@@ -110,7 +110,7 @@ class TrapezoidMove:
         seconds = abs(velocity) / acceleration
         if seconds == 0:
             return TrapezoidMove(self.begin, self.start, here, past)
-        slow = Phase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
+        slow = MotionPhase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
         return TrapezoidMove(self.begin, self.start, slow.position_after(seconds), (*past, slow))
 
     def halted(self, position: float) -> TrapezoidMove:
@@ -121,13 +121,13 @@ class TrapezoidMove:
         """
         return TrapezoidMove(self.begin, self.start, position, self._until(self.time_at(position)))
 
-    def _phase(self, time: float) -> Phase | None:
+    def _phase(self, time: float) -> MotionPhase | None:
         """The phase at `time`; None while it stands: before, and from `end` on as that number is rounded."""
         if not self.begin <= time < self.end:
             return None
         return next((phase for phase in self.phases if time - self.begin < phase.end), None)
 
-    def _until(self, time: float) -> tuple[Phase, ...]:
+    def _until(self, time: float) -> tuple[MotionPhase, ...]:
         seconds = time - self.begin
         return tuple(
             replace(phase, duration=min(phase.end, seconds) - phase.begin)
@@ -136,7 +136,7 @@ class TrapezoidMove:
         )
 
 
-def _seconds_for(distance: float, phase: Phase, sign: int) -> float:
+def _seconds_for(distance: float, phase: MotionPhase, sign: int) -> float:
     """Time to cover `distance` ahead in a phase: the root of d = vt + at²/2 in the form that does not cancel."""
     velocity, acceleration = sign * phase.velocity, sign * phase.acceleration
     root = math.sqrt(max(velocity * velocity + 2.0 * acceleration * distance, 0.0))

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from beamline.monitor.check import Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
+from beamline.monitor.view import PixelBox
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
 
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
 MARGIN = 0.25  # of the region's shorter side, on all sides
 
 Mask = NDArray[np.bool_]
-Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,9 @@ def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
     return flags.flagged & ~whole
 
 
-def boxes_of(flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]) -> Iterator[tuple[int, Box | None]]:
+def boxes_of(
+    flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
+) -> Iterator[tuple[int, PixelBox | None]]:
     """Frames that a check flagged, each with its region and a margin; None: the whole view, or most of it.
 
     A view that a check marked when it had seen later ones has no region in the file: it takes the one that these lead

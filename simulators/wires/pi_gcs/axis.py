@@ -13,7 +13,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from simulators.devices.motion import Phase, TrapezoidMove
+from simulators.devices.motion import MotionPhase, TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.output import Firmware, Output, WiredOutput
 from simulators.wires.pi_gcs.trigger import FirstPulse
@@ -266,8 +266,8 @@ def profile(start: int, target: int, speed: float, up: float, down: float, begin
     rise, fall = peak / up, peak / down
     cruise = max(0.0, (distance - peak * (rise + fall) / 2) / peak)
     phases = (
-        Phase(0.0, rise, start, 0.0, sign * up),
-        Phase(rise, cruise, start + sign * peak * rise / 2, sign * peak, 0.0),
-        Phase(rise + cruise, fall, target - sign * peak * fall / 2, sign * peak, -sign * down),
+        MotionPhase(0.0, rise, start, 0.0, sign * up),
+        MotionPhase(rise, cruise, start + sign * peak * rise / 2, sign * peak, 0.0),
+        MotionPhase(rise + cruise, fall, target - sign * peak * fall / 2, sign * peak, -sign * down),
     )
     return TrapezoidMove(begin, start, target, tuple(phase for phase in phases if phase.duration > 0))
