@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.scan import rate
-from beamline.scan.rate import FEWEST, REFERENCES, RING, STAGES, Load, rates, summary
+from beamline.doctor import rate
+from beamline.doctor.rate import FEWEST, REFERENCES, RING, STAGES, Load, rates, summary
 from beamline.scan.recorder import Recorder
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
