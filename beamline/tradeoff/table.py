@@ -9,7 +9,6 @@ from typing import Any
 
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
-from recon.base.method import PRECISION
 
 
 @dataclass(frozen=True)
@@ -70,7 +69,7 @@ class TrialTable:
     @property
     def compared(self) -> tuple[Outcome, ...]:
         """The trials that reconstructed the scan successfully."""
-        return tuple(o for o in self.outcomes if o.status == "done" and o.trial.group != PRECISION)
+        return tuple(o for o in self.outcomes if o.status == "done")
 
     @property
     def qualities(self) -> list[float]:
@@ -104,5 +103,4 @@ class TrialTable:
             "quality_db": outcome.quality(self.by),
             "message": outcome.message,
             **outcome.metrics,
-            **outcome.details,
         }

@@ -21,9 +21,6 @@ F32 = NDArray[np.float32]
 Depth = Literal["quick", "full"]
 Plain = str | int | float
 
-PRECISION = "precision"
-"""`TrialSettings.varies` of a comparison of float32 kernels with the float64 reference implementation."""
-
 
 @dataclass(frozen=True)
 class Progress:
@@ -157,7 +154,7 @@ class TrialSettings:
     """One way in which a trade-off tries a method.
 
     Attributes:
-        varies: the group of the trial: "method" for the baseline, else what differs from it, or `PRECISION`.
+        varies: the group of the trial: "method" for the baseline, else what differs from it.
         settings: that differ from the defaults, by name as `recon.methods.build` takes them.
         binning: of detector pixels.
     """

@@ -11,7 +11,7 @@ from typing import ClassVar, Self, get_args
 from recon.assess.plans import PRESETS, Quality
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.method import PRECISION, Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import Depth, MethodResult, Plain, ReconProblem, RunControl, Traits, TrialSettings
 from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
@@ -134,7 +134,7 @@ class R2:
         found.append(TrialSettings("start", base | {"start": "tv"}))
         found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
         found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
-        return [*found, TrialSettings(PRECISION)]
+        return found
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or default_count(grid)
