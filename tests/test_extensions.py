@@ -131,7 +131,7 @@ class Dummy:
         return Look(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
 '''
     },
-    (("beamline/monitor/checks.py", '    "dark": "Dark",', '    "dummy": "Dummy",'),),
+    (("beamline/monitor/checks.py", '    "dark": "DarkCheck",', '    "dummy": "Dummy",'),),
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
@@ -210,11 +210,11 @@ READER = Extension(
         "beamline/storage/readers/npy_stack.py": """
 import numpy as np
 
-from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
+from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
 from drivers.frame import FrameKind
 
 
-class NpyStack(ScanReader):
+class NpyStack(BaseSource):
     format = "npy_stack"
 
     def __init__(self, path):
@@ -231,7 +231,7 @@ class NpyStack(ScanReader):
         pass
 
 
-FORMAT = Format("an .npy stack", lambda path, opening: path.suffix == ".npy", lambda path, opening: NpyStack(path))
+FORMAT = ScanFormat("an .npy stack", lambda path, opening: path.suffix == ".npy", lambda path, opening: NpyStack(path))
 """
     },
     (

@@ -86,7 +86,7 @@ class Instrument:
         last: result of the newest scan, also of one that raised; None before the first, and where it took no frame.
     """
 
-    def __init__(self, config: Config, connected: devices.Instrument, tell: Tell | None = to_stderr) -> None:
+    def __init__(self, config: Config, connected: devices.ConnectedDevices, tell: Tell | None = to_stderr) -> None:
         self.config = config
         self.last: ScanResult | None = None
         self._devices, self._tell = connected, tell

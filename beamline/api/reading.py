@@ -18,7 +18,7 @@ from beamline.core.files import parts_of
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
-from beamline.projections.replay import Verdict, frames_of, replay, verdict
+from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
 from beamline.scan.run_folder import SCAN
 from beamline.scan.runs import describe
 from beamline.scan.states import State
@@ -44,7 +44,7 @@ def scan_file(path: str | Path) -> Path:
 
 def monitor(
     path: str | Path, *, config: str | Path | None = None, set: Mapping[str, object] | None = None, follow: bool = False
-) -> Verdict:
+) -> ScanVerdict:
     """What the checks of the monitor say of every frame of a scan of any format, as `beamline monitor` prints it.
 
     Args:

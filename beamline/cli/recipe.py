@@ -19,7 +19,7 @@ from beamline.core.files import SETTINGS, require_regular, text_in
 
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
-    "output", "as_json", "report", "pdf", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
+    "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
     "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats", "preset",
 )  # fmt: skip
 """Options that are of one scan or one call, not of a recipe; a preset is in the name of the method."""
@@ -169,5 +169,5 @@ def _text(path: Path) -> str:
 
     with opened_reconstruction(path) as record:
         if "recipe" not in record.parameters:
-            raise click.BadParameter(f"{path} holds no recipe; an older version wrote it")
+            raise click.BadParameter(f"{path} holds no recipe; expected a volume that `beamline recon` wrote")
         return str(record.parameters["recipe"])

@@ -138,8 +138,12 @@ _SHEET = ".png"
     help=f"Output: {suffixes_text()}; of --axis try a .png. "
     "Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
 )
-@click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
-@click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")
+@click.option(
+    "--report/--no-report",
+    default=True,
+    show_default=True,
+    help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
+)
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
 @click.option(
     "--earlier",
@@ -214,7 +218,6 @@ def recon(
     truth: str | None,
     output: Path | None,
     report: bool,
-    pdf: bool,
     follow: bool,
     earlier: tuple[Path, ...],
     enough_loss: float | None,
@@ -272,8 +275,7 @@ def recon(
         raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
-    sheet = output.with_suffix(".pdf") if pdf else None
-    files = {"FILE": file, "--output": output, "report": page, "--pdf": sheet, "--checkpoint": checkpoint}
+    files = {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint}
     refuse_shared({**files, "--resume": resume, "--log": log})
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
     if cluster is not None and (follow or budget is not None):
@@ -292,7 +294,7 @@ def recon(
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=replace(source, earlier=earlier),
-        target=OutputPaths(output, page, pdf=sheet),
+        target=OutputPaths(output, page),
         selection=selection,
         method=method_with(method, {**settings, "filter": ramp, "any_setting": any_setting}),
         budget=budget,

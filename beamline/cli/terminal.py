@@ -239,7 +239,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 def results(data: Mapping[str, Any]) -> str:
     """The result of a reconstruction, from its `done` event: files, grid, then a table of metrics by method."""
     lines = [f"{'output':<10}{data['output']}"]
-    lines += [f"{name:<10}{data[name]}" for name in ("report", "pdf") if data.get(name)]
+    lines += [f"{'report':<10}{data['report']}"] if data.get("report") else []
     lines.append(f"{'volume':<10}{' x '.join(str(n) for n in data['shape'])} in {data['units']}")
     lines.append(f"{'axis_col':<10}{data['axis_col']:.2f}")
     for name, key in (("chosen", "chosen"), ("next dB", "next_db_said")):

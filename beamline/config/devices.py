@@ -159,14 +159,14 @@ def _is_a_page(url: str) -> str:
 
 
 Pattern = Annotated[str, AfterValidator(_finds_a_number)]
-Scale = Annotated[float, Field(gt=0)]
+PositiveScale = Annotated[float, Field(gt=0)]
 
 
 class _BeamMonitor(Section):
     """What every beam monitor has."""
 
     unit: str
-    scale: Scale = 1.0
+    scale: PositiveScale = 1.0
     """What the number is multiplied by to be in `unit`."""
     timeout_s: PositiveFloat = 2.0
     period_s: PositiveFloat = 1.0

@@ -12,7 +12,7 @@ from beamline.scan.recorder import WAITING_BYTES, WAITING_FRAMES
 
 
 @dataclass(frozen=True)
-class Needs:
+class ScanNeeds:
     """The disk and memory that a scan needs.
 
     Attributes:
@@ -45,7 +45,7 @@ class Needs:
         return most
 
 
-def needs(worked: DryRun, ring_bytes: int) -> Needs:
+def needs(worked: DryRun, ring_bytes: int) -> ScanNeeds:
     """The needs of a planned scan.
 
     Args:
@@ -53,7 +53,7 @@ def needs(worked: DryRun, ring_bytes: int) -> Needs:
     """
     timeline = worked.timeline
     per_row = timeline.total_bytes // timeline.n_frames
-    return Needs(
+    return ScanNeeds(
         stretches=tuple((block.n * per_row, block.n * block.period) for block in timeline.blocks),
         waiting_bytes=waiting_frames(timeline.frame_bytes) * timeline.frame_bytes,
         ring_bytes=ring_bytes,

@@ -18,7 +18,7 @@ from beamline.core.errors import ConfigError
 from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.instrument.cameras import make_camera, wait_until_cold
 from beamline.instrument.operator import ask_operator
-from beamline.instrument.simulated import Simulated, clock_of, scene_of, simulated_devices
+from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_devices
 from drivers.clock import Clock, SystemClock
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualSampleMover, ManualShutter
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Instrument:
+class ConnectedDevices:
     """Connected devices and what goes with them; leaving a `with` block closes them.
 
     Attributes:
@@ -54,7 +54,7 @@ class Instrument:
 
     devices: Devices
     clock: Clock
-    simulated: Simulated | None
+    simulated: SimulatedScene | None
     close: Callable[[], None]
     beam_monitor: BeamMonitor | None = None
     frame_memory: FrameMemory | None = None
@@ -73,7 +73,7 @@ class Instrument:
 
 def connect(
     config: Config, clock: Clock | None = None, ask: Ask | None = None, check_stop: Callable[[], None] = lambda: None
-) -> Instrument:
+) -> ConnectedDevices:
     """Open every device that the configuration names. Nothing moves.
 
     Args:
@@ -96,7 +96,7 @@ def connect(
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        return Instrument(devices, clock, simulated, opened.pop_all().close, monitor, memory)
+        return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory)
 
 
 @contextmanager

@@ -15,10 +15,10 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.change import Change
+from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.spots import NO_SPOTS, Spots
-from beamline.monitor.view import Cells, Grid, Region, View
+from beamline.monitor.view import CellGrid, CellValues, CellView, PixelBox
 from drivers.frame import Frame
 
 State = TypeVar("State")
@@ -61,7 +61,7 @@ class Flag:
     score: float
     limit: float
     advice: str
-    region: Region | None = None
+    region: PixelBox | None = None
     first: int | None = None
 
     @property
@@ -107,17 +107,17 @@ class ScanContext:
     stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None
-    model: Callable[[float, int], Cells] | None = None
+    model: Callable[[float, int], CellValues] | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan
-    grid: Grid | None = None
+    grid: CellGrid | None = None
     spots: Spots = NO_SPOTS
     follows: bool = True
     light_left: float = 1.0
-    view: View | None = None
+    view: CellView | None = None
     truncated: bool = False
-    change: Change | None = None
+    change: SampleChange | None = None
 
 
 @dataclass(frozen=True, eq=False)

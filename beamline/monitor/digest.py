@@ -100,8 +100,8 @@ def checksum_of(image: NDArray[Any]) -> int:
 
 
 def has_checksum(image: NDArray[Any], stored: int) -> bool:
-    """Whether this is its checksum, or that of its bytes swapped: `ingest` wrote such of big-endian frames."""
-    return stored == checksum_of(image) or stored == checksum_of(image.byteswap())
+    """Whether this is its checksum."""
+    return stored == checksum_of(image)
 
 
 Numbers = tuple[float, float, float, float, float, float, float, float]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.jit import njit
-from beamline.monitor.view import Cells
+from beamline.monitor.view import CellValues
 
 Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
@@ -75,7 +75,7 @@ class Filters:
         speeds: float64 [signal], cells a view.
     """
 
-    weights: Cells
+    weights: CellValues
     strength: Reals
     speeds: Reals
 

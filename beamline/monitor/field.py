@@ -12,7 +12,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import BRIGHT, UNLIT, Grid, View
+from beamline.monitor.view import BRIGHT, UNLIT, CellGrid, CellView
 from drivers.frame import Frame, FrameKind
 
 LASTS = 5  # views in a row with matter at an edge
@@ -30,7 +30,7 @@ class FieldState:
 
 
 @dataclass(frozen=True)
-class FieldOfView:
+class FieldOfViewCheck:
     """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
 
     The defaults: a line integral of 0.1 at the edges is a tenth of what a sample has in its middle, and more than phase
@@ -87,7 +87,7 @@ class FieldOfView:
         )
         return Flag(self.name, Level.WARN, frame.index, share, self.unlit, advice, region)
 
-    def _cut(self, row: int, view: View, grid: Grid) -> Flag:
+    def _cut(self, row: int, view: CellView, grid: CellGrid) -> Flag:
         left, right = view.edges
         sides = " and ".join(side for side, depth in (("left", left), ("right", right)) if depth > self.edge)
         advice = (

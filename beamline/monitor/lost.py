@@ -18,7 +18,7 @@ class LostState:
 
 
 @dataclass(frozen=True)
-class Lost:
+class LostCheck:
     """Score: share of the light that is gone from nine tenths of the frame, against the last view with light.
 
     The default: half of the light goes neither by drift nor by the decay of a ring's current between two top-ups, and

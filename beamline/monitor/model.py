@@ -17,7 +17,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import Cells, cell_noise
+from beamline.monitor.view import CellValues, cell_noise
 from drivers.frame import Frame
 
 BROAD = 3  # cells a side, over which a difference is averaged
@@ -32,11 +32,11 @@ class ModelState:
     """Views so far, and the usual square of the difference at each cell, None before the first."""
 
     views: int = 0
-    usual: Cells | None = None
+    usual: CellValues | None = None
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelCheck:
     """Score: largest difference from the volume, in standard deviations of what it usually is at its place.
 
     The default: a frame has up to 18,000 cells, of which noise takes one beyond 5 standard deviations in 100 views;

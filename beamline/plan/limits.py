@@ -19,7 +19,7 @@ MARGIN = 1.01
 
 
 @dataclass(frozen=True, eq=False)
-class Facts:
+class PlanFacts:
     """A plan with its computed speeds, times and sizes, which the checks look at."""
 
     plan: ScanPlan
@@ -37,7 +37,7 @@ class Facts:
     free_bytes: int | None
 
 
-def violations(facts: Facts) -> Iterator[str]:
+def violations(facts: PlanFacts) -> Iterator[str]:
     """One sentence for each broken limit."""
     plan = facts.plan
     if plan.mode is Mode.FLY:
@@ -65,7 +65,7 @@ def violations(facts: Facts) -> Iterator[str]:
         )
 
 
-def remarks(facts: Facts) -> Iterator[str]:
+def remarks(facts: PlanFacts) -> Iterator[str]:
     """One sentence for each thing worth knowing."""
     plan, camera = facts.plan, facts.camera
     yield from _rounding(facts)
@@ -106,7 +106,7 @@ def remarks(facts: Facts) -> Iterator[str]:
     yield from _reference("darks", plan.darks, plan.exposure, "their hot pixels and dark current are not the views'")
 
 
-def _timing(facts: Facts) -> Iterator[str]:
+def _timing(facts: PlanFacts) -> Iterator[str]:
     plan, camera, period = facts.plan, facts.camera, facts.views.period
     if plan.exposure > period:
         yield (
@@ -122,7 +122,7 @@ def _timing(facts: Facts) -> Iterator[str]:
         )
 
 
-def _speed(facts: Facts) -> Iterator[str]:
+def _speed(facts: PlanFacts) -> Iterator[str]:
     if facts.flight and facts.flight.interval / facts.plan.period < 0.5:
         slowest = facts.flight.interval
         yield (
@@ -155,7 +155,7 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
         )
 
 
-def _limits(facts: Facts) -> Iterator[str]:
+def _limits(facts: PlanFacts) -> Iterator[str]:
     low, high = facts.reach
     slack = math.pi / facts.stage.counts_per_turn
     if low < facts.stage.low - slack or high > facts.stage.high + slack:
@@ -167,7 +167,7 @@ def _limits(facts: Facts) -> Iterator[str]:
         )
 
 
-def _rounding(facts: Facts) -> Iterator[str]:
+def _rounding(facts: PlanFacts) -> Iterator[str]:
     flight, stage = facts.flight, facts.stage
     if flight is None or flight.drift <= 1.01 * math.pi / stage.counts_per_turn:
         return

@@ -70,7 +70,7 @@ def fit_within(
         sweep = first_sweep_seconds(geometry.straightened(), grid, clock.now)
     spent = clock.now() - started[0]
     busy = min(max(spent / max(time.process_time() - started[1], 1e-3), 1.0), _BUSIEST)
-    pages = target.report is not None or target.pdf is not None
+    pages = target.report is not None
     after = busy * (_REPORT * pages + 4 * math.prod(grid.shape) / _BYTES)
     measuring = _FORWARD * sweep * residual_share(geometry, grid, prepared.held_out)
     left, least = method.seconds - spent - measuring - after, _LEAST * sweep

@@ -22,7 +22,6 @@ from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.reconstruct.remarks import hiding_warning, lost_mass_warning, odd_views_warning
 from beamline.report.html import write_report
-from beamline.report.logbook import write_logbook
 from beamline.report.record import history_arrays
 from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
@@ -47,14 +46,12 @@ def report_beside(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where results go. `report` and `pdf` (a logbook page) are None where none is wanted; `replace` takes the place of
-    older results. `take` gets the result before the file `output` is written. Where that is not to be `written`, its
-    folder is only worked in."""
+    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results. `take` gets
+    the result before the file `output` is written. Where that is not to be `written`, its folder is only worked in."""
 
     output: Path
     report: Path | None
     replace: bool = False
-    pdf: Path | None = None
     take: Callable[[ReconRecord], None] = lambda record: None
     written: bool = True
 
@@ -79,7 +76,7 @@ class OutputPaths:
     def refuse_existing(self) -> None:
         """Raise DataError before any work where a result is in the way, or its folder cannot be written to."""
         if not self.replace:
-            for path in (self.output, self.report, self.pdf):
+            for path in (self.output, self.report):
                 if path is not None:
                     refuse_existing(path)
         try:
@@ -197,16 +194,12 @@ def write_result(
         history=history_arrays(made.history),
         model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
     )
-    pages: list[Path] = []
+    page: Path | None = None
     try:
-        if target.report is not None or target.pdf is not None:
-            page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
         if target.report is not None:
-            write_report(target.report, page, replace=target.replace)
-            pages.append(target.report)
-        if target.pdf is not None:
-            write_logbook(target.pdf, page, record.volume, prepared.length_unit, clock.now(), replace=target.replace)
-            pages.append(target.pdf)
+            report = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
+            write_report(target.report, report, replace=target.replace)
+            page = target.report
         phases.enter("writing the volume")
         target.take(record)
         if partial_volume is not None:
@@ -214,14 +207,13 @@ def write_result(
         elif target.written:
             write_volume(target.output, record, replace=target.replace)
     except BaseException:
-        for written in pages:
-            remove(written)
+        if page is not None:
+            remove(page)
         raise
     phases.end()
     summary: dict[str, Any] = {
         "output": target.output,
         "report": target.report,
-        **({} if target.pdf is None else {"pdf": target.pdf}),
         "method": made.method,
         "axis_col": prepared.axis_col,
         "n_views": prepared.geometry.n_views,

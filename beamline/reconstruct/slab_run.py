@@ -36,7 +36,7 @@ _WEIGHED = 16  # rows of which weights are made at a time
 _LOOK = 0.5  # s between two looks at slabs under way
 
 T = TypeVar("T")
-Run = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
+RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
 """Reconstructs views on a grid."""
 
 
@@ -45,11 +45,11 @@ class SlabWorkers:
     """Reconstructs `count` slabs at a time, each by `run` in a thread of its own."""
 
     count: int
-    run: Run
+    run: RunMethod
 
 
 def in_slabs(
-    run: Run,
+    run: RunMethod,
     prepared: PreparedProjections,
     options: ReconOptions,
     slabs: Sequence[Slab],
@@ -82,7 +82,7 @@ def in_slabs(
         said(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
     in_all = sum(slab.slices.stop - slab.slices.start for slab in slabs)
 
-    def made(n: int, by: Run, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
+    def made(n: int, by: RunMethod, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
         """The slab, and what is to be said of it; None of views that are zero."""
         slab, follows = slabs[n], partial is not None
         one = replace(control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0]))

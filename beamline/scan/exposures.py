@@ -15,7 +15,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, booked, by_nothing, placing
-from beamline.scan.ledger import EXTRA, Account, Exposed, Ledger, Train, enter, settle
+from beamline.scan.ledger import EXTRA, Account, DeliveredFrame, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
 from drivers.clock import Clock
@@ -122,8 +122,8 @@ class _Pass:
             yield self.waiting.pop(0), trigger, entry.angle
 
     @property
-    def _exposed(self) -> list[Exposed]:
-        return [Exposed(frame.framestamp, frame.time) for frame in self.waiting]
+    def _exposed(self) -> list[DeliveredFrame]:
+        return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]
 
     @property
     def _braking(self) -> Braking:

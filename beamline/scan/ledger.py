@@ -69,7 +69,7 @@ class Train:
 
 
 @dataclass(frozen=True)
-class Entry:
+class LedgerEntry:
     """The trigger of a frame (EXTRA: no trigger exposed it) and the angle in radians at its time."""
 
     trigger: int
@@ -143,7 +143,7 @@ class Account:
 
 
 @dataclass(frozen=True)
-class Exposed:
+class DeliveredFrame:
     """A frame as it comes from the camera: see `assign`."""
 
     framestamp: int
@@ -151,7 +151,7 @@ class Exposed:
     steady: bool = True
 
 
-def enter(ledger: Ledger, frames: Sequence[Exposed], last: bool) -> tuple[Ledger, Entry] | None:
+def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple[Ledger, LedgerEntry] | None:
     """Enter the first of the frames that wait, by what those after it show; None: it must wait for further frames.
 
     Args:
@@ -180,7 +180,7 @@ def enter(ledger: Ledger, frames: Sequence[Exposed], last: bool) -> tuple[Ledger
     return after, entry
 
 
-def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
+def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, LedgerEntry]:
     """Enter a received frame: the ledger after it, and the frame's trigger and angle.
 
     Frames come in the order in which they were exposed.
@@ -189,7 +189,7 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
         time: the frame's trigger time in s; nan: no trigger is known to have exposed it.
         steady: the stage turned at constant speed; else the time is as if it had, and must fit better.
     """
-    train, frame = ledger.train, Exposed(framestamp, time, steady)
+    train, frame = ledger.train, DeliveredFrame(framestamp, time, steady)
     if math.isnan(time):
         return _extra(ledger, frame, max(ledger.last, 0))
     new_exposures = framestamp - ledger.exposed
@@ -221,10 +221,10 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
         matched = _follow(ledger, matched, time, steps, residual)
     else:
         matched = replace(matched, phase=ledger.phase + steps * ledger.period)
-    return matched, Entry(trigger, float(train.angles[trigger]))
+    return matched, LedgerEntry(trigger, float(train.angles[trigger]))
 
 
-def _extra(ledger: Ledger, frame: Exposed, position: float, beyond: bool = False) -> tuple[Ledger, Entry]:
+def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool = False) -> tuple[Ledger, LedgerEntry]:
     """Enter a frame that no trigger exposed, at a position in periods."""
     train, new_exposures = ledger.train, frame.framestamp - ledger.exposed
     after = replace(
@@ -236,7 +236,7 @@ def _extra(ledger: Ledger, frame: Exposed, position: float, beyond: bool = False
         beyond=ledger.beyond + beyond,
         unconfirmed=ledger.unconfirmed + (not frame.steady),
     )
-    return after, Entry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
+    return after, LedgerEntry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
 
 
 def settle(ledger: Ledger, cut_short: bool = False) -> Account:

@@ -30,7 +30,7 @@ from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
-from beamline.instrument.connect import Instrument, connect
+from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
 from beamline.monitor.rehearsal import rehearse
@@ -110,7 +110,7 @@ def run_scan(
     stop: StopRequest | None = None,
     *,
     live: LiveCommand | None = None,
-    instrument: Instrument | None = None,
+    instrument: ConnectedDevices | None = None,
     ask: Ask | None = None,
     afterwards: LiveCommand | None = None,
 ) -> RunResult:
@@ -190,7 +190,7 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
 @dataclass(frozen=True, eq=False)
 class _Run:
     config: Config
-    instrument: Instrument
+    instrument: ConnectedDevices
     ready: ReadyScan
     folder: Path
     stop: StopRequest

@@ -19,9 +19,9 @@ from beamline.config.references import reference_limits
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Emit
 from beamline.core.stop import StopRequest
-from beamline.instrument.connect import Instrument, camera_settings
+from beamline.instrument.connect import ConnectedDevices, camera_settings
 from beamline.monitor.digest import digest
-from beamline.monitor.references import FaultKind, Reference, ReferenceLimits, judge
+from beamline.monitor.references import FaultKind, ReferenceFrame, ReferenceLimits, judge
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
@@ -112,7 +112,9 @@ class Tuning:
         return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]
 
 
-def tune(config: Config, instrument: Instrument, stop: StopRequest, emit: Emit, angle: float | None = None) -> Tuning:
+def tune(
+    config: Config, instrument: ConnectedDevices, stop: StopRequest, emit: Emit, angle: float | None = None
+) -> Tuning:
     """Take darks, flats and views at a few exposures and evaluate them. Nothing is written.
 
     At the end the shutter is closed and stage and sample are where they were, as after a scan.
@@ -166,7 +168,7 @@ def evaluate(
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
     references = [
-        Reference.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
+        ReferenceFrame.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
         for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
     ]
     judged = judge([references[: len(darks)], references[len(darks) :]], limits)
@@ -228,7 +230,7 @@ def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
     return float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 2
 
 
-def _accepted(instrument: Instrument, config: Config, exposure: float) -> list[float]:
+def _accepted(instrument: ConnectedDevices, config: Config, exposure: float) -> list[float]:
     """The exposures that the camera takes, the longest first.
 
     Raises:

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation
 from beamline.config.tree import read
 from beamline.core.errors import ConfigError
 from beamline.simulate.scene_file import open_scene, volumes_beside
-from beamline.xafs.contrast import Regions
+from beamline.xafs.contrast import ContrastRegions
 from beamline.xafs.depth import line_integrals
 from beamline.xafs.series import Series
 from simulators.frame.mapping import SceneError
@@ -53,7 +53,7 @@ class EnergyScan:
     energies: Reals
     angle: float
     material: str
-    regions: Regions
+    regions: ContrastRegions
 
     def series(self) -> Series:
         """Its radiographs, computed lazily."""
@@ -164,7 +164,7 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
     return wanted
 
 
-def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Regions:
+def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> ContrastRegions:
     """Pixels with much of the material, and those near it without it, in the sample if possible, else in air."""
     thickness = sample.thickness(angle, scan.detector)
     mine = np.array([_is(c, material) for c in sample.constituents])
@@ -174,7 +174,7 @@ def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Region
     inside = own >= THICK * own.max()
     near = binary_dilation(own > 0, iterations=min(NEAR, max(own.shape))) & (own == 0)
     matter = near & (thickness != 0).any(axis=0)
-    return Regions(inside, matter if matter.any() else near, float(own[inside].mean()))
+    return ContrastRegions(inside, matter if matter.any() else near, float(own[inside].mean()))
 
 
 def _is(constituent: Constituent, material: str) -> bool:

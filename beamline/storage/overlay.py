@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from beamline.storage.disk_file import UnderHdf5
-from beamline.storage.journal import Change, Changes
+from beamline.storage.journal import FileChange, FileChanges
 
 _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piece, as far as any does
 
@@ -21,7 +21,7 @@ class Overlay(UnderHdf5):
         length: bytes of the file, where this is more than there are: the rest is zero.
     """
 
-    def __init__(self, path: Path, changes: Sequence[Change] = (), length: int = 0) -> None:
+    def __init__(self, path: Path, changes: Sequence[FileChange] = (), length: int = 0) -> None:
         super().__init__(path, "r", length)
         self._there = os.fstat(self._file.fileno()).st_size
         self._pages: dict[int, bytearray] = {}
@@ -57,7 +57,7 @@ class Overlay(UnderHdf5):
         self._size = self._at if length is None else length
         return self._size
 
-    def changes(self) -> Changes:
+    def changes(self) -> FileChanges:
         """What was written and differs from what the disk has; never less than there is."""
         ranges = []
         for page in sorted(self._pages):
@@ -67,8 +67,8 @@ class Overlay(UnderHdf5):
             differ = [i for i in range(stop) if i >= there or old[i] != new[i]]
             if differ:
                 first, last = differ[0], differ[-1] + 1
-                ranges.append(Change(begin + first, bytes(old[first : min(last, there)]), bytes(new[first:last])))
-        return Changes(self.path, max(self._there, self._size), tuple(ranges))
+                ranges.append(FileChange(begin + first, bytes(old[first : min(last, there)]), bytes(new[first:last])))
+        return FileChanges(self.path, max(self._there, self._size), tuple(ranges))
 
     def _on_disk(self, page: int) -> bytearray:
         out = bytearray(_PAGE)

@@ -22,7 +22,7 @@ from beamline.core.errors import DataError
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
-from beamline.storage.journal import Changes
+from beamline.storage.journal import FileChanges
 from beamline.storage.overlay import Overlay
 from beamline.storage.parts import require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
@@ -103,7 +103,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         if head.open_for_writing or head.missing or not _finished(path):
             done, mended = _mended(path, head)
         else:
-            done, mended = _as_it_is(path, begun), Changes(path, head.size, ())
+            done, mended = _as_it_is(path, begun), FileChanges(path, head.size, ())
         return _with_view(done, mended, say)
     finally:
         if lock is not None:
@@ -135,7 +135,7 @@ def _as_it_is(path: Path, changed: bool) -> Recovered:
         return Recovered(path, changed, frames, 0, missing, altered=_altered(file, frames))
 
 
-def _with_view(done: Recovered, mended: Changes, say: Callable[[str], None]) -> Recovered:
+def _with_view(done: Recovered, mended: FileChanges, say: Callable[[str], None]) -> Recovered:
     """Carry it out with the /exchange view; without it where the disk takes only that."""
     with hdf5.readable(done.path), h5py.File(Overlay(done.path, mended.ranges), "r") as file:
         if has_exchange_view(file):
@@ -154,7 +154,7 @@ def _with_view(done: Recovered, mended: Changes, say: Callable[[str], None]) -> 
     return replace(done, changed=True)
 
 
-def _announce(changes: Changes, say: Callable[[str], None]) -> None:
+def _announce(changes: FileChanges, say: Callable[[str], None]) -> None:
     if changes.ranges:
         free = shutil.disk_usage(changes.path.parent).free
         say(f"{changes.path}: to recover it takes {size(changes.room)} on its disk, {size(free)} are free.")
@@ -172,7 +172,7 @@ def _require_ours(path: Path, file: h5py.File) -> None:
         raise DataError(f"{path} is no scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
 
 
-def _mended(path: Path, head: Superblock) -> tuple[Recovered, Changes]:
+def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
     """What becomes of it, and what has to change for that."""
     end = max(head.end, head.size) if head.open_for_writing else head.end
     overlay = Overlay(path, length=end)

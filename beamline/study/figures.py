@@ -12,7 +12,7 @@ from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.study.table import HEADINGS, StudyTable, formatted, write_text
 from beamline.tradeoff.varied import colour_of
 from recon.methods import by_name
@@ -40,7 +40,7 @@ def figures_of_rows(table: StudyTable) -> bytes:
     return png(figure)
 
 
-def write_page(folder: Path, table: StudyTable, slices: Slices) -> None:
+def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
     """Write the pictures and report.html."""
     pictures = []
     if table.done:

@@ -19,9 +19,6 @@ from recon.splatting.settings import FitSettings
 
 Depth = Literal["quick", "full"]
 
-PRECISION = "precision"
-"""`TrialSettings.varies` of a comparison of float32 kernels with the float64 reference implementation."""
-
 _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
 _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
@@ -34,7 +31,7 @@ class TrialSettings:
     """One way in which a trade-off tries a method.
 
     Attributes:
-        varies: the group of the trial: "method" for the baseline, else what differs from it, or `PRECISION`.
+        varies: the group of the trial: "method" for the baseline, else what differs from it.
         settings: that differ from the defaults, by name as `recon.methods.build` takes them.
         binning: of detector pixels.
     """
@@ -99,7 +96,7 @@ def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
     found.append(TrialSettings("loss", base | {"fit.ssim_weight": 0.0}))
     found += [TrialSettings("loss", base | {"fit.loss": loss}) for loss in ("l2", "poisson")]
     found.append(TrialSettings("rectification", base | {"fit.rays.rectified": False}))
-    return [*found, TrialSettings(PRECISION)]
+    return found
 
 
 def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:

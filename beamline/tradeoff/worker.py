@@ -28,7 +28,6 @@ from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
 from beamline.tradeoff.data import Data, geometry_in
 from beamline.tradeoff.trials import Trial
-from beamline.tradeoff.varied import PRECISION
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
@@ -38,7 +37,6 @@ from recon.base.method import DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
-from recon.splatting.precision import compare
 from recon.voxels.projector import data_residual
 from recon.warm_up import warm_up
 
@@ -65,9 +63,6 @@ def run(
     Raises:
         ValueError: the reconstruction refuses these settings.
     """
-    if trial.group == PRECISION:
-        found = compare(data.projections, data.geometry, seed, now)
-        return {"seconds": found["seconds_float32"], "peak_bytes": peak_memory(), "details": found}
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)

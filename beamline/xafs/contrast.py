@@ -24,7 +24,7 @@ KNOWN = 0.5  # least share of pixels with a value in a region
 
 
 @dataclass(frozen=True, eq=False)
-class Regions:
+class ContrastRegions:
     """The pixels that are compared.
 
     Attributes:
@@ -44,7 +44,7 @@ class Regions:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class XafsCurve:
     """Absorption over energies.
 
     Attributes:
@@ -96,7 +96,7 @@ class Curve:
         return float(self.energies[first]), float(self.energies[last])
 
 
-def contrast_of(frame: Reals, regions: Regions) -> tuple[float, float]:
+def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
     """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
     pixels).
 
@@ -110,15 +110,15 @@ def contrast_of(frame: Reals, regions: Regions) -> tuple[float, float]:
     return inside - around, float(np.hypot(noise, noise_around))
 
 
-def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Regions) -> Curve:
+def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: ContrastRegions) -> XafsCurve:
     """The curve of points from `contrast_of`, sorted by energy; unknown points are left out."""
     order = np.argsort(energies, kind="stable")
     contrast, noise = np.array(points, dtype=np.float64).reshape(-1, 2).T[:, order]
     known, e = np.isfinite(contrast), energies[order]
     contrast, noises = contrast[known], None if np.isnan(noise[known]).any() else noise[known]
     if regions.thickness is None:
-        return Curve(e[known], contrast, contrast, noises, left_out=e[~known])
-    return Curve(e[known], contrast / regions.thickness, contrast, noises, "1/mm", e[~known])
+        return XafsCurve(e[known], contrast, contrast, noises, left_out=e[~known])
+    return XafsCurve(e[known], contrast / regions.thickness, contrast, noises, "1/mm", e[~known])
 
 
 def _level(frame: Reals, mask: Mask) -> tuple[float, float]:

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
+from beamline.monitor.view import PixelBox
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.xafs.contrast import Curve, Regions
-from beamline.xafs.radiographs import Part, Radiographs, reals
+from beamline.xafs.contrast import ContrastRegions, XafsCurve
+from beamline.xafs.radiographs import FramePart, Radiographs, reals
 from beamline.xafs.series import Series
 
 Reals = NDArray[np.float64]
-Box = tuple[int, int, int, int]
 
 EV_BEYOND, KEV_BELOW = 500.0, 0.05
 """keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
@@ -85,14 +85,14 @@ class FileOptions:
 
     low: float = 0.0
     high: float = np.inf
-    region: Box | None = None
-    around: Box | None = None
+    region: PixelBox | None = None
+    around: PixelBox | None = None
     unit: str | None = None
     quantity: str | None = None
 
 
 @contextmanager
-def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
+def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve]:
     """The curve or the radiographs of a file, which is open within the context.
 
     Raises:
@@ -111,24 +111,24 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
         if isinstance(source, AbsorptionTable):
             if options.region or options.around:
                 raise ConfigError(f"{path} has no frames, so that regions do not apply. Nothing was written.")
-            yield Curve(energies, source.absorption[kept], unit="as in the file")
+            yield XafsCurve(energies, source.absorption[kept], unit="as in the file")
             return
         inside = _mask(source.shape, options.region or (0, source.shape[0], 0, source.shape[1]))
         around = None if options.around is None else _mask(source.shape, options.around) & ~inside
         if around is not None and not around.any():
             raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
         part = _bounds(inside if around is None else inside | around)
-        regions = Regions(inside[part], None if around is None else around[part])
+        regions = ContrastRegions(inside[part], None if around is None else around[part])
         yield Series(path.name, kept.size, source.line_integrals(kept.tolist(), part), regions)
 
 
-def _bounds(mask: NDArray[np.bool_]) -> Part:
+def _bounds(mask: NDArray[np.bool_]) -> FramePart:
     """The rows and columns of the mask and its neighbouring pixels: no more of a frame is read."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
 
 
-def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
+def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
     if box[1] > shape[0] or box[3] > shape[1]:
         raise ConfigError(
             f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is not in frames of {shape[0]} x {shape[1]} pixels. "

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
-class Phase:
+class MotionPhase:
     """Constant acceleration for a while. Times are s after the move began; the rest is in the unit of the position."""
 
     begin: float
@@ -38,7 +38,7 @@ class TrapezoidMove:
     begin: float
     start: float
     target: float
-    phases: tuple[Phase, ...]
+    phases: tuple[MotionPhase, ...]
 
     @classmethod
     def between(
@@ -64,9 +64,9 @@ class TrapezoidMove:
         peak = min(speed, math.sqrt(distance * mean))
         rise, fall = peak / acceleration, peak / slow
         cruise = max(0.0, distance / peak - (rise + fall) / 2) if peak > 0 else 0.0
-        up = Phase(0.0, rise, start, 0.0, sign * acceleration)
-        flat = Phase(rise, cruise, start + sign * 0.5 * peak * rise, sign * peak, 0.0)
-        down = Phase(flat.end, fall, target - sign * 0.5 * peak * fall, sign * peak, -sign * slow)
+        up = MotionPhase(0.0, rise, start, 0.0, sign * acceleration)
+        flat = MotionPhase(rise, cruise, start + sign * 0.5 * peak * rise, sign * peak, 0.0)
+        down = MotionPhase(flat.end, fall, target - sign * 0.5 * peak * fall, sign * peak, -sign * slow)
         return cls(begin, start, target, tuple(phase for phase in (up, flat, down) if phase.duration > 0))
 
     @property
@@ -126,7 +126,7 @@ class TrapezoidMove:
         seconds = abs(velocity) / acceleration
         if seconds == 0:
             return TrapezoidMove(self.begin, self.start, here, past)
-        slow = Phase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
+        slow = MotionPhase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
         return TrapezoidMove(self.begin, self.start, slow.position_after(seconds), (*past, slow))
 
     def halted(self, position: float) -> TrapezoidMove:
@@ -148,13 +148,13 @@ class TrapezoidMove:
         braked = self.braked(time, velocity**2 / (2 * abs(last - position)))
         return TrapezoidMove(braked.begin, braked.start, last, braked.phases)
 
-    def _phase(self, time: float) -> Phase | None:
+    def _phase(self, time: float) -> MotionPhase | None:
         """The phase at `time`; None while it stands: before, and from `end` on as that number is rounded."""
         if not self.begin <= time < self.end:
             return None
         return next((phase for phase in self.phases if time - self.begin < phase.end), None)
 
-    def _until(self, time: float) -> tuple[Phase, ...]:
+    def _until(self, time: float) -> tuple[MotionPhase, ...]:
         seconds = time - self.begin
         return tuple(
             replace(phase, duration=min(phase.end, seconds) - phase.begin)
@@ -163,7 +163,7 @@ class TrapezoidMove:
         )
 
 
-def _seconds_for(distance: float, phase: Phase, sign: int) -> float:
+def _seconds_for(distance: float, phase: MotionPhase, sign: int) -> float:
     """Time to cover `distance` ahead in a phase: the root of d = vt + at²/2 in the form that does not cancel."""
     velocity, acceleration = sign * phase.velocity, sign * phase.acceleration
     root = math.sqrt(max(velocity * velocity + 2.0 * acceleration * distance, 0.0))

@@ -1,4 +1,4 @@
-"""ScanSource: one view of a scan, whatever the file. ScanReader and Format: what a file format adds."""
+"""ScanSource: one view of a scan, whatever the file. BaseSource and ScanFormat: what a file format adds."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
     return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
 
 
-class ScanReader(ABC):
+class BaseSource(ABC):
     """Base class of the readers: a format adds what it knows and `read`; the rest is here once.
 
     A subclass sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and `facts` (its attributes) where it
@@ -270,7 +270,7 @@ class Opening:
 
 
 @dataclass(frozen=True)
-class Format:
+class ScanFormat:
     """A file format in the registry `storage.readers.open.FORMATS`.
 
     Attributes:
@@ -282,4 +282,4 @@ class Format:
 
     name: str
     recognises: Callable[[Path, Opening], bool]
-    open: Callable[[Path, Opening], ScanReader]
+    open: Callable[[Path, Opening], BaseSource]

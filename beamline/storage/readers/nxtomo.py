@@ -20,13 +20,21 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.hdf5 import require_real
 from beamline.storage.parts import require_joined
-from beamline.storage.readers.base import WHOLE, Format, Opening, Quantity, ScanReader, count_in_blocks, frame_indices
+from beamline.storage.readers.base import (
+    WHOLE,
+    BaseSource,
+    Opening,
+    Quantity,
+    ScanFormat,
+    count_in_blocks,
+    frame_indices,
+)
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
 from drivers.frame import Frame, FrameKind
 
 
-class NXtomoSource(ScanReader):
+class NXtomoSource(BaseSource):
     """A scan in NXtomo's structure; see ScanSource."""
 
     def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
@@ -347,7 +355,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return bool(find(file))
 
 
-FORMAT = Format(
+FORMAT = ScanFormat(
     "an NXdetector with frames and an image_key (NXtomo)",
     _recognises,
     lambda path, opening: NXtomoSource(path, follow=opening.follow, own_angles=opening.own_angles),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.digest import digest
-from beamline.monitor.references import JudgedGroup, Reference, ReferenceLimits, full_scale, judge
+from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from drivers.frame import FrameKind
@@ -111,8 +111,8 @@ def _some(group: Frames) -> Frames:
     return group[np.unique(np.linspace(0, group.size - 1, SAMPLES).astype(int))]
 
 
-def _reference(source: ScanSource, row: int) -> Reference:
+def _reference(source: ScanSource, row: int) -> ReferenceFrame:
     image = source.read([row])[0]
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
     found = digest(image, saturation, BLOCK)
-    return Reference.of(row, FrameKind(int(source.image_key[row])), float(source.exposures[row]), found, BLOCK)
+    return ReferenceFrame.of(row, FrameKind(int(source.image_key[row])), float(source.exposures[row]), found, BLOCK)

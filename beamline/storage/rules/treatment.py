@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Level
-from beamline.monitor.motion import Motion
-from beamline.monitor.opposite import Opposite
+from beamline.monitor.motion import MotionCheck
+from beamline.monitor.opposite import OppositeCheck
+from beamline.monitor.view import PixelBox
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
 
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
 MARGIN = 0.25  # of the region's shorter side, on all sides
 
 Mask = NDArray[np.bool_]
-Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +58,11 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
     A view in which the sample jumped is as good as those after it; and then, what views from opposite sides show of it
     is no fault of theirs.
     """
-    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
+    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
-    flags = flags.without(Motion.bit)
+    flags = flags.without(MotionCheck.bit)
     if jumped.size:  # what views from the other side show of the jump is corrected with it
-        flags = flags.without(Opposite.bit)
+        flags = flags.without(OppositeCheck.bit)
     local = flagged_in_part(flags, shape)
     left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
     return Treatment(flags, views, left_out, halved, views & local, jumped)
@@ -79,7 +79,9 @@ def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
     return flags.flagged & ~whole
 
 
-def boxes_of(flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]) -> Iterator[tuple[int, Box | None]]:
+def boxes_of(
+    flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
+) -> Iterator[tuple[int, PixelBox | None]]:
     """Frames that a check flagged, each with its region and a margin; None: the whole view, or most of it.
 
     A view that a check marked when it had seen later ones has no region in the file: it takes the one that these lead

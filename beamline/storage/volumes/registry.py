@@ -35,8 +35,8 @@ class FormatEntry:
 _HERE = "beamline.storage.volumes."
 REGISTRY = {
     "hdf5": FormatEntry(_HERE + "nxtomoproc", "NXtomoproc", (".h5", ".hdf5", ".nxs"), "with all settings"),
-    "tiff": FormatEntry(_HERE + "tiff", "TiffFile", (".tif", ".tiff")),
-    "tiff_folder": FormatEntry(_HERE + "tiff", "TiffFolder", ("",), "a folder of TIFFs"),
+    "tiff": FormatEntry(_HERE + "tiff", "TiffVolume", (".tif", ".tiff")),
+    "tiff_folder": FormatEntry(_HERE + "tiff", "TiffFolderVolume", ("",), "a folder of TIFFs"),
     "npy": FormatEntry(_HERE + "plain", "Npy", (".npy",)),
     "nrrd": FormatEntry(_HERE + "plain", "Nrrd", (".nrrd",)),
     "ome_zarr": FormatEntry(_HERE + "ome_zarr", "OmeZarr", (".zarr",)),

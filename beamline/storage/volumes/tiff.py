@@ -25,7 +25,7 @@ _UNITS = {"mm": "mm", "px": "pixel"}  # as ImageJ and OME call them
 
 
 @dataclass(frozen=True)
-class TiffFile:
+class TiffVolume:
     """One TIFF, a hyperstack of ImageJ; from 4 GB on, which ImageJ's own cannot hold, a BigTIFF in the way of OME.
 
     Both say the edges of a voxel in x, y and z; the facts are JSON in ImageJ's `Info` or OME's `Description`.
@@ -63,7 +63,7 @@ class TiffFile:
 
 
 @dataclass(frozen=True)
-class TiffFolder:
+class TiffFolderVolume:
     """A folder of `slice_00000.tif` and so on; every file has the facts, its own number and how many there are."""
 
     name: str = "folder of TIFFs"

@@ -46,7 +46,7 @@ def digest(path: Path) -> str:
                     found.update(str(value.tolist()).encode() if value.dtype.hasobject else value.tobytes())
 
             file.visititems(add)
-    elif path.suffix in (".html", ".pdf"):
+    elif path.suffix == ".html":
         found.update(str(path.stat().st_size > 1000).encode())
     else:
         found.update(path.read_bytes())

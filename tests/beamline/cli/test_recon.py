@@ -231,25 +231,6 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     assert left(folder) == {"scan.h5", "scan_fbp.h5"}
 
 
-def test_a_logbook_page_beside_the_volume(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--pdf", "--no-report")
-    assert result.exit_code == 0, result.output
-    assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.pdf"}
-    assert "pdf       scan_fbp.pdf" in result.stdout and "report" not in result.stdout
-    assert (folder / "scan_fbp.pdf").read_bytes().startswith(b"%PDF")
-    (folder / "scan_fbp.h5").unlink()
-    refused = beamline("recon", "scan.h5", "-m", "fbp", "--pdf")
-    assert refused.exit_code == 5 and "scan_fbp.pdf" in refused.stderr
-    (folder / "scan_fbp.pdf").unlink()
-
-    def full(*_: object, **__: object) -> None:
-        raise DataError("scan_fbp.pdf could not be written (No space left on device).")
-
-    monkeypatch.setattr("beamline.reconstruct.result.write_logbook", full)
-    assert beamline("recon", "scan.h5", "-m", "fbp", "--pdf").exit_code == 5
-    assert left(folder) == {"scan.h5"}
-
-
 def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None:
     lens = "xcenter = 20.0\nycenter = 0.5\nfactor0 = 1.0\nfactor1 = 1e-5\n"
     (folder / "lens.txt").write_text(lens, encoding="utf-8")

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Self
 from uuid import uuid4
 
-from beamline.instrument.connect import Instrument
+from beamline.instrument.connect import ConnectedDevices
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
 from drivers.protocols import Devices
@@ -55,9 +55,9 @@ class FlyRig:
         self.stage = PM16CStage(register(f"fly-{uuid4().hex}", box), PM16CSettings(figures), self.clock)
         self.camera: DcamCamera = world.connect(options)
 
-    def connected(self) -> Instrument:
+    def connected(self) -> ConnectedDevices:
         devices = Devices(self.stage, self.camera, SimulatedShutter(), SimulatedSampleMover())
-        return Instrument(devices, self.clock, None, self.close)
+        return ConnectedDevices(devices, self.clock, None, self.close)
 
     def close(self) -> None:
         self.stage.close()

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.scan import rate
-from beamline.scan.rate import FEWEST, REFERENCES, RING, STAGES, Load, rates, summary
+from beamline.doctor import rate
+from beamline.doctor.rate import FEWEST, REFERENCES, RING, STAGES, Load, rates, summary
 from beamline.scan.recorder import Recorder
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
@@ -19,7 +19,7 @@ from drivers.frame import Frame, FrameKind
 LOAD = Load((24, 40), preview_bin=4, flush_every=16)
 
 
-def measured(folder: Path, rounds: int = 2) -> list[rate.Taken]:
+def measured(folder: Path, rounds: int = 2) -> list[rate.StageRun]:
     return list(rates(LOAD, folder, SystemClock(), 1e-3, rounds, lambda n, of, stage: None))
 
 

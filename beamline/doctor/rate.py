@@ -123,7 +123,7 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Taken:
+class StageRun:
     """One stage of one round.
 
     Attributes:
@@ -235,7 +235,7 @@ is what the others are compared with."""
 
 def rates(
     load: Load, folder: Path, clock: Clock, seconds: float, rounds: int, said: Callable[[int, int, str], None]
-) -> Iterator[Taken]:
+) -> Iterator[StageRun]:
     """Measure all stages, `rounds` times in turn, in about so many seconds; each removes its file.
 
     The stages of a round have the same number of frames, at most what half of the free disk holds.
@@ -272,7 +272,7 @@ def rates(
     said(total, total, "")
 
 
-def summary(load: Load, taken: Sequence[Taken]) -> list[RateRow]:
+def summary(load: Load, taken: Sequence[StageRun]) -> list[RateRow]:
     """The table: a row a stage."""
     plain, *_ = STAGES
     rounds = {name: [one for one in taken if one.stage == name] for name in STAGES}
@@ -293,7 +293,7 @@ def summary(load: Load, taken: Sequence[Taken]) -> list[RateRow]:
     return rows
 
 
-def _measure(name: str, load: Load, folder: Path, n: int, clock: Clock) -> Taken:
+def _measure(name: str, load: Load, folder: Path, n: int, clock: Clock) -> StageRun:
     load.prepare()
     try:
         with tempfile.TemporaryDirectory(prefix="beamline-bench-", dir=folder) as own:
@@ -301,7 +301,7 @@ def _measure(name: str, load: Load, folder: Path, n: int, clock: Clock) -> Taken
             cpu, began = time.process_time(), time.perf_counter()
             lost = STAGES[name](load, Path(own), n, clock)
             seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
-            return Taken(name, n, seconds, cpu, lost, peak_memory())
+            return StageRun(name, n, seconds, cpu, lost, peak_memory())
     except OSError as error:
         raise DataError(
             f"{folder} did not take the frames ({error.strerror or error}). What was written was removed."
