@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
+from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.core.files import text_in
@@ -227,6 +228,7 @@ def _hardening(value: str | None) -> Hardening | None:
 
 
 _BEFORE = (
+    heading(DATA),
     click.option(
         "--views",
         default="all",
@@ -259,6 +261,7 @@ _BEFORE = (
     ),
 )
 _AFTER = (
+    heading(CORRECTIONS),
     click.option(
         "--tilt",
         callback=tilt_of,
@@ -274,6 +277,7 @@ _AFTER = (
         help="Radial distortion of the lens, which is taken out of the views: the text file that discorpy writes "
         "(backward model: xcenter, ycenter, factor0 ...).",
     ),
+    heading(DATA),
     click.option(
         "--pixel-size-um",
         type=POSITIVE,
@@ -285,6 +289,7 @@ _AFTER = (
         metavar="SOD:SDD",
         help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
     ),
+    heading(CORRECTIONS),
     click.option(
         "--air",
         callback=air_of,
