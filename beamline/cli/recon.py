@@ -109,9 +109,9 @@ _SHEET = ".png"
     "-m",
     "--method",
     type=click.Choice((AUTO, *names())),
-    help="auto: the one of r2, fista-tv and fbp that predicts views held out best, hides no structure and dulls no "
-    "edges; r2: Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels. "
-    "Default: auto; r2 with --follow and with options of the fit.",
+    help="auto chooses r2, fista-tv or fbp by how well it predicts views held out. r2 fits Gaussians to the views, "
+    "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
+    "options of the fit.",
 )
 @selection_options
 @method_options
@@ -321,7 +321,7 @@ def recon(
         recipe=recipe_text(context, method),
     )
     if roi is not None and max_residual is not None and options.method.traits.direct:
-        raise click.UsageError("--max-residual needs the whole volume, of which fbp with --roi makes a part.")
+        raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
     if write_config is not None:
         _write_recipe(write_config, options.recipe)
         return

@@ -28,7 +28,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     unknown = [name for name in wanted if name not in names()]
     if unknown:
-        raise click.BadParameter(f"{unknown[0]!r} is none of {', '.join(names())}")
+        raise click.BadParameter(f"{unknown[0]!r} is not a method; expected {', '.join(names())}")
     return wanted
 
 

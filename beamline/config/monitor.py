@@ -36,8 +36,8 @@ class MonitorBase(Section):
             return data
         if data.get("on_alarm", "log") != "log":
             raise ValueError(
-                "on_alarm is not a key any longer; write policy: {<check>: stop} for the checks whose alarms are to "
-                "stop the scan, and act_after: 1 to stop it at the first frame"
+                "on_alarm is not a key; write policy: {<check>: stop} for checks that stop the scan, and act_after: 1 "
+                "to stop it at the first frame"
             )
         if old := data.get("thresholds"):
             group, keys = next(iter(old.items())) if isinstance(old, dict) else ("<check>", None)

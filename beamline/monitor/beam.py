@@ -123,7 +123,7 @@ class Beam:
             if state.covered:
                 return Look(replace(state, drifting=0))
             advice = (
-                f"No part of the frame gets more than {1 - score:.0%} of the flats' light: the sample covers all of "
+                f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
                 "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))

@@ -91,9 +91,9 @@ class FieldOfView:
         left, right = view.edges
         sides = " and ".join(side for side, depth in (("left", left), ("right", right)) if depth > self.edge)
         advice = (
-            f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there): "
-            "the total absorption says nothing, floaters must be faster to be seen, and reconstructions are brighter "
-            "at the rim."
+            f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there). "
+            f"The total absorption says nothing, floaters must be faster to be seen, and reconstructions are brighter "
+            f"at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)

@@ -234,7 +234,7 @@ def _outshone(flats: Group, darks: Group | None, views: Group, limits: Reference
     share = there / most
     said = (
         f"they have {share:.2%} of the light of the views (limit {1 - limits.light_gone:.0%}), though a sample only "
-        "takes light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
+        f"takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
     )
     return Fault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, said)
 

@@ -258,8 +258,8 @@ class ScanCorrection:
             has_views = (self._source.image_key[start:end] == FrameKind.PROJECTION).any()
             if has_views and not any(start <= position < end for position in flats):
                 self._warn(
-                    f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used: their "
-                    "views are corrected by the nearest flats of another part, though the beam may have changed."
+                    f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used. The "
+                    f"nearest flats of another part correct their views, though the beam may have changed."
                 )
 
     def _no_view(self) -> DataError:

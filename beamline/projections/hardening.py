@@ -32,7 +32,7 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
             curve, explained = fitted(views, geometry)
         except NoCurveError as error:
             return None, f"Hardening: not determined by the views ({error}); none corrected."
-        how = f"fitted on the views, of which one material explains {explained:.1%}"
+        how = f"fitted on the views; one material explains {explained:.1%} of them"
     corrected = float(np.interp(highest, curve.measured, curve.corrected))
     if corrected < (1 + _LEAST_SEEN) * highest:
         return None, f"Hardening: none seen ({how}); none corrected."

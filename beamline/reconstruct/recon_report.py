@@ -279,8 +279,8 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as image "
-            "viewers show them, all in one grey window (1st to 99.5th percentile of these slices).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
+            "viewers. All share one grey window (1st to 99.5th percentile).",
             figures.orthogonal_slices(shown, unit),
         ),
         Picture(
@@ -291,7 +291,7 @@ def _pictures(
         Picture(
             "Sharpest edge, and values",
             "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
-            "artefacts. Values: narrower peaks are better, if what lies between them is none of the sample's.",
+            "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
             figures.profile_and_values(shown, unit),
         ),
     ]

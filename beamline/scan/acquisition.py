@@ -323,8 +323,8 @@ def _describe(done: TakenBlock) -> str:
     if taken.unconfirmed:
         text += (
             f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
-            "where it stands confirm: noise on the trigger line, or another deceleration than the stage's. They are "
-            "kept as invalid rows."
+            "where it stands confirm. The cause is noise on the trigger line, or another deceleration than the "
+            "stage's. They are kept as invalid rows."
         )
     if taken.shift:
         text += (

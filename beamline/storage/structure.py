@@ -104,7 +104,7 @@ def _refuse_empty_claim(dataset: Any, what: str) -> None:
     if n < CLAIMED or dataset.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()):
-        raise DataError(f"{what} claims {n / 1e9:.3g} GB, of which {stored} bytes are there. Nothing was read.")
+        raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 
 def _drawn_on(dataset: Any) -> Iterator[str]:

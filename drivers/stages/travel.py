@@ -83,7 +83,7 @@ class Travel:
         return self.to_counts(angle)
 
     def refuse_train(self, train: TriggerTrain) -> None:
-        """Refuses a train without pulses or intervals, one whose pulses would run together at full speed or are no
+        """Refuses a train without pulses or intervals. Also one whose pulses would run together at full speed or are no
         multiple of `interval_unit` apart, and one beyond the soft limits. How far apart a single pulse is says nothing.
         """
         interval, least = abs(train.interval), least_interval(self.limits)

@@ -75,7 +75,7 @@ class Material:
 
     def decrement(self, energy: float) -> float:
         """delta of the refractive index 1 - delta + i beta at an energy in keV, by the electrons of the atoms and the
-        dispersion f' (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics, equation 3.2).
+        dispersion f'. (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics, equation 3.2).
 
         Raises:
             ValueError: the energy is outside the tables.

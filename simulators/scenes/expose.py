@@ -25,8 +25,8 @@ def expose(scene: Scene, shot: Shot, on_step: StepHook = nullcontext) -> NDArray
 
     Args:
         shot: the conditions; the same shot gives the same frame.
-        on_step: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
-            or "ideal", where there are no effects and the sample computes the same counts in one step.
+        on_step: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects'.
+            Or "ideal", where there are no effects and the sample computes the same counts in one step.
     """
     chain = scene.chain
     if not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):

@@ -37,7 +37,9 @@ def format_of(path: Path) -> VolumeFormat:
     found = next((kind for kind in FORMATS if suffix in kind.suffixes), None)
     if found is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in FORMATS)
-        raise ValueError(f"{str(path)!r}: the suffix names the format of a volume, and {suffix!r} is none of {known}.")
+        raise ValueError(
+            f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}."
+        )
     return found
 
 

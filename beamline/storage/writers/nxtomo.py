@@ -180,7 +180,7 @@ class NXtomoWriter:
         DataError where the disk does not take it; the frames committed stay readable.
         """
         if status not in STATUSES:
-            raise ValueError(f"Status {status!r} is none of {', '.join(STATUSES)}.")
+            raise ValueError(f"Status {status!r} is not known; expected {', '.join(STATUSES)}.")
         if not self._open:
             return
         self._open = False

@@ -32,7 +32,7 @@ class FirstPulse(StrEnum):
 
 @dataclass(frozen=True)
 class TriggerWindow:
-    """In counts: the distance of pulses, where the window begins (which the stage must stand before) and ends; and how
+    """In counts: the distance of pulses, where the window begins and ends. The stage must stand before it. Then how
     much of a count a step may be wrong, as it adds up over the train."""
 
     step: Fraction
