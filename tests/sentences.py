@@ -61,11 +61,16 @@ class Sentence:
 
 
 def split(text: str) -> list[str]:
-    """The sentences of a text. Items of lists and entries of Args are texts of their own; names of code are one word."""
+    """The sentences of a text. Items of lists, entries of Args and rows in columns are texts of their own.
+
+    Names of code count as one word.
+    """
     parts: list[str] = [""]
     for line in text.splitlines():
         if not line.strip():
             parts.append("")
+        elif re.search(r"\S {3,}\S", line):
+            parts += [line, ""]
         elif item := _ITEM.match(line):
             parts.append(line[item.end() :])
         else:

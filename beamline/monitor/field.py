@@ -33,8 +33,8 @@ class FieldState:
 class FieldOfView:
     """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
 
-    The defaults: a line integral of 0.1 at the edges is a tenth of what a sample has in its middle, and more than phase
-    fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
+    The defaults: a line integral of 0.1 at the edges is a tenth of the value in a sample's middle. It is more than
+    phase fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
     """
 
     name: ClassVar[str] = "field"

@@ -89,8 +89,8 @@ class ReconOutcome:
     def next_decibel(self) -> NextDecibel | None:
         """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
 
-        None for a direct method, while views still came, for a resumed fit, whose whole time is not known, and for one
-        with other rates than the fits that were measured, such as one that followed a scan.
+        None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
+        also for other rates than those of the fits that were measured, as after following a scan.
         """
         judged = residual_curve(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:

@@ -128,7 +128,7 @@ class Needs:
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
     """The method for so many slices: as many Gaussians as belong to them `of` a volume, and their part of the seconds
-    for all slabs, which with what they share have so many `in_all`."""
+    for all slabs. With what they share, all slabs have so many `in_all`."""
     if not isinstance(method, R2):
         return method
     count = method.gaussians

@@ -36,7 +36,7 @@ def in_beam(name: str, beam: str) -> tuple[Reals, Reals]:
 
     Args:
         name: as in `delta_beta`; of a formula in 1/mm at 1 g/cm3.
-        beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1"; or a text file of two columns, keV and
+        beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
             weight (without regard to its unit, the detector's response within it). A filter needs its density: it is
             one of the materials that scenes know.
 

@@ -73,8 +73,8 @@ def archive(
         progress: counts the MB of images twice, when they are written and when they are compared.
 
     Raises:
-        DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan; the disk
-            is too small; what was read back differs. Nothing is left of `out`, and the scan is untouched.
+        DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan. The disk
+            is too small, or what was read back differs. Nothing is left of `out`, and the scan is untouched.
     """
     frames = _frames_of_archivable(scan)
     with whole_file(out) as partial, hdf5.open_hdf5(scan) as raw, hdf5.readable(scan):

@@ -22,8 +22,8 @@ class DiskFile:
     """A file that h5py writes to by its driver `fileobj`.
 
     HDF5 holds chunks and metadata back and writes them when an object goes, where h5py cannot raise; and it may crash
-    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, nothing more
-    is written, and HDF5 reads what it wrote since then from memory, until it has closed the file.
+    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, and nothing
+    more is written. Until HDF5 has closed the file, it reads what it wrote since then from memory.
     """
 
     def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:
@@ -121,7 +121,7 @@ class DiskFile:
         self._file.close()
 
     def _unchanged(self) -> Iterator[tuple[int, int, int]]:
-        """Writes of which nothing was written again."""
+        """Writes that no later write changed."""
         begins, ends = list[int](), list[int]()  # of what later writes cover: apart, in order
         for at, n, checksum in reversed(self._sums):
             first, end = bisect_left(ends, at), bisect_right(begins, at + n)  # those that it overlaps or touches

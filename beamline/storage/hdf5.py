@@ -64,8 +64,8 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     head = superblock(path)
     missing = 0 if head is None else head.missing
     being_written = head is not None and head.open_for_writing and head.intact
-    # A follower takes no lock, so as not to be taken for a writer; but a writer in this same process shares its file
-    # with us, and then HDF5 wants the same locking of both.
+    # A follower takes no lock, so as not to be taken for a writer. But a writer in this same process shares its file
+    # with us; HDF5 then wants the same locking of both.
     growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
     for swmr, locking in (growing, whole, shared) if follow else (whole, growing, shared):
         if swmr and (missing or not (follow or being_written)):
@@ -140,9 +140,9 @@ def reason(error: Exception) -> str:
 def never_close(file: h5py.File) -> None:
     """Keep a file open until the process ends, so that HDF5 changes nothing more on the disk.
 
-    For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
-    object, and may leave it marked as one that nobody can open. HDF5 closes it all the same when the process ends, and
-    crashes where the disk still fails: its handle leads to memory then.
+    For a file that the disk did not take: to close it would write that once more, with a traceback for each object. It
+    may leave the file marked so that nobody can open it. HDF5 closes it all the same when the process ends, and crashes
+    where the disk still fails: its handle leads to memory then.
     """
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back

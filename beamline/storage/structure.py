@@ -23,8 +23,8 @@ _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5p
 
 
 def require_harmless(file: h5py.File) -> None:
-    """DataError for a file with more objects or deeper groups than any scan, that draws on what is no file, or that
-    claims what it has not.
+    """DataError for a file with more objects or deeper groups than any scan. Also for one that draws on a path without
+    a file, or that claims more data than it has.
 
     Files that it draws on are looked at, too, and those that they draw on.
     """

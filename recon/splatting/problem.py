@@ -81,7 +81,7 @@ def make_problem(
 
     Values that are not finite, or more than a million half fields times density units, get no weight, see
     `masks.masked`. The squared losses are scaled to the size of the absolute one at the data's noise (see
-    `noise_level`), so that the weights of SSIM and total variation keep their meaning.
+    `noise_level`). So the weights of SSIM and total variation keep their meaning.
 
     Args:
         weights: of each ray [view, row, col], 0 or more; None: one for all.

@@ -38,7 +38,7 @@ class R2:
 
     Attributes:
         steps: of the fit. 0 gives the starting point. None takes 400. It takes 200 where a finish follows and the noise
-            of the views hides the gain of more (see `schedule.Schedule`), or as many as fit into `seconds`.
+            of the views hides the gain of more (see `schedule.Schedule`). With `seconds` it takes as many as fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. Where they
             do not suffice for the start, a warning says so before it, and the start is made of binned views.

@@ -69,9 +69,9 @@ def fdk(
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
     Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
-    interfaces across the axis blur. On one side of the axis or on both, a full turn must see the whole width of the
-    object (see `fan_shares`): what it cuts off brightens the rim. A voxel that a view does not see gets nothing from
-    it.
+    interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
+    both (see `fan_shares`). Matter that it cuts off brightens the rim. A voxel that a view does not see gets nothing
+    from it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).

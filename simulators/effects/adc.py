@@ -21,7 +21,7 @@ class Adc:
     Attributes:
         bits: of a code.
         nonlinearity: integral: the largest departure of the response from the straight line through its ends, as a
-            share of the full range F. The response bows, y = x + 4 nonlinearity x (1 - x / F).
+            share of the range. F is the full range. The response bows, y = x + 4 nonlinearity x (1 - x / F).
     """
 
     bits: Literal[8, 12, 16] = 16

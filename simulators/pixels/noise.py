@@ -2,7 +2,7 @@
 
 A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution: without
 rejection, so that rows can be vectorised. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
-"Algorithm 955"), unless the expansion is closer to a whole number than its error. In that case, one in thousands, the
+"Algorithm 955"). The expansion may be closer to a whole number than its error. In that case, one in thousands, the
 distribution itself is summed. For expectations below 2 a uniform number is looked up in the distribution.
 """
 
