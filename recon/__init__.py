@@ -1,7 +1,7 @@
 """Tomographic reconstruction: arrays in, arrays out: `recon.correct`, `find_axis`, `remove_rings`, `reconstruct`.
 
-The values (Geometry, Grid, Volume, RunControl, DataUse) load at once; what computes loads torch and numba on first use,
-so that a program which only plans a scan starts quickly.
+The values (Geometry, Grid, Volume, RunControl, DataUse) load at once. Functions that compute load torch and numba on
+first use: a program that only plans a scan starts quickly.
 """
 
 from __future__ import annotations

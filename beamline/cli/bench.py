@@ -72,8 +72,8 @@ def acquire(
     """Measure how fast frames are taken, checked and written to FOLDER, which is on the disk for scans.
 
     Five stages, one part of the acquisition more in each: a plain file with the same bytes, the writer of scans, its
-    digest of each frame, the monitor, and all of it behind the queue that a scan feeds. Half of the free disk is used
-    at most, and every file is removed. Run it on an idle machine; ratios of one round are more reliable than rates.
+    digest, the monitor, all of it behind the queue of a scan. Half of the free disk is used at most, and every file is
+    removed. Run it on an idle machine; ratios of one round are more reliable than rates.
     """
     from beamline.doctor.rate import rates, summary
 

@@ -28,7 +28,7 @@ def _command(verb: str, help_text: str) -> click.Command:
 
 pause = _command(
     "pause",
-    "Pause the scan in the folder RUN (the running one of ./runs): the stage stands, the shutter closes, and no view "
+    "Pause the scan in the folder RUN (the running one of ./runs). The stage stands, the shutter closes, and no view "
     "is lost or taken twice. `beamline resume` goes on.",
 )
 resume = _command("resume", "Let the paused scan in the folder RUN (the running one of ./runs) go on.")

@@ -11,6 +11,7 @@ from typing import Any, get_args
 import click
 from click.core import ParameterSource
 
+from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import POSITIVE
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
@@ -266,8 +267,9 @@ _ALLOW_NEGATIVE = click.option(
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
-_OF_ROWS = (_STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
+_OF_ROWS = (heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
 _OPTIONS = (
+    heading(METHOD),
     _STEPS,
     click.option(
         "--seconds",
@@ -304,13 +306,16 @@ _OPTIONS = (
         help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5. "
         f"Default: {KERNEL}; gaussian by r2-published.",
     ),
+    heading(RESOURCES),
     click.option("--device", default="cpu", show_default=True, metavar="cpu|cuda", help="Device of the fit."),
+    heading(METHOD),
     click.option(
         "--early-stop",
         is_flag=True,
         help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
     ),
     _FINISH,
+    heading(OUTPUT),
     click.option(
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
@@ -323,6 +328,7 @@ _OPTIONS = (
         help="Continue the fit from this checkpoint, or make the slabs that this partial volume lacks: with the same "
         "data and options.",
     ),
+    heading(METHOD),
     _ITERATIONS,
     _TV_WEIGHT,
     _ALLOW_NEGATIVE,

@@ -120,7 +120,7 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_take,
-        help="Recipe: options by their long names (YAML), or a volume of which the recipe is taken. The command line "
+        help="Recipe: options by their long names (YAML), or a volume with its recipe. The command line "
         "goes before it.",
     )(command)
 

@@ -26,8 +26,9 @@ from beamline.cli.method_options import (
     refuse_contradictions,
     resumes_slabs,
 )
+from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
-from beamline.cli.recipe import Repeatable, config_option, recipe_text, repeating
+from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import LogLines, Terminal, counting, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
@@ -98,20 +99,26 @@ def region_of(text: str) -> Region:
 _SHEET = ".png"
 
 
-@click.command(cls=Repeatable)
+@click.command(
+    cls=Grouped,
+    first=("method", "views", "rows", "binning", "axis", "rings", "budget", "output", "follow", "dry"),
+)
+@heading(DATA)
 @config_option
 @click.argument("file", type=click.Path(path_type=Path))
+@heading(METHOD)
 @click.option(
     "-m",
     "--method",
     type=click.Choice((AUTO, *names())),
-    help="auto: the one of r2, fista-tv and fbp that predicts views held out best, hides no structure and dulls no "
-    "edges; r2: Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels. "
-    "Default: auto; r2 with --follow and with options of the fit.",
+    help="auto chooses r2, fista-tv or fbp by how well it predicts views held out. r2 fits Gaussians to the views, "
+    "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
+    "options of the fit.",
 )
 @selection_options
 @method_options
 @preset_option
+@heading(METHOD)
 @click.option(
     "--filter",
     "ramp",
@@ -120,13 +127,16 @@ _SHEET = ".png"
     show_default=True,
     help="Filter of fbp, also of the fbp for comparison with r2. hann is best for few or noisy views.",
 )
+@heading(OUTPUT)
 @click.option(
     "--max-residual",
     type=NOT_NEGATIVE,
     metavar="X",
     help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
 )
+@heading(METHOD)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@heading(OUTPUT)
 @click.option(
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use."
 )
@@ -144,6 +154,7 @@ _SHEET = ".png"
     show_default=True,
     help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
 )
+@heading(DATA)
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
 @click.option(
     "--earlier",
@@ -167,6 +178,7 @@ _SHEET = ".png"
 @click.option(
     "--unfinished", is_flag=True, help="Accept an unfinished scan, one that failed or still runs, and use its frames."
 )
+@heading(RESOURCES)
 @click.option(
     "--memory",
     metavar="SIZE",
@@ -181,6 +193,7 @@ _SHEET = ".png"
     help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
     "those of a scheduler, or jobs of Slurm by a YAML file.",
 )
+@heading(OUTPUT)
 @click.option(
     "--roi",
     metavar="Z0:Z1,Y0:Y1,X0:X1",
@@ -195,12 +208,14 @@ _SHEET = ".png"
 )
 @click.option("--log", type=click.Path(path_type=Path), help="Write everything that happens to this text file.")
 @click.option("-v", "--verbose", is_flag=True, help="Print everything that happens, with its time, to stderr.")
+@heading(RESOURCES)
 @click.option(
     "--dry-run",
     "dry",
     is_flag=True,
     help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
 )
+@heading(OUTPUT)
 @json_option
 def recon(
     file: Path,
@@ -314,7 +329,7 @@ def recon(
         recipe=recipe_text(context, method),
     )
     if roi is not None and max_residual is not None and options.method.traits.direct:
-        raise click.UsageError("--max-residual needs the whole volume, of which fbp with --roi makes a part.")
+        raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
     if write_config is not None:
         _write_recipe(write_config, options.recipe)
         return

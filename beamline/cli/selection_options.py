@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
+from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.core.files import text_in
@@ -106,8 +107,8 @@ def air_of(ctx: click.Context, param: click.Parameter, value: str) -> tuple[str 
     models = {"auto": ("auto", "auto"), "columns": ("auto", "none"), "none": ("none", "none")}
     if value not in models:
         raise click.BadParameter(
-            f"{value!r} is none of auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12), surface:ORDER (0 "
-            "to 3)"
+            f"{value!r} is not known; expected auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12) or "
+            f"surface:ORDER (0 to 3)"
         )
     return models[value]
 
@@ -166,7 +167,9 @@ def phase_of(ctx: click.Context, param: click.Parameter, value: str) -> str | No
     """What `paganin:` is followed by; None for "none"."""
     way, _, material = value.partition(":")
     if value != "none" and (way != "paganin" or not material):
-        raise click.BadParameter(f"{value!r} is none of none, paganin:RATIO (delta/beta), paganin:MATERIAL")
+        raise click.BadParameter(
+            f"{value!r} is not known; expected none, paganin:RATIO (delta/beta) or paganin:MATERIAL"
+        )
     return material or None
 
 
@@ -207,7 +210,8 @@ def hardening_of(ctx: click.Context, param: click.Parameter, value: str) -> str 
     """`fit` or `material:beam`; None for "none"."""
     if value not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", value):
         raise click.BadParameter(
-            f"{value!r} is none of none, fit, MATERIAL:BEAM (Al:60kV,Al=1 is a tube behind 1 mm Al; or Al:FILE)"
+            f"{value!r} is not known; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a tube behind 1 mm Al; or "
+            f"Al:FILE)"
         )
     return None if value == "none" else value
 
@@ -227,6 +231,7 @@ def _hardening(value: str | None) -> Hardening | None:
 
 
 _BEFORE = (
+    heading(DATA),
     click.option(
         "--views",
         default="all",
@@ -259,6 +264,7 @@ _BEFORE = (
     ),
 )
 _AFTER = (
+    heading(CORRECTIONS),
     click.option(
         "--tilt",
         callback=tilt_of,
@@ -274,6 +280,7 @@ _AFTER = (
         help="Radial distortion of the lens, which is taken out of the views: the text file that discorpy writes "
         "(backward model: xcenter, ycenter, factor0 ...).",
     ),
+    heading(DATA),
     click.option(
         "--pixel-size-um",
         type=POSITIVE,
@@ -285,41 +292,41 @@ _AFTER = (
         metavar="SOD:SDD",
         help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
     ),
+    heading(CORRECTIONS),
     click.option(
         "--air",
         callback=air_of,
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
         default="auto",
         show_default=True,
-        help="What is taken off each view so that its air is at zero. columns: the line through the air at the left "
-        "and right edge; LEFT,RIGHT: of so many columns; surface:0 to 3: also a polynomial through all rays that miss "
-        "the sample; auto: that where the views confirm it, and says so.",
+        help="Level the air of each view at zero. columns: take off the line through the air at both edges. "
+        "LEFT,RIGHT: from so many columns. surface:0 to 3: take off a polynomial through all rays that miss the "
+        "sample, too. auto: the surface where the views confirm it.",
     ),
     click.option(
         "--flags",
         type=click.Choice(["use", "judge", "ignore"]),
         default="use",
         show_default=True,
-        help="use: views with an alarm of the monitor are left out, with a warning weigh half (or rays in the flag's "
-        "region), after a jump of the "
-        "sample are corrected; judge: by what the monitor says of them now, also where the file has no flags; "
-        "ignore: all are alike.",
+        help="use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, "
+        "correct views after a jump of the sample. judge: let the monitor look at the frames first. ignore: take "
+        "all views alike.",
     ),
     click.option(
         "--references",
         type=click.Choice(["check", "accept"]),
         default="check",
         show_default=True,
-        help="check: groups of darks and flats that are saturated, dark, uneven or lit are left out, and refused where "
-        "no other is left; accept: all are used as they are.",
+        help="check: leave out groups of darks and flats that are saturated, dark, uneven or lit; refuse the scan if "
+        "no group is left. accept: use all as they are.",
     ),
     click.option(
         "--noise",
         type=click.Choice(get_args(Noise)),
         default="auto",
         show_default=True,
-        help="log: line integrals are logarithms of counts; counts: they carry the likelihood of the photons counted, "
-        f"with weights, which few photons need; auto: counts where a pixel of the open beam has fewer than "
+        help="log: line integrals are logarithms of counts. counts: line integrals and weights carry the likelihood "
+        f"of the photons counted, for few photons. auto: counts where a pixel of the open beam has fewer than "
         f"{FEW_PHOTONS}.",
     ),
     click.option(
@@ -327,8 +334,8 @@ _AFTER = (
         type=click.Choice(get_args(FlatFields)),
         default="groups",
         show_default=True,
-        help="groups: a view's flat is interpolated between the means of groups of flats; dynamic: the mean of all, "
-        "with the components of their changes that the view shows, for a beam that moves (4 flats or more).",
+        help="groups: interpolate the flat of a view between the means of groups of flats. dynamic: add the changes "
+        "of the flats that the view shows, for a beam that moves (4 flats or more).",
     ),
     click.option(
         "--ring-current",

@@ -21,8 +21,8 @@ LINK, LIBRARY = "camera link", "camera library"
 _SUPERSPEED = "one Hamamatsu camera on a SuperSpeed link (5 Gbit/s or more)"
 _LINK_ADVICE = {
     usb.Verdict.SLOW: "Use the vendor's USB 3 cable, shorter than 3 m, in a port marked SS or blue, without a hub or "
-    "extension; then switch the camera off and on. A camera at 480 Mbit/s gives about 2 full frames a second",
-    usb.Verdict.ABSENT: "Switch the camera on, wait for its lamp, check the cable at both ends; on Linux see whether "
+    "extension. Then switch the camera off and on. A camera at 480 Mbit/s gives about 2 full frames a second",
+    usb.Verdict.ABSENT: "Switch the camera on, wait for its lamp, check the cable at both ends. On Linux see whether "
     "`lsusb -d 0661:` lists it, on Windows the Device Manager",
     usb.Verdict.AMBIGUOUS: "Set devices.camera.usb_product or usb_serial to the ids listed here",
 }

@@ -68,7 +68,7 @@ def waiting_frames(frame_bytes: int) -> int:
 
 
 def ring_bytes(timeline: Timeline, most: int) -> int:
-    """Memory of the camera's ring buffer for the longest block, at most `most` bytes: one slot more than frames and at
+    """Memory of the camera's ring buffer for the longest block, at most `most` bytes. One slot more than frames and at
     least 16, like the driver."""
     frames = max(block.n for block in timeline.blocks)
     slots = max(2, min(max(frames + 1, 16), most // timeline.frame_bytes))

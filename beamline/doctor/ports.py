@@ -52,8 +52,8 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Diagnosis:
             Grade.FAILED,
             f"There is no port {url}; there are {listed}.",
             f"the port {url} of the configuration",
-            "Plug the adapter in, switch the controller on, and set the port to one of those found; a name "
-            "under /dev/serial/by-id stays the same when adapters are plugged in another order",
+            "Plug the adapter in, switch the controller on, and set the port to one of those found. A name under "
+            "/dev/serial/by-id stays the same when adapters are plugged in another order",
             values,
         )
     if sys.platform != "win32" and not os.access(url, os.R_OK | os.W_OK):
@@ -94,7 +94,7 @@ def _network(name: str, url: str) -> Diagnosis:
             Grade.FAILED,
             f"{host}:{number} accepts no connection ({error}).",
             expected,
-            "Check the controller's power, its address and port on its panel, the network, and that no other program "
-            "is connected: many controllers accept only one connection",
+            "Check the controller's power, its address and port on its panel, and the network. Close other programs: "
+            "many controllers accept only one connection",
         )
     return Diagnosis(name, Grade.OK, f"{host}:{number} accepts connections.", expected)

@@ -65,8 +65,8 @@ class Load:
 
     @cached_property
     def images(self) -> Sequence[NDArray[np.uint16]]:
-        """Frames with photon noise, REFERENCES darks, as many flats, and RING views of a cylinder on the axis; those
-        of a kind are the same noise, shifted along the cylinder."""
+        """Frames with photon noise, REFERENCES darks, as many flats, and RING views of a cylinder on the axis. Those of
+        a kind are the same noise, shifted along the cylinder."""
         random, u = np.random.default_rng(0), np.linspace(-1, 1, self.shape[1]) / RADIUS
         light = FLAT * np.exp(-ABSORPTION * np.sqrt(np.clip(1 - u**2, 0, None)))
         images = list[NDArray[np.uint16]]()

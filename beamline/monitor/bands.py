@@ -1,9 +1,9 @@
 """Bands: rows or columns that lose or gain light at once while the others do not: a lost packet, a slit that moved.
 
 A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
-column is compared with what the views before let expect (it goes on as it did), and what all have in common is the
-beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their neighbours as they did
-at its beginning.
+column is compared with the value expected from the views before. A change that all have in
+common is the beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their neighbours
+as they did at its beginning.
 """
 
 from __future__ import annotations

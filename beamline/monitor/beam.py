@@ -2,8 +2,8 @@
 
 Against the flats it is judged where there is air: the brightest of the places in a view. It is a drift: said once, and
 again only after it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
-air. These changes have errors of one sign where dense particles turn fast, which would sum up to a dip: one counts only
-where the light of the whole view moved with it.
+air. These changes have errors of one sign where dense particles turn fast; these would sum up to a dip. A change counts
+only where the light of the whole view moved with it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.frame import Frame, FrameKind
 
-PLACES = (4, 16)  # parts of the field, down and across, the brightest of which is air
+PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
 COVERED = 0.1  # light that the brightest place has less than the flats: there is no air, or the beam fell before
 LASTS = 5  # views that a drift must last
 GONE = 0.5  # of the limit, below which a drift has gone
@@ -45,8 +45,8 @@ class BeamState:
         usual: level that is normal.
         dipping: views in a row with a dip.
         whole: logarithm of the light of the whole view before; NaN before any.
-        changes: of the light from view to view, none larger than half of `alarm`: so that one dip is no scatter, and
-            the limit at most 3.8 times `alarm`.
+        changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the
+            limit is at most 3.8 times `alarm`.
     """
 
     drifting: int = 0
@@ -63,8 +63,8 @@ class BeamState:
 class BeamCheck:
     """Score: fraction of the light that is gone (negative: there is more).
 
-    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, which air beside the sample
-    allows; 10 % at once are no drift of a ring.
+    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, as air beside the sample
+    allows. 10 % at once are no drift of a ring.
     """
 
     name: ClassVar[str] = "beam"
@@ -125,7 +125,7 @@ class BeamCheck:
             if state.covered:
                 return Look(replace(state, drifting=0))
             advice = (
-                f"No part of the frame gets more than {1 - score:.0%} of the flats' light: the sample covers all of "
+                f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
                 "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))

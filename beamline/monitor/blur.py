@@ -2,8 +2,8 @@
 
 The figure is the contrast of second differences over two pixels against that of first differences over four, along the
 rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
-product of a difference and the same difference a line beside it: noise is independent from line to line and adds
-nothing on average, however few the photons, while edges go on. The light's level and a smooth beam cancel.
+product of a difference and the same difference a line beside it. Noise is independent from line to line and adds
+nothing on average, however few the photons; edges go on. The light's level and a smooth beam cancel.
 """
 
 from __future__ import annotations

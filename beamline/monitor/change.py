@@ -4,8 +4,8 @@ Between neighbouring views each cell goes on as it did: depth + velocity, from t
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
 stage other than the last ones (turn). For the columns of the fit: d depth = -gain - across d/dx - down d/dy + turn
 velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The first pass
-weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964), so
-that a floater, a zinger or a band moves nothing.
+weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964). So a
+floater, a zinger or a band moves nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from beamline.core.jit import njit
 from beamline.monitor.view import CellGrid, CellValues, CellView
 
-SPAN = 4  # views before, of which the velocity is the mean of three steps
+SPAN = 4  # views before; the velocity is the mean of their three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
 LEAST_VARYING = 0.1  # of what a shift changes, which must differ from row to row
 MOST_STEPS = 4  # steps that a gap may have: after a longer one, velocities say nothing

@@ -83,8 +83,8 @@ class ScanContext:
         stored: views that are in an earlier file of the scan.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
-        model: line integrals that a volume has at an angle in radians, float32 [row, col] means of cells of so many
-            pixels a side; None where no volume is known.
+        model: line integrals of a volume at an angle in radians, float32 [row, col] means of cells of so many pixels a
+            side. None where no volume is known.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.

@@ -1,9 +1,9 @@
 """Floater: a particle that crosses the field in some views, faster than the sample's turning carries anything.
 
-It is found by filters that are blind to all that turns within the field (beamline.monitor.fan), as peaks of absorption
-that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of the sample
-obeys col = a cos + b sin + c with sqrt(a² + b²) within the sample; a floater's line is steeper than any of these at its
-place.
+It is found by filters that are blind to all that turns within the field (beamline.monitor.fan). It shows as peaks of
+absorption that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of
+the sample obeys col = a cos + b sin + c with sqrt(a² + b²) within the sample; a floater's line is steeper than any of
+these at its place.
 """
 
 from __future__ import annotations

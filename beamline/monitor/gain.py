@@ -32,7 +32,7 @@ class GainState:
 class GainCheck:
     """Score: relative change of the light of all places alike since the view before (beamline.monitor.change).
 
-    The default: flats divide a step out only if they are taken anew, and 1 % of light is 0.01 of line integral in every
+    The default: flats divide a step out only if they are taken anew. 1 % of light is 0.01 of line integral in every
     ray, a fifth of what 50 um of electrolyte do. A ring that is topped up every few minutes steps by less. The figure's
     own noise is 1e-4 on 128 x 512 pixels of 5000 photons.
     """

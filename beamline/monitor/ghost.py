@@ -1,8 +1,8 @@
 """Ghost: a broad hump of more or less light than any view should have that crosses the field from side to side.
 
-As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan), but they look at the mean of
-all rows on broad columns, for a hump as broad as a part of the field: 2 % of light in one cell are lost in the noise,
-and in the mean of thousands of pixels they are a hundred times its noise.
+As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan). But they look at the mean of
+all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are lost in the noise.
+In the mean of thousands of pixels they are a hundred times its noise.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class GhostState:
 
 @dataclass(frozen=True)
 class GhostCheck:
-    """Score: relative change of the light in the middle of the ghost, without its sign: in the few views of a window, a
+    """Score: relative change of the light in the middle of the ghost, without its sign. In the few views of a window, a
     ghost that leaves a place looks like a shadow that comes.
     """
 

@@ -1,8 +1,8 @@
 """Opposite: does the view from the other side, or the same view taken again, show the same sample in the same place?
 
 Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
-degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. Where it fits best gives the axis,
-and a shift since; what is left is stated as the shift of the whole sample that would leave as much.
+degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a
+shift since. The remainder is stated as the shift of the whole sample that would leave as much.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class OppositeState:
 class OppositeCheck:
     """Score: pixels by which the sample moved, or by which all of it would have to move to change the view as much.
 
-    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution; where it is more, a
-    twentieth of a cell, up to which a shift is known. Flat faces and coarse steps leave a remainder of 0.3 cells.
+    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution. Or a twentieth of a cell
+    where that is more, since a shift is known no better. Flat faces and coarse steps leave a remainder of 0.3 cells.
     """
 
     name: ClassVar[str] = "opposite"

@@ -41,9 +41,9 @@ class PixelsState:
 
 @dataclass(frozen=True)
 class PixelsCheck:
-    """Score: fraction of the pixels that are dead: in all flats of the group at the scan's begin they have less than a
-    fifth of the light around them. It is said at the first view, as a fact where they are few. In a view also the
-    fraction that holds no number (NaN, infinite) but does in the darks and flats.
+    """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
+    of the light around them. It is said at the first view, as a fact where they are few. In a view also the fraction
+    that holds no number (NaN, infinite) but does in the darks and flats.
 
     The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
     """

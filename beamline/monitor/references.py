@@ -1,6 +1,6 @@
 """Darks and flats judged as groups: saturated, without light, uneven, or lit though they should be dark.
 
-A volume is lost by bad references as surely as by bad views, so they are judged before the first projection is taken,
+Bad references spoil a volume as surely as bad views. So they are judged before the first projection is taken,
 and once more before a file is reconstructed. All functions are pure: values of frames in, faults with figures out.
 """
 
@@ -44,7 +44,7 @@ class ReferenceLimits:
     uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
     unlit: a beam may be narrower than the detector, but not so that most of it is dark.
     light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their
-        variance; an offset has the first alone and readout noise the second. A fifth of both is neither.
+        variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
     """
 
     saturated: Annotated[float, Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")] = 1e-3
@@ -234,7 +234,7 @@ def _outshone(flats: Group, darks: Group | None, views: Group, limits: Reference
     share = there / most
     said = (
         f"they have {share:.2%} of the light of the views (limit {1 - limits.light_gone:.0%}), though a sample only "
-        "takes light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
+        f"takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
     )
     return ReferenceFault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, said)
 

@@ -40,7 +40,7 @@ class CellGrid:
         lit: float32 [row, col], 1 where a cell has light enough to say something, else 0.
         flats: there were flats; otherwise `full` is 1 and line integrals are relative.
         row_dark, col_dark: dark counts of each preview row and column, means.
-        left, right: first and last column of cells of which most are lit.
+        left, right: first and last column of cells with most of them lit.
     """
 
     cell: int

@@ -54,8 +54,8 @@ class Monitor:
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
-    """Median step from one of these angles, in the order of their views, to the next; NaN where they do not turn one
-    way (golden or random angles), so that no view has its neighbour beside it."""
+    """Median step from one of these angles, in the order of their views, to the next. NaN where they do not turn one
+    way (golden or random angles): no view then has its neighbour beside it."""
     steps = np.diff(angles)
     steps = steps[np.isfinite(steps) & (steps != 0)]
     share = float((steps > 0).mean()) if steps.size else 0.5

@@ -143,14 +143,14 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
     if interval % unit:
         yield (
             f"views are {interval} counts of the stage apart, and a trigger output that is toggled needs a multiple of "
-            f"{unit}; take another number of views, devices.stage.toggle: false where the firmware can, or "
+            f"{unit}. Take another number of views, devices.stage.toggle: false where the firmware can, or "
             "scan.mode: step"
         )
     elif interval < least:
         fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
         yield (
             f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
-            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s; take fewer views, a shorter "
+            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer views, a shorter "
             f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {_down(fastest):g}"
         )
 
@@ -174,8 +174,8 @@ def _rounding(facts: PlanFacts) -> Iterator[str]:
     count = 2 * math.pi / stage.counts_per_turn
     yield (
         f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; triggers fall on whole counts, so "
-        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, which moves views by up to "
-        f"{degrees(flight.drift)}; the file holds the angles that were triggered"
+        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, and views move by up to "
+        f"{degrees(flight.drift)}. The file holds the angles that were triggered"
     )
 
 

@@ -35,7 +35,7 @@ def work_out(
     """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
 
     Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, rounded to whole
-    counts a second (the views' block has the period that comes of it); it starts far enough before the first pulse to
+    counts a second (the views' block has the resulting period). It starts far enough before the first pulse to
     reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return
     at full speed between them. The duration is that of a stage that stands at its zero and goes back there at the end,
     without shutter and sample moves.

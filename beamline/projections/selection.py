@@ -51,7 +51,7 @@ class Hardening:
     Attributes:
         description: the material and the beam as the user said them, for the record.
         spectrum: the material's attenuation, in any unit, at the energies of the beam, and their shares of the detected
-            light; None: the curve is fitted on the views.
+            light. None: the curve is fitted on the views.
     """
 
     description: str
@@ -76,7 +76,7 @@ class Selection:
         judge: the monitor looks at the frames of the file now, and its flags count in place of the file's.
         accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
         noise: "log": line integrals are logarithms of counts; "counts": they and weights carry the likelihood of the
-            counts; "auto": that where the open beam has few photons a pixel.
+            counts. "auto": that where the open beam has few photons a pixel.
         flat_fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components
             of their changes that the view shows, see `recon.prep.dynamic_flats`.
         use_current: views and flats are divided by the ring current that the file has for each frame.
@@ -85,7 +85,7 @@ class Selection:
         phase: None: it is not retrieved.
         hardening: None: it is not corrected.
         axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
-        tilt_deg: by how much the axis leans in the detector's plane: its column grows by tan(tilt) a row; None: nobody
+        tilt_deg: by how much the axis leans in the detector's plane: its column grows by tan(tilt) a row. None: nobody
             knows, and views are used as they are.
         find_tilt: the tilt is found.
         distortion: of the lens; None: none.

@@ -109,7 +109,7 @@ class _Budget:
         return plans(left, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
     def preferred(self, found: Sequence[Choice]) -> Choice:
-        """The first of the methods that is level with the one of which most is expected."""
+        """The first of the methods that is level with the one expected to gain most."""
         level = [c for c in found if c.gain >= found[0].gain - _LEVEL]
         order = list(self.methods)
         return min(level, key=lambda c: order.index(c.method))
@@ -130,11 +130,11 @@ def within(
 ) -> Budgeted:
     """Reconstruct within `budget` seconds by the clock of `control`, the measuring included.
 
-    For each method the settings that the time suffices for follow from its measured curves. Where there are several,
-    they are tried on some rows, and the one that predicts views held out best gets what is left; where a trial would
-    take more than 0.375 of the time, it is the first one of which as much is expected as of any. Placing of Gaussians
-    is run and timed before the fit gets what is left, and filling is timed on a slab. Where even the cheapest choice
-    will be late, `warn` gets a warning before the work.
+    For each method the settings that the time suffices for follow from its measured curves. Several methods are tried
+    on some rows, and the one that predicts views held out best gets the time that is left. Where trials would take more
+    than 0.375 of the time, the first method with the highest expectation is taken. Placing of Gaussians is run and
+    timed before the fit gets what is left, and filling is timed on a slab. Where even the cheapest choice will be late,
+    `warn` gets a warning before the work.
 
     Args:
         methods: to choose from, with measured curves, by preference; the choice sets their steps and Gaussians.

@@ -213,8 +213,8 @@ class ScanFollower:
         Does nothing where the views are of one part, and these are what they were. `why` is said, unless views are
         unlearned.
 
-        Where views of these are not usable any longer, the model goes on without them, at the first rates: a check
-        found them bad when it had seen later ones, or they were taken again.
+        Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
+        again. Then the model goes on without them, at the first rates.
         """
         assert self._correction is not None and self._fit is not None
         fed = np.concatenate([batch.view_ids for batch in self._batches])

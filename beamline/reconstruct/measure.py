@@ -111,8 +111,8 @@ def measure(
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
     With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. With views: the
-    residual in up to 16 of the views used, and in the views held out where there are any; of a detector with more than
-    2^17 pixels in bands of rows that have so many. `told` hears how many of these views were compared.
+    residual in up to 16 of the views used, and in the views held out where there are any. Of a detector with more than
+    2^17 pixels only bands of rows with so many pixels are used. `told` hears how many of these views were compared.
     """
     values: dict[str, float] = {}
     if truth is not None:

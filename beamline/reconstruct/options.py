@@ -46,7 +46,7 @@ class ReconOptions:
         memory: bytes that the reconstruction may use; None: 70 % of what is free.
         region: of the volume that is wanted; None: all of it.
         cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
-        partial: volume of which the missing slabs are reconstructed; None begins anew.
+        partial: volume whose missing slabs are reconstructed; None begins anew.
         command: that repeats this, for the record.
         recipe: its options that hold for any scan, as YAML, for the record.
     """

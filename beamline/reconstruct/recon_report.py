@@ -92,8 +92,8 @@ class ReconOutcome:
     def next_decibel(self) -> NextDecibel | None:
         """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
 
-        None for a direct method, while views still came, for a resumed fit, whose whole time is not known, and for one
-        with other rates than the fits that were measured, such as one that followed a scan.
+        None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
+        also for other rates than those of the fits that were measured, as after following a scan.
         """
         judged = residual_curve(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:
@@ -283,8 +283,8 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as image "
-            "viewers show them, all in one grey window (1st to 99.5th percentile of these slices).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
+            "viewers. All share one grey window (1st to 99.5th percentile).",
             figures.orthogonal_slices(shown, unit),
         ),
         Picture(
@@ -295,7 +295,7 @@ def _pictures(
         Picture(
             "Sharpest edge, and values",
             "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
-            "artefacts. Values: narrower peaks are better, if what lies between them is none of the sample's.",
+            "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
             figures.profile_and_values(shown, unit),
         ),
     ]

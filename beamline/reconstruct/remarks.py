@@ -23,8 +23,8 @@ def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
     z, y, x = (f"{first}:{end}" for first, end in beside_fbp.lost)
     return (
         f"The {label_of(made.method)} volume keeps {beside_fbp.kept:.0%} of the mass that FBP shows above its own air "
-        f"in a region of {z},{y},{x} [z, y, x]: weak matter was lost, as where air is below zero. See --air in "
-        "docs/commands.md, give --allow-negative, or use --method fbp."
+        f"in a region of {z},{y},{x} [z, y, x]. Weak matter was lost, as where air is below zero. See --air in "
+        "docs/corrections.md, give --allow-negative, or use --method fbp."
     )
 
 

@@ -31,7 +31,7 @@ from recon.reconstruction import Reconstruction
 from recon.voxels.methods.fista_tv import FistaTv
 
 _LOOKED_AT = 8  # views by which the rows with most matter are found
-_WEIGHED = 16  # rows of which weights are made at a time
+_WEIGHED = 16  # rows whose weights are made at a time
 
 _LOOK = 0.5  # s between two looks at slabs under way
 

@@ -170,7 +170,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
     """Each volume along a line through the sharpest edge of the last one, and how often its values occur.
 
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
-    voxel, so that single noisy voxels are no edges.
+    voxel. So single noisy voxels are no edges.
     """
     last = list(volumes.values())[-1].data
     z = bright_centre(last)[0]

@@ -133,7 +133,7 @@ class _Panel:
 
 def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:
     """The images with pixels repeated, or means of several, so that the longest side is _SIDE pixels or more, less than
-    twice as many; how many pixels one became."""
+    twice as many. Then how many pixels one became."""
     longest = max(max(image.shape) for image in images)
     if longest < _SIDE:
         factor = math.ceil(_SIDE / longest)

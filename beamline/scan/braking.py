@@ -1,8 +1,8 @@
 """Braking: which triggers exposed the frames that came after a stage was told to stop within a train.
 
 Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
-frames: from its speed u it stands u²/2a further on (constant deceleration a), so the place where it stands tells when
-it began to brake, and where it was at the time of each frame. Of a stage that brakes otherwise, by jerk-limited ramps,
+frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands tells when
+it began to brake, and where it was at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
 the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
 Frames that neither confirms belong to no trigger. All functions are pure.
 """

@@ -212,8 +212,8 @@ class Exposures:
             i += yield from self._pass(block, taken, left, i, (begin, flown.end))
 
     def _after_pause(self, i: int, block: Block, taken: Taken) -> int:
-        """Wait while the scan is paused. Returns the trigger to go on with: `i` or the next one that is not stored, or
-        the first one since there may have been no beam; its frame and those after it are taken again."""
+        """Wait while the scan is paused. Returns the trigger to go on with: `i` or the next one that is not stored. Or
+        the first one since there may have been no beam. Its frame and those after it are taken again."""
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
         if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
             self._supervision.wait_for_beam_reading()

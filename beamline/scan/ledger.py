@@ -2,12 +2,12 @@
 
 A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost in transfer. The
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
-While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame is the
-nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too: where the first trigger's time is not known well, the
-first frames are those that make a regular train, and of two frames that could be a trigger's the nearer one is. That
-takes a look at the frames that follow: see `enter`. Frames exposed while the stage brakes come with the times at which
-their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
+While a stage turns at constant speed, trigger times are linear in the trigger's index. So the index of a frame is the
+nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
+Bordner 1962). Noise on the trigger line exposes frames, too. Where the first trigger's time is not known well, the
+first frames are those that make a regular train. Of two frames that could belong to a trigger, the nearer one does.
+That takes a look at the frames that follow: see `enter`. Frames exposed while the stage brakes come with the times at
+which their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ class Account:
         extra: framestamps of the frames that no trigger exposed.
         unconfirmed: how many of them were exposed while the stage braked.
         shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
-            missing at the other, or a frame too many at the end could be one at the beginning; 0 where there is none
-            or the time of the first trigger was known.
+            missing at the other. Likewise a frame too many at the end could be one at the beginning. 0 where there is
+            none or the time of the first trigger was known.
         off: steps by which the angle of a frame may be wrong, because it came so much off its trigger.
     """
 
@@ -292,8 +292,8 @@ def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int
     Args:
         framestamp: exposures before it, without those that no trigger made.
 
-    Where the expected time is not precise enough, framestamps decide: no trigger was ignored before the first frame,
-    because a camera that is armed and idle ignores none.
+    Where the expected time is not precise enough, framestamps decide. No trigger was ignored before the first frame,
+    because an armed, idle camera takes every trigger.
     """
     if train.first is None:
         return float(framestamp), framestamp, 0.0

@@ -46,7 +46,7 @@ class ReferenceLog:
         """What is wrong with the groups so far, by the name of the group; a sentence or more each.
 
         Args:
-            planned: blocks that are over by now; references of which no frame came are missing.
+            planned: blocks that are over by now; references without any frame are missing.
         """
         missing = {
             block.kind.name: f"None of the {block.n} {block.kind.name.lower()}s planned before the views came."

@@ -1,7 +1,7 @@
 """Tune: a few darks, flats and views at some exposures, and what they say about counts, noise and the exposure to take.
 
-Noise is told from structure by pairs of frames; the gain by photon transfer (Janesick 2007, Photon Transfer, ch. 5):
-variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
+Noise is told from structure by pairs of frames. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
+ch. 5): variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
 sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
 """
 
@@ -53,7 +53,7 @@ class Tuning:
         saturated: fraction of its pixels that are saturated at the configured exposure.
         gain: counts of a photon; NaN where the frames have no noise.
         transmission: of the view, at its darkest hundredth and in the median.
-        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow; NaN
+        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
             where darks have light or flats none.
         noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median.
         longest: exposure that the period and the camera allow.
@@ -212,7 +212,7 @@ def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: in
 
 
 def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:
-    """The longest exposure of the flats of which few pixels are saturated; the shortest where there is none."""
+    """The longest exposure among flats with few saturated pixels; else the shortest."""
     exposures = sorted({frame.exposure for frame in flats}, reverse=True)
     for exposure in exposures:
         each = [(frame.counts >= saturation).mean() for frame in flats if frame.exposure == exposure]

@@ -61,8 +61,8 @@ class EnergyScan:
         return Series(title, self.energies.size, self.frames(self.energies), self.regions)
 
     def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene: first a dark level, then
-        flats and a radiograph for each energy, in the scene's period. A pixel without light is +inf."""
+        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene. First comes a dark level,
+        then flats and a radiograph for each energy, in the scene's period. A pixel without light is +inf."""
         n_darks = max(self.scan.scene.scan.darks, 1)
         dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(n_darks)], axis=0)
         number = n_darks

@@ -85,8 +85,8 @@ def archive(
         progress: counts the MB of images twice, when they are written and when they are compared.
 
     Raises:
-        DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan; the disk
-            is full; what was read back differs. Nothing is left of `out`, and the scan is untouched.
+        DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan. The disk
+            is full, or what was read back differs. Nothing is left of `out`, and the scan is untouched.
     """
     frames, altered, said = _frames_of_archivable(scan)
     if altered and not keep_damaged:

@@ -167,7 +167,7 @@ class DiskFile(UnderHdf5):
                 raise OSError(errno.EIO, f"{n} bytes at {at} are not those that were written", str(self.path))
 
     def _unchanged(self) -> Iterator[tuple[int, int, int]]:
-        """Writes of which nothing was written again."""
+        """Writes that no later write changed."""
         begins, ends = list[int](), list[int]()  # of what later writes cover: apart, in order
         for at, n, checksum in reversed(self._sums):
             first, end = bisect_left(ends, at), bisect_right(begins, at + n)  # those that it overlaps or touches

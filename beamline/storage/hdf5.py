@@ -175,9 +175,9 @@ def reason(error: Exception) -> str:
 def never_close(file: h5py.File) -> None:
     """Keep a file open until the process ends, so that HDF5 changes nothing more on the disk.
 
-    For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
-    object, and may leave it marked as one that nobody can open. HDF5 closes it all the same when the process ends, and
-    crashes where the disk still fails: its handle leads to memory then.
+    For a file that the disk did not take: to close it would write that once more, with a traceback for each object. It
+    may leave the file marked so that nobody can open it. HDF5 closes it all the same when the process ends, and crashes
+    where the disk still fails: its handle leads to memory then.
     """
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back

@@ -1,8 +1,8 @@
 """A journal: changes to a file in its place happen whole, whatever is killed or fails meanwhile.
 
 They are written beside the file first, then to it. Where a journal lies beside a file, its changes were begun: `finish`
-ends them, and readers see the file as it shall be. What makes the file longer is written before what changes in it, so
-that a disk without room is found out while the file is as it was; to write on bytes that are there takes no room.
+ends them, and readers see the file as it shall be. First comes what makes the file longer, then what changes in it. So
+a disk without room is found out while the file is as it was; overwriting bytes takes no room.
 """
 
 from __future__ import annotations

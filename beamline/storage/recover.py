@@ -1,7 +1,7 @@
 """recover: an ordinary scan file of one whose writer died, in its place; every frame that was committed is kept.
 
-HDF5 mends the file in memory, the result is read, and only then the few bytes that differ are written, by a journal:
-whatever stops it, it can be run again.
+HDF5 mends the file in memory, and the result is read. Only then the few bytes that differ are written, by a journal.
+Whatever stops it, it can be run again.
 """
 
 from __future__ import annotations

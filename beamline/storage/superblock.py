@@ -1,7 +1,8 @@
 """The first 48 bytes of an HDF5 file: whether it is being written, what it lacks, and how it would be if closed.
 
-Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A): signature 8,
-version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes, little-endian.
+Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A). Fields:
+signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes,
+little-endian.
 """
 
 from __future__ import annotations

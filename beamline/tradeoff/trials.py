@@ -87,7 +87,7 @@ class Outcome:
         metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), by name.
         gaussians: in the model at the end; None for voxel methods.
         curve: (seconds, dB) of its own record of the residual.
-        curve_of: of which views that is, in words.
+        curve_of: which views that record is of, in words.
         message: why there are no figures.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
     """

@@ -100,8 +100,8 @@ def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
     """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
     pixels).
 
-    Both are NaN where a region is not usable: more than 1 % of its pixels are dark (+inf; the mean of the others is not
-    the region's, and pixels without light have no noise), or less than half of them have a value.
+    Both are NaN where a region is not usable: more than 1 % of its pixels are dark (+inf), or less than half of them
+    have a value. The mean of the others is not the region's then, and pixels without light have no noise.
     """
     inside, noise = _level(frame, regions.inside)
     if regions.around is None:

@@ -47,10 +47,10 @@ def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
 
     A curve without an edge is Victoreen's, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise. There
     is an edge where a step upwards at one of the energies improves the fit more than chance would in one of a million
-    such curves (Student's t of the step, times the number of its possible places), or where the curve differs from
-    Victoreen's by five times its noise, which is estimated from second differences. The edge is the maximum of the
-    slope near that step (of parabolas through five points). The white line is the maximum above it, if it exceeds the
-    noise and the extrapolation of the curve's far end.
+    such curves. The test is Student's t of the step, times the number of its possible places. There is also one where
+    the curve differs from Victoreen's by five times its noise, estimated from second differences. The edge is the
+    maximum of the slope near that step (of parabolas through five points). The white line is the maximum above it, if
+    it exceeds the noise and the extrapolation of the curve's far end.
 
     Args:
         energies: keV, rising, [n].

@@ -77,8 +77,8 @@ class FileOptions:
 
     Attributes:
         low, high: keV, the first and the last energy.
-        region, around: (first row, row after the last, first column, column after the last) of the material, and of
-            its surroundings, from which the material is excluded; None: all of the frame, and none.
+        region, around: (first row, row after the last, first column, column after the last) of the material, and of its
+            surroundings, from which the material is excluded. None: the whole frame, and no surroundings.
         unit: of the energies, "keV" or "eV"; None: as in the file, else keV.
         quantity: of the frames, "counts" or "line_integrals"; None: counts.
     """
@@ -141,8 +141,8 @@ def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
 
 @contextmanager
 def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[AbsorptionTable | Radiographs]:
-    """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col] beside `flats`
-    ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]).
+    """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col]. Beside frames it
+    has `flats` ([n, row, col] or [row, col]), perhaps `darks` ([row, col] or [k, row, col]).
 
     Args:
         unit: of the energies, "keV" or "eV"; None: as in the dataset, else keV.
@@ -191,7 +191,7 @@ def _darks(path: Path, file: h5py.File, shape: tuple[int, ...]) -> h5py.Dataset 
 
 
 def _numbers(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
-    """A dataset of numbers; None where there is none of that name."""
+    """A dataset of numbers; None where no dataset has that name."""
     item = hdf5.dataset(file, name)
     if item is not None:
         require_real(item.dtype, f"{path}: {name}")

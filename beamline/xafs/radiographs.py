@@ -41,7 +41,7 @@ class Radiographs:
         return int(self.frames.shape[1]), int(self.frames.shape[2])
 
     def line_integrals(self, which: Sequence[int], part: FramePart = EVERYTHING) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each; +inf where no light
+        """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each. +inf where no light
         was transmitted, NaN without a value, also for integers that are the largest of their type.
 
         Raises:

@@ -1,9 +1,9 @@
-"""Rates and mean of a fit of which nobody knows how many steps are to come.
+"""Rates and mean of a fit whose number of steps is not known.
 
 The rates fall as 1 / (1 + t / 60) with the steps t, and the model is the mean of the parameters over the last quarter
-of them. A step follows one or two views, so that at a high rate the parameters wander about where all views would have
-them; their mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit whose
-rates were planned to end there (docs/notes/performance.md, "Streaming").
+of them. A step follows one or two views, so at a high rate the parameters wander about the point where all views would
+have them. Their mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit
+whose rates were planned to end there (docs/notes/performance.md, "Streaming").
 """
 
 from __future__ import annotations

@@ -177,8 +177,8 @@ def sample_gaussians(
 ) -> Gaussians:
     """At most n isotropic Gaussians drawn from a volume.
 
-    The volume is smoothed first (streaks of few views would attract Gaussians; Yuluo et al. 2025, GR-Gaussian, gain
-    0.4 dB with 25 views), then voxels above 5 % of the density unit are drawn without replacement, with a
+    The volume is smoothed first, since streaks of few views would attract Gaussians. (Yuluo et al. 2025, GR-Gaussian,
+    gain 0.4 dB with 25 views.) Then voxels above 5 % of the density unit are drawn without replacement, with a
     probability that is half density and half gradient. A Gaussian's size is the distance to its neighbours, its density
     the voxel's.
 

@@ -34,18 +34,18 @@ class R2:
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
-        steps: of the fit; 0 gives the starting point; None takes 400, or 200 where a finish follows and the noise of
-            the views hides what more would gain (see `schedule.Schedule`), or as many as fit into `seconds`.
-        seconds: of the whole run, from the call to the volume: start, steps, which the rates decay along, finish and
-            volume; by the caller's clock, and with the time to compile where `warm_up` was not called. Where they do
-            not suffice for the start, a warning says so before it, and the start is made of binned views.
+        steps: of the fit. 0 gives the starting point. None takes 400. It takes 200 where a finish follows and the noise
+            of the views hides the gain of more (see `schedule.Schedule`). With `seconds` it takes as many as fit.
+        seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
+            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. Where they
+            do not suffice for the start, a warning says so before it, and the start is made of binned views.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
             that had it lowest.
-        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None: 8
-            to 24 as views held out prefer, or none for rolled or tilted views, which the voxel projector does not
-            take. The result's `gaussians` stay the model as it was fitted.
+        finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8
+            to 24 as views held out prefer. Rolled or tilted views have none, since the voxel projector does not take
+            them. The result's `gaussians` stay the model as it was fitted.
         allow_negative: the finish keeps voxels below zero; Gaussians have none.
         fit: weights, rates and limits.
     """

@@ -211,7 +211,7 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
     factor = next((n for n in factors if needed / n**3 <= _START_SHARE * left), factors[-1])
     warnings.warn(
-        f"seconds={method.seconds:g} do not suffice for the start of the fit, which takes about {needed:.3g} s: it "
+        f"seconds={method.seconds:g} do not suffice for the start of the fit, which takes about {needed:.3g} s. It "
         f"starts from views binned {factor} x {factor}, and ends with what is left of the time",
         stacklevel=2,
     )
@@ -221,8 +221,8 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
 def _finish_in_time(
     method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
 ) -> tuple[int | None, float]:
-    """The sweeps of the finish as `finish_within` says, or those of the method where the time suffices for two, and
-    their seconds, of so many `left` after the first steps, each of which takes `step`."""
+    """The sweeps of the finish and their seconds, of so many `left` after the first steps, at `step` seconds each.
+    `finish_within` gives the sweeps; where the time suffices for two, the method's own are taken."""
     room = FINISH_SHARE * left
     sweeps, seconds = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
     return (sweeps, seconds) if method.finish is None or sweeps == 0 else (method.finish, room)

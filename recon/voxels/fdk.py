@@ -74,9 +74,10 @@ def fdk(
 ) -> NDArray[np.float32]:
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
-    Exact in the plane of the source; above and below, values fall off with the square of the cone's angle, and flat
+    Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
     interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
-    both (see `fan_shares`): what it cuts off brightens the rim. A voxel that a view does not see gets nothing from it.
+    both (see `fan_shares`). Matter that it cuts off brightens the rim. A voxel that a view does not see gets nothing
+    from it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
@@ -89,8 +90,8 @@ def fdk(
         float32 [z, y, x], 1/mm.
 
     Raises:
-        ValueError: for a parallel beam, rolled or tilted views, a short scan, a shape that does not belong to the
-            geometry, values that are not finite, a box that reaches the source, or an unknown filter.
+        ValueError: for a parallel beam, rolled or tilted views, a short scan, or an unknown filter. Also for a shape
+            that does not belong to the geometry, values that are not finite, or a box that reaches the source.
     """
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:
@@ -129,8 +130,8 @@ def fdk(
 
 
 def _prepared(views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], filter: Filter) -> F32:
-    """Views times the weights [view, col] and the cosine of each ray, with columns of zeros before and after, filtered:
-    [view, col + 2, row + 2], the rim twice."""
+    """Views times the weights [view, col] and the cosine of each ray, filtered. Columns of zeros stand before and
+    after. Shape [view, col + 2, row + 2], the rim twice."""
     rows, cols = geometry.detector_shape
     out = np.empty((geometry.n_views, sum(beyond) + cols + 2, rows + 2), np.float32)
     for view in range(geometry.n_views):

@@ -1,4 +1,4 @@
-"""odd_views: views of which a part is not what a volume made of them has there, against the views beside them."""
+"""odd_views: views with a part that differs from the volume made of them, compared with the views beside them."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ def odd_views(
 ) -> tuple[OddView, ...]:
     """Views in which something was in the beam, or the sample was elsewhere, for few views: p - A x, seen by place.
 
-    The difference of each view from the volume's projection, less what all its pixels have in common (light), averaged
-    over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views fully: at
-    edges that it blurs, at rings, at what lies outside the field. So a difference counts by what the 18 views of the
-    nearest angles have at the same place, and by the edges of the volume in the view itself, where a face or a crack
-    that is parallel to the rays is sharp in few views only [our own].
+    The difference of each view from the volume's projection, less what all its pixels have in common (light). It is
+    averaged over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views
+    fully: at edges that it blurs, at rings, at what lies outside the field. So a difference counts relative to the 18
+        views of the nearest angles at the same place. It also counts relative to the edges of the volume in the view
+        itself: a face or a crack parallel to the rays is sharp in few views only [our own].
 
     Args:
         projections: [view, row, col].

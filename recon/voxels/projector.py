@@ -1,8 +1,8 @@
 """The voxel projector: line integrals through a volume, and the exact transpose.
 
-Both directions run on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. Whoever
-applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward` and
-`adjoint` take and give the usual one and pay a copy each way (256³: some 0.05 s on two cores).
+Both directions run on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. A caller
+that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
+and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
 A ray has no width: pixels should not be much larger than voxels, or voxels between the rays are not seen.
 """

@@ -108,8 +108,8 @@ class Momentum:
 def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6) -> float:
     """An upper bound of the largest eigenvalue of Aᵀ W A, within a few per cent, by power iteration.
 
-    For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942),
-    so the step 1 / bound is safe after any number of rounds; the Rayleigh quotient would err to the other side.
+    For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
+    So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side.
     """
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)

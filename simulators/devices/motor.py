@@ -1,7 +1,7 @@
 """Pulse motor: one axis that counts commanded pulses, with limits, stops and a position-synchronised trigger output.
 
-Nothing runs in the background: a move is a closed form of time, so its trigger pulses are put on the line, with their
-exact times, the moment it starts, and those still to come are taken away when it is stopped.
+Nothing runs in the background: a move is a closed form of time. So its trigger pulses are put on the line, with their
+exact times, the moment it starts. Those still to come are taken away when it is stopped.
 """
 
 from __future__ import annotations

@@ -14,14 +14,14 @@ from simulators.frame.shot import CannotExposeError, Image, Shot
 
 @dataclass(frozen=True)
 class Adc(ImageEffect):
-    """Counts in steps of 2^(16 - bits), from 0 to the last step: the codes are the upper bits of 16, so that conversion
-    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits; photon numbers
+    """Counts in steps of 2^(16 - bits), from 0 to the last step. The codes are the upper bits of 16, so that conversion
+    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits. Photon numbers
     can be resolved only then, since fewer bits have steps wider than an electron.
 
     Attributes:
         bits: of a code.
         nonlinearity: integral: the largest departure of the response from the straight line through its ends, as a
-            share of the full range F; the response bows, y = x + 4 nonlinearity x (1 - x / F).
+            share of the range. F is the full range. The response bows, y = x + 4 nonlinearity x (1 - x / F).
     """
 
     bits: Literal[8, 12, 16] = 16

@@ -19,7 +19,7 @@ FEW = 1.0
 class DarkCurrent(ImageEffect):
     """Poisson around the dark current times the exposure.
 
-    A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely, which makes
+    A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely. This makes
     every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
 
     `rate`: electrons a second and sensor pixel.

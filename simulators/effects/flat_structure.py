@@ -20,7 +20,7 @@ REACH = 4.0
 class FlatStructure(ImageEffect):
     """Each speck and scratch multiplies the light by 1 - depth x Gaussian.
 
-    A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them: name dust on the
+    A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them. Name dust on the
     scintillator before scintillator_blur, dust on the camera's window after it. They are computed for sensor pixels and
     averaged over binned ones, so that any ROI and binning shows the same ones.
 

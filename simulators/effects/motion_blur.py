@@ -20,9 +20,9 @@ class MotionBlur(SamplingEffect):
     """Mean of the transmission over as many moments of the exposure as the blur needs: one where the stage stands.
 
     The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are no better, since the
-    transmission jumps at edges: for 1 px of blur of a battery, 1, 2, 4 and 8 moments have errors of 1.1, 0.38, 0.13 and
-    0.045 in 1000 of the beam (rms), Gauss-Legendre 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to 1.6 times
-    larger.
+    transmission jumps at edges: a battery with 1 px of blur. 1, 2, 4 and 8 moments have errors of 1.1, 0.38, 0.13 and
+    0.045 in 1000 of the beam (rms). Gauss-Legendre has 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to 1.6
+    times larger.
 
     Attributes:
         tolerance_px: pixels that the sample's rim may travel from one moment to the next. The rim counts even where it

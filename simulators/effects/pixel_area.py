@@ -11,7 +11,7 @@ from simulators.effects.chain import AreaEffect
 class PixelArea(AreaEffect):
     """Mean of the transmission over rays x rays points of a pixel, evenly spread (midpoint rule).
 
-    Without it edges are as sharp as a single ray, and jump from pixel to pixel: no volume of voxels explains such
+    Without it edges are as sharp as a single ray, and jump from pixel to pixel. No volume of voxels explains such
     views, and iterative methods bend theirs (docs/studies.md).
 
     Attributes:

@@ -14,7 +14,7 @@ from simulators.frame.shot import Image, Shot
 @dataclass(frozen=True)
 class Saturation(ImageEffect):
     """Charge x is clipped at the full well W; with a knee, charge above x0 = (1 - knee) W becomes
-    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))), which bends smoothly and stays below the full well.
+    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))). This bends smoothly and stays below the full well.
 
     Name it after all effects that add charge and before the read noise. Binned pixels share their light evenly.
 

@@ -136,7 +136,7 @@ def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str
     if n < base.image_key.size == table.size:
         raise DataError(
             f"{name} has {table.size} angles, one for each frame, and {base.path} does not say when its darks and "
-            f"flats were taken: say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
+            f"flats were taken. Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
         )
 
 

@@ -42,7 +42,7 @@ class ReferenceGroups:
         return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)
 
     def lacking(self) -> tuple[JudgedGroup, ...]:
-        """The groups of a kind of which none is good."""
+        """The groups of a kind where all are bad."""
         return tuple(
             group for group in self.judged if all(other.faults for other in self.judged if other.kind is group.kind)
         )
@@ -78,7 +78,7 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
 def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
     """Flats that are lit, whole and even, and darks that are dark; a bad group beside a good one is left out.
 
-    An error for groups of a kind of which none is good, a warning for others that have a fault.
+    An error where all groups of a kind are bad, a warning for others that have a fault.
 
     Args:
         accepted: all are used as they are, so that a fault is a warning.

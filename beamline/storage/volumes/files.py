@@ -32,7 +32,9 @@ def format_of(path: Path) -> VolumeFormat:
     found = next((kind for kind in formats() if suffix in kind.suffixes), None)
     if found is None:
         known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
-        raise ValueError(f"{str(path)!r}: the suffix names the format of a volume, and {suffix!r} is none of {known}.")
+        raise ValueError(
+            f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}."
+        )
     return found
 
 

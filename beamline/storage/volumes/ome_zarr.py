@@ -1,7 +1,7 @@
 """OME-Zarr 0.5: a folder with the volume in several scales, each in raw chunks, for viewers that load what they show.
 
 A Zarr 3 array without a compressor is a zarr.json and a file for each chunk with its voxels in order (Zarr core 3.0,
-zarr-specs.readthedocs.io), which is written here; the axes and scales are those of ngff.openmicroscopy.org/0.5.
+zarr-specs.readthedocs.io). It is written here; the axes and scales are those of ngff.openmicroscopy.org/0.5.
 """
 
 from __future__ import annotations

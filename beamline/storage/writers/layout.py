@@ -18,9 +18,9 @@
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
 image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind. image_key_control (a link to it),
-field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo, without which its
-programs (nabu) take a file for one of another kind, or leave out its darks and flats.
-Float frames are no NXtomo (its data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
+field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo. Without them its
+programs (nabu) take a file for one of another kind, or leave out its darks and flats. Float frames are no NXtomo (its
+data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """NXtomoWriter: a scan's file while it grows, in a state that a reader can trust after every frame.
 
-The file is written SWMR (single writer, multiple readers): what was flushed can be read by others at once, and
-survives the death of this process; every second it is brought to the disk (fsync), where it survives a loss of power.
+The file is written SWMR (single writer, multiple readers). Others can read flushed frames at once, and these survive
+the death of this process. Every second they are brought to the disk (fsync), where they survive a loss of power.
 `frames_committed` is advanced last, so that it never counts half a row.
 """
 
@@ -118,8 +118,8 @@ class NXtomoWriter:
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
         """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found, in rows before it too.
 
-        DataError for a wrong shape, type or index (nothing is written), or a disk that does not take it (the frames
-        before stay readable; nothing more can be appended).
+        DataError for a wrong shape, type or index; nothing is written then. Also for a disk that does not take the
+        frame; the frames before stay readable, and nothing more can be appended.
         """
         self._check(frame, digest)
         record = layout.Record(
@@ -180,7 +180,7 @@ class NXtomoWriter:
         DataError where the disk does not take it; the frames committed stay readable.
         """
         if status not in STATUSES:
-            raise ValueError(f"Status {status!r} is none of {', '.join(STATUSES)}.")
+            raise ValueError(f"Status {status!r} is not known; expected {', '.join(STATUSES)}.")
         if not self._open:
             return
         self._open = False

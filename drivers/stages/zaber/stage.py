@@ -31,7 +31,7 @@ class ZaberStage:
 
     `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
     move against a train under way ends the train: the controller counts distance both ways. Where triggers are not
-    `chained`, `arm` itself turns the stage to one step before the first pulse and waits; it then speeds up over the
+    `chained`, `arm` itself turns the stage to one step before the first pulse and waits. It then speeds up over the
     first pulses.
 
     Args:

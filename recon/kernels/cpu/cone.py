@@ -1,9 +1,9 @@
 """Cone-beam projector and its adjoint: Joseph's interpolation, the detector's rows fastest (numba, threaded).
 
 All rays to one column of the detector lie in one plane parallel to the rotation axis, so they share their path in x and
-y; in every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is
-sampled once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row]; the table of rays is that
-of `cpu.joseph`. The transpose reads the same weights and runs plane by plane: no two threads write to one voxel.
+y. In every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is sampled
+once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row]; the table of rays is that of
+`cpu.joseph`. The transpose reads the same weights and runs plane by plane: no two threads write to one voxel.
 """
 
 from __future__ import annotations

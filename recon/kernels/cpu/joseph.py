@@ -1,10 +1,10 @@
 """Parallel-beam projector and its adjoint: Joseph's interpolation, the slices of a volume fastest (numba, threaded).
 
-A ray is sampled once in every plane of voxels across the axis that is closest to its direction, by linear
-interpolation between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are [y, x, z]
-and projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions read their
-weights from one table of rays, so each is the exact transpose of the other; the transpose runs plane by plane, and no
-two threads write to one voxel.
+A ray is sampled once in every plane of voxels across the axis that is closest to its direction. Samples are
+interpolated linearly between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are
+[y, x, z] and projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions
+read their weights from one table of rays, so each is the exact transpose of the other. The transpose runs plane by
+plane, and no two threads write to one voxel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Flags = NDArray[np.bool_]
 _f = np.float32
 
 # Columns of the table of rays. A ray crosses plane j at line AT + STEP j, where one detector row is RISE + CLIMB j
-# slices high; it runs PATH mm from plane to plane, and REACH mm from the source to the detector (both in the plane).
+# slices high. It runs PATH mm from plane to plane, and REACH mm from the source to the detector (both in the plane).
 AT, STEP, RISE, CLIMB, PATH, REACH = range(6)
 
 _BLOCK = 64  # slices of one job, at most
@@ -123,8 +123,8 @@ def _columns(rays, v, low0, low1, j0, j1):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _tile(axis, y0, y1, x0, x1):  # type: ignore[no-untyped-def]
-    """How rays cross a tile: planes j0..j1 (excluded), lower lines low0..low1 (excluded) of samples that touch it, rows
-    of the tile from plane to plane and from line to line, and the row of the first sample."""
+    """How rays cross a tile. Planes are j0..j1 (excluded), lower lines of samples that touch it low0..low1 (excluded).
+    Then rows of the tile from plane to plane and from line to line, and the row of the first sample."""
     if axis == 0:
         return y0, y1, x0 - 1, x1, _EDGE, 1, _EDGE
     return x0, x1, y0 - 1, y1, 1, _EDGE, 1

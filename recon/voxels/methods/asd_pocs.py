@@ -27,14 +27,14 @@ F32 = NDArray[np.float32]
 class AsdPocs:
     """Adaptive steepest descent of TV between projections onto the data (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
-    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep was;
-    steps shrink by `alpha_decay` where they undo more than `ratio` of the sweep while the data are not yet explained to
+    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep was.
+    Steps shrink by `alpha_decay` where they undo more than `ratio` of the sweep while the data are not yet explained to
     `goal`. Memory: 5 volumes, 3 x the projections.
 
     Attributes:
-        goal: ||A x - p|| / ||p|| to be reached; None: 0.15 of that of filtered back-projection (FBP or FDK), or, for
-            views that it does not take (a cone's short scan), of a sweep of ordered-subset SIRT, which has about
-            the same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
+        goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
+            cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. That has about the
+            same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
         allow_negative: voxels below zero are kept.
     """
 

@@ -1,6 +1,6 @@
 """Simulated PI GCS 2.0 (C-863 class), the axis behind the wire: servo, reference, moves, stops, limits, trigger line.
 
-Inside, positions are encoder counts from the reference switch ("true"); on the wire they are degrees from the axis'
+Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis'
 own zero, which before a reference move is wherever it was switched on. Nothing runs in the background: what a move
 will do at its end is done when somebody next looks. Strict where a manual is silent: a move during a move is refused.
 """

@@ -82,8 +82,8 @@ class PacketReader:
 
 
 def _command(text: str) -> Command:
-    """Numbers at the start are address, axis and id, as many as there are; the first word that is none begins the
-    command. "--" in the third place is no id."""
+    """Numbers at the start are address, axis and id, as many as there are. The first other word begins the command.
+    "--" in the third place is no id."""
     words = text.split()
     numbers: list[str] = []
     while words and len(numbers) < 3 and (words[0].isdigit() or (len(numbers) == 2 and words[0] == "--")):

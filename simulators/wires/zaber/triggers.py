@@ -1,9 +1,10 @@
 """Simulated Zaber triggers and digital outputs: conditions on a moving axis, two actions each, edges with their times.
 
 Nothing runs in the background: `advance` goes from event to event up to a time, and a copy that is advanced beyond it
-predicts the edges still to come. As the vendor's library has it, a trigger fires when its condition turns true, at
-once where it is true when enabled, and COUNT fires disable it. From memory, not confirmed: a distance is counted, in
-both directions, from where the trigger was enabled or last fired; a new value of an output cancels its schedule.
+predicts the edges still to come. A trigger fires when its condition turns true, as in the vendor's library. It fires at
+once if the condition is true when it is enabled; COUNT fires disable it. From memory, not confirmed: a distance is
+counted, in both directions, from where the trigger was enabled or last fired. A new value of an output cancels its
+schedule.
 """
 
 from __future__ import annotations

@@ -266,7 +266,7 @@ def test_hardening_is_corrected_recorded_and_told(folder: Path) -> None:
     for options, error in (
         (("--hardening", "Al:80"), "80 is neither a tube such as 60kV,Al=1 nor a table"),
         (("--hardening", "bone:60kV"), "'bone' is neither a material"),
-        (("--hardening", "Al"), "is none of none, fit, MATERIAL:BEAM"),
+        (("--hardening", "Al"), "expected none, fit or MATERIAL:BEAM"),
         (("--hardening", "fit", "--follow"), "--hardening is for a finished scan"),
     ):
         result = beamline("recon", "scan.h5", *options, "-o", "other.h5")
