@@ -170,9 +170,9 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
 def _here() -> str:
     """Where the numbers of processes are ours: this machine, and in it this container."""
     try:
-        namespace = os.readlink("/proc/self/ns/pid")
+        namespace = Path("/proc/self/ns/pid").readlink()
     except OSError:  # not Linux
-        namespace = ""
+        namespace = Path()
     return f"{zlib.crc32(f'{platform.node()} {namespace}'.encode()):08x}"
 
 

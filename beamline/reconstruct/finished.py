@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+
+from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import ConfigError, DataError
@@ -293,14 +295,20 @@ def _by_fit(job: _Job, method: R2) -> ReconOutcome:
         others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
         origin = origin_of(prepared, method.fit, others)
         resume = checkpoints.begin(origin, steps, job.warn)
-    keep = partial(checkpoints.write, origin, steps, job.warn)
+    lost = ""  # why the last checkpoint was left out
+
+    def keep(state: Mapping[str, NDArray[Any]]) -> None:
+        nonlocal lost
+        lost = checkpoints.write(origin, steps, job.warn, state)
+
     control = RunControl(
         on_progress=job.listener(method.seconds),
         on_checkpoint=None if checkpoints.path is None else keep,
         resume=resume,
     )
     result = job.run(method, control)
-    lost = "" if result.checkpoint is None else keep(result.checkpoint)
+    if result.checkpoint is not None:
+        keep(result.checkpoint)
     started_from = int(result.settings["gaussians_at_start"])
     if options.quality is not None:
         chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
