@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -143,6 +144,7 @@ def run() -> NoReturn:
     HDF5 crashes at exit where a file could not be closed, as on a full disk: the code would be -11 instead of 5. A
     terminal that is closed, or a disk that takes no output, ends no command: what is left to be printed is lost.
     """
+    warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: what rests on them is judged, in words
     outputs, code = Outputs(), 0
     try:
         main(prog_name="beamline")

@@ -81,9 +81,9 @@ class DcamOrca(_Orca):
     """null: counts as measured; else the camera repairs defects with this sensitivity, which alters data."""
     exposure_tolerance: Annotated[float, Field(ge=0)] = 0.01
     """By which fraction (and one line time) the camera may change an exposure before it is refused."""
-    cool_s: Annotated[float, Field(ge=0)] = 0.0
+    cool_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Wait at most so long for the sensor to be cold before a scan; 0: do not wait."""
-    ring_mb: PositiveInt = 1000
+    ring_mb: Annotated[int, Field(gt=0, le=1_000_000)] = 1000
     """Most memory for the ring; a full frame has 18.9 MB."""
     usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
     """USB product id, for the doctor; null: any of the vendor's (which makes other things too)."""
@@ -168,8 +168,8 @@ class _BeamMonitor(Section):
     unit: str
     scale: PositiveScale = 1.0
     """What the number is multiplied by to be in `unit`."""
-    timeout_s: PositiveFloat = 2.0
-    period_s: PositiveFloat = 1.0
+    timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 2.0
+    period_s: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     """Between readings while a scan runs (real time); they are kept in the scan's file."""
     pause_below: PositiveFloat | None = None
     """In `unit`: a scan pauses while there is less; null: it never does."""

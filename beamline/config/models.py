@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, model_validator
 
 from beamline.config.devices import DeviceSection
 from beamline.config.monitor import MonitorSection
@@ -28,6 +28,7 @@ class SampleSection(Section):
 
 
 Views = Annotated[int, Field(gt=0, le=1_000_000)]
+Degrees = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class FixedAngles(Section):
@@ -35,8 +36,8 @@ class FixedAngles(Section):
 
     scheme: Literal["fixed"]
     views: Views
-    start_deg: FiniteFloat = 0.0
-    span_deg: FiniteFloat = 180.0
+    start_deg: Degrees = 0.0
+    span_deg: Degrees = 180.0
 
 
 class SectorAngles(Section):
@@ -44,8 +45,8 @@ class SectorAngles(Section):
 
     scheme: Literal["sector"]
     views: Views
-    first_deg: FiniteFloat
-    last_deg: FiniteFloat
+    first_deg: Degrees
+    last_deg: Degrees
 
 
 class RandomAngles(Section):
@@ -53,8 +54,8 @@ class RandomAngles(Section):
 
     scheme: Literal["random"]
     views: Views
-    start_deg: FiniteFloat = 0.0
-    span_deg: FiniteFloat = 180.0
+    start_deg: Degrees = 0.0
+    span_deg: Degrees = 180.0
     seed: int = 0
 
 
@@ -63,9 +64,9 @@ class InterlacedAngles(Section):
 
     scheme: Literal["interlaced"]
     views: Views
-    passes: PositiveInt
-    start_deg: FiniteFloat = 0.0
-    span_deg: FiniteFloat = 180.0
+    passes: Views
+    start_deg: Degrees = 0.0
+    span_deg: Degrees = 180.0
 
 
 class GoldenAngles(Section):
@@ -73,8 +74,8 @@ class GoldenAngles(Section):
 
     scheme: Literal["golden"]
     views: Views
-    start_deg: FiniteFloat = 0.0
-    span_deg: FiniteFloat = 180.0
+    start_deg: Degrees = 0.0
+    span_deg: Degrees = 180.0
 
 
 class FileAngles(Section):
@@ -92,6 +93,7 @@ AnglesSection = Annotated[
 
 
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
+Column = Annotated[float, Field(ge=-1e7, le=1e7)]
 
 
 class Fields(Section):
@@ -117,19 +119,19 @@ class ScanSection(Section):
 
 
 class OpticsSection(Section):
-    pixel_size_um: PositiveFloat
+    pixel_size_um: Annotated[float, Field(gt=0, le=1e6)]
     """Of an unbinned pixel at the sample."""
-    energy_kev: PositiveFloat | None = None
-    distance_mm: Annotated[float, Field(ge=0)] | None = None
+    energy_kev: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    distance_mm: Annotated[float, Field(ge=0, le=1e7)] | None = None
     """Sample to detector."""
-    axis_col: FiniteFloat | None = None
+    axis_col: Column | None = None
     """Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."""
 
 
 class StorageSection(Section):
     folder: Annotated[str, Field(min_length=1)] = RUNS
-    preview_bin: PositiveInt = 4
-    flush_every: PositiveInt = 16
+    preview_bin: Annotated[int, Field(gt=0, le=10_000)] = 4
+    flush_every: Annotated[int, Field(gt=0, le=1_000_000)] = 16
     """Frames that are flushed together, at most, while others wait to be written; else each is flushed at once."""
 
 
@@ -153,9 +155,9 @@ class ReconSection(Section):
     """A volume while the scan runs; by a method that needs the whole scan, when it is complete."""
     method: MethodName = DEFAULT
     """r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."""
-    seconds: PositiveFloat = 30.0
+    seconds: Seconds = 30.0
     """Time for the fit after the last view."""
-    axis: Literal["auto"] | FiniteFloat = "auto"
+    axis: Literal["auto"] | Column = "auto"
     seed: int = 0
     stop_when: StopWhen | None = None
     """End the scan when its views are enough; needs live: true. null: take all views."""
@@ -170,7 +172,7 @@ class ReconSection(Section):
 
 
 class Speed(Section):
-    speed: PositiveFloat
+    speed: Annotated[float, Field(gt=0, le=1e6)]
     """Simulated seconds per real second."""
 
 

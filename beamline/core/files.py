@@ -5,10 +5,12 @@ from __future__ import annotations
 import errno
 import math
 import os
+import platform
 import shutil
 import stat
 import sys
 import uuid
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -135,7 +137,7 @@ def bring_to_disk(path: Path) -> None:
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """A temporary name beside `path` to write to, a file or a folder. It becomes `path` at the end of the block, when
-    it is on the disk; an error removes it.
+    it is on the disk; an error removes it. One that a killed program left for the same `path` is removed first.
 
     Args:
         path: the file to write. Without `replace` it must not exist.
@@ -146,7 +148,8 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """
     if not replace:
         refuse_existing(path)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.partial")
+    _remove_left(path)
+    partial = path.with_name(f".{path.name}.{_here()}-{os.getpid()}-{uuid.uuid4().hex[:4]}.partial")
     try:
         yield partial
         bring_to_disk(partial)
@@ -162,6 +165,27 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     finally:
         with suppress(PermissionError):  # Windows removes no file that is open, as it is after a full disk
             remove(partial)
+
+
+def _here() -> str:
+    """Where the numbers of processes are ours: this machine, and in it this container."""
+    try:
+        namespace = Path("/proc/self/ns/pid").readlink()
+    except OSError:  # not Linux
+        namespace = Path()
+    return f"{zlib.crc32(f'{platform.node()} {namespace}'.encode()):08x}"
+
+
+def _remove_left(path: Path) -> None:
+    """Remove what programs that were killed here left of `path`."""
+    with suppress(OSError):
+        for left in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:
+            place, _, process = left.name.removeprefix(f".{path.name}.").rpartition("-")[0].partition("-")
+            if left.suffix == ".partial" and place == _here() and process.isdecimal():
+                import psutil  # here, as most commands find nothing
+
+                if not psutil.pid_exists(int(process)):
+                    remove(left)
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:

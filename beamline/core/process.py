@@ -19,7 +19,6 @@ from typing import Any, Self, TextIO
 import psutil
 
 _POLL = 0.2  # real s between two questions whether the process should stop
-_BEHIND: int = getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", 10)  # which only Windows has
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """A Python with this in its environment, and those that it starts, import nothing from the working folder."""
 _LAST_LINES = 5.0  # real s to read what a killed process has left; a child of its own may hold the pipe open
@@ -82,7 +81,8 @@ class ChildProcess:
         )
         if behind:
             with suppress(psutil.Error):  # it has ended already, or the system does not allow it
-                psutil.Process(self._process.pid).nice(_BEHIND)
+                child = psutil.Process(self._process.pid)
+                child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
         self._reader = threading.Thread(target=self._read, name=f"output of process {self._process.pid}", daemon=True)
         self._reader.start()
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+
+from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import ConfigError, DataError
@@ -267,14 +269,20 @@ def _at_once(job: _Job) -> ReconOutcome:
         settings, others = method.made_by
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.warn)
-    keep = partial(checkpoints.write, origin, steps, job.warn)
+    lost = ""  # why the last checkpoint was left out
+
+    def keep(state: Mapping[str, NDArray[Any]]) -> None:
+        nonlocal lost
+        lost = checkpoints.write(origin, steps, job.warn, state)
+
     control = RunControl(
         on_progress=job.listener(getattr(method, "seconds", None)),
         on_checkpoint=None if checkpoints.path is None else keep,
         resume=resume,
     )
     result = job.run(method, control)
-    lost = "" if result.checkpoint is None else keep(result.checkpoint)
+    if result.checkpoint is not None:
+        keep(result.checkpoint)
     chosen, started_from = _chosen(result), int(result.settings.get("gaussians_at_start", 0))
     asked = getattr(method, "gaussians", None) if options.quality is None else None
     if options.quality is not None:

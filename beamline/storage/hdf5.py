@@ -106,10 +106,11 @@ def grows_here(path: Path) -> bool:
     here = path.stat()
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
-            own = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
-            if own and file.get_intent() != h5py.h5f.ACC_RDONLY:
-                if os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
-                    return True
+            alone = file.get_access_plist().get_driver() == h5py.h5fd.fileobj_driver
+            if alone or file.get_intent() == h5py.h5f.ACC_RDONLY:
+                continue
+            if os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
+                return True
     return False
 
 

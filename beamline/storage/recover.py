@@ -62,18 +62,16 @@ class Recovered:
 
     def said(self) -> str:
         """A line for people."""
-        wrong = f"what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
+        wrong = f"; what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"
-            said = (
-                f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong and ': ' + wrong}; nothing was changed."
-            )
+            said = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}; nothing was changed."
         else:
             gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
             lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""
             damaged = f"; frames {spans(self.damaged)} differ from their checksum" if self.damaged else ""
             views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
-            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong and '; ' + wrong}{views}."
+            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong}{views}."
         return f"{said} {self.remark}".strip()
 
 

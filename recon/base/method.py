@@ -80,7 +80,7 @@ class RunControl:
 
     should_stop: Callable[[], bool] | None = None
     on_progress: Callable[[Progress], None] | None = None
-    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], object] | None = None
+    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None
     checkpoint_every: float = 60.0
     resume: Mapping[str, NDArray[Any]] | None = None
     now: Callable[[], float] = time.perf_counter

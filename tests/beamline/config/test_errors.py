@@ -194,3 +194,16 @@ def test_a_configuration_that_is_no_regular_file_or_far_too_large(tmp_path: Path
 def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read: It is a folder"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "optics.pixel_size_um=1e308", "optics.energy_kev=1e308", "optics.distance_mm=1e308", "optics.axis_col=-1e308",
+        "scan.angles.start_deg=-1e308", "scan.angles.span_deg=1e308", "recon.seconds=1e308", "recon.axis=1e308",
+        "storage.preview_bin=1000000000000", "simulation.clock={speed: 1e308}",
+    ],
+)  # fmt: skip
+def test_a_number_beyond_all_that_is_real_is_refused(tmp_path: Path, setting: str) -> None:
+    said = faults(tmp_path, GOOD, setting)
+    assert setting.split("=")[0] in said and "expected" in said and "<= 1e" in said.replace("10000", "1e4")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -34,3 +36,29 @@ def test_what_is_read_back_is_compared(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(DataError, match=r"not what was written.*what was there is untouched"):
         write_whole(path, "new", replace=True)
     assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_program_left_is_removed_by_the_next_that_writes_there(tmp_path: Path) -> None:
+    path, code = tmp_path / "volume.h5", "\n".join(
+        (
+            "import os, sys, pathlib, beamline.core.files as files",
+            "with files.whole_file(pathlib.Path(sys.argv[1])) as partial:",
+            "    partial.write_bytes(b'half')",
+            "    if sys.argv[2] == 'dies': os._exit(9)",
+            "    print(flush=True), input()",
+        )
+    )  # fmt: skip
+    subprocess.run([sys.executable, "-c", code, path, "dies"], check=False)
+    elsewhere, other = (tmp_path / f".{name}.00000000-1-abcd.partial" for name in ("volume.h5", "volume.h5.csv"))
+    for kept in (elsewhere, other):
+        kept.touch()
+    with subprocess.Popen(
+        [sys.executable, "-c", code, path, "lives"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None and process.stdout.readline()
+        (alive,) = {entry for entry in tmp_path.iterdir() if f"-{process.pid}-" in entry.name}
+        with whole_file(path) as partial:
+            assert {*tmp_path.iterdir()} == {elsewhere, other, alive}
+            partial.write_bytes(b"whole")
+        process.kill()
+    assert path.read_bytes() == b"whole"
