@@ -230,9 +230,9 @@ def recon(
     HDF5 is NXtomo, Diamond NeXus, Data Exchange, or any layout whose datasets --data-path and its like name.
 
     Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
-    and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on, the
-    first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs keeps those
-    that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
+    and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on,
+    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs
+    keeps those that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
     """
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.finished import reconstruct_file
