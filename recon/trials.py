@@ -95,7 +95,6 @@ def predicts_best(
     trial, judge, some = (of_views(part, views) for views in (seen, unseen, seen[:: ONE_IN // 2]))
     found: list[tuple[Score, F32]] = []
     refused, begin = [], control.now()
-    quiet = RunControl(control.should_stop, now=control.now)
 
     def stopped() -> bool:
         return control.should_stop is not None and control.should_stop()
@@ -106,7 +105,8 @@ def predicts_best(
         method = methods[at]
         device = part.device if method.traits.device else "cpu"
         try:
-            volume = method.run(replace(trial, device=device), quiet).volume
+            run = RunControl(control.should_stop, _of_trial(control, method.name), now=control.now)
+            volume = method.run(replace(trial, device=device), run).volume
         except ValueError as error:
             refused.append(f"{method.name}: {error}")
             return
@@ -147,6 +147,19 @@ def predicts_best(
     ]
     late = [methods[at].name for at in regular[len(found) + len(refused) :]] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
+
+
+def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | None:
+    """A listener to one trial that says of which method it is; none in a slab, which counts its slices alone."""
+    listen = control.on_progress
+    if listen is None or control.decide is not None:
+        return None
+
+    def told(progress: Progress) -> None:
+        word = progress.unit or ("steps" if progress.n_gaussians else "iterations")
+        listen(replace(progress, unit=f"{word} of the trial of {name}"))
+
+    return told
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:

@@ -16,6 +16,7 @@ from click.shell_completion import CompletionItem
 
 from beamline.cli.lasting import Outputs
 from beamline.core.errors import (
+    INTERRUPTED,
     BeamlineError,
     DataError,
     exit_code,
@@ -150,6 +151,8 @@ def run() -> NoReturn:
         main(prog_name="beamline")
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else BeamlineError.exit_code if end.code else 0
+    except KeyboardInterrupt:  # beside the work of a command, as while its result is printed
+        code = INTERRUPTED
     if lost := outputs.lost():
         click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)
         entry = _COMMANDS.get(next((word for word in sys.argv[1:] if not word.startswith("-")), ""))

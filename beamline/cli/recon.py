@@ -253,9 +253,9 @@ def recon(
     HDF5 is NXtomo, Diamond NeXus, Data Exchange, or any layout whose datasets --data-path and its like name.
 
     Writes a volume [z, y, x] in 1/mm (1/px if the pixel size is unknown), by default as NXtomoproc with all settings,
-    and a report. Nothing is overwritten, and a failure leaves no partial file. The first Ctrl-C during a fit or
-    iterations stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs keeps those
-    that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
+    and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on,
+    the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs
+    keeps those that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
     """
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.finished import reconstruct_file
@@ -341,6 +341,13 @@ def recon(
         _dry_run(options, clock, as_json)
         return
     last: list[Event] = []
+    stop = StopOnSignal(ready=follow or budget is not None)
+
+    def made(event: Event) -> None:
+        """From the first step or iteration on there is a volume; what has a unit is a trial, or slices."""
+        if event.event == "progress" and event.data.get("stage") == "recon" and not event.data.get("unit"):
+            stop.ready = True
+
     with (
         terminated_like_interrupted(),
         json_events(as_json) as json_sinks,
@@ -348,8 +355,8 @@ def recon(
     ):
         shown = fan_out(*(json_sinks or [LogLines(sys.stderr) if verbose else terminal]))
         with _logged(log, shown) as logged:
-            sink = fan_out(last.append, *logged, shown)
-            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
+            sink = fan_out(last.append, made, *logged, shown)
+            metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=stop)
     if not as_json:
         click.echo(results(last[-1].data))
     if lost := last[-1].data.get("checkpoint_lost"):

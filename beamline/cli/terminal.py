@@ -191,7 +191,7 @@ def rate_text(data: Mapping[str, Any], what: str = "frames") -> str:
 def phase_text(data: Mapping[str, Any]) -> str:
     """n/N, rate and time left, of a `progress` event of a phase; that it has begun where that is all that is known."""
     known = data["of"] and data["per_s"] and data["eta_s"] is not None
-    return rate_text(data, "views") if known else "begun"
+    return rate_text(data, data["counted"]) if known else "begun"
 
 
 def trials(data: Mapping[str, Any], what: str = "trials") -> str:

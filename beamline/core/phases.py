@@ -23,18 +23,20 @@ class Phases:
 
     def __init__(self, sink: Sink = lambda event: None, clock: Clock | None = None) -> None:
         self._sink, self._clock = sink, clock or SystemClock()
-        self._name, self._begun, self._said = "", self._clock.now(), -math.inf
+        self._name, self._counted, self._begun, self._said = "", "", self._clock.now(), -math.inf
         self.seconds: dict[str, float] = {}
 
-    def enter(self, name: str) -> None:
-        """The phase before has ended; this one begins."""
+    def enter(self, name: str, counted: str = "views") -> None:
+        """The phase before has ended; this one begins, and tells of so many `counted` how many are done."""
         self.end()
-        self._name, self._said = name, -math.inf
+        self._name, self._counted, self._said = name, counted, -math.inf
         self._say({"phase": name, "n": 0, "of": 0, "per_s": None, "eta_s": None})
 
     def told(self, n: int, total: int) -> None:
-        """So much of the phase is done."""
+        """So much of the phase is done; of nothing nothing is said."""
         now = self._clock.now()
+        if not n:
+            return
         if now - self._said >= _SAY_EVERY or n == total:
             self._said = now
             rate = n / max(now - self._begun, 1e-9)
@@ -50,4 +52,4 @@ class Phases:
         self._name = ""
 
     def _say(self, data: dict[str, object]) -> None:
-        self._sink(Event("progress", self._clock.now(), {"stage": "phase", **data}))
+        self._sink(Event("progress", self._clock.now(), {"stage": "phase", "counted": self._counted, **data}))

@@ -59,10 +59,13 @@ class StopOnSignal:
 
     Args:
         reply: printed on the first signal.
+        ready: there is, or soon will be, such a result. Before that the first signal interrupts.
     """
 
-    def __init__(self, reply: str = "Stopping as soon as there is a volume. Ctrl-C again discards it.") -> None:
-        self._requested, self._reply = False, reply
+    def __init__(
+        self, reply: str = "Stopping as soon as there is a volume. Ctrl-C again discards it.", ready: bool = True
+    ) -> None:
+        self._requested, self._reply, self.ready = False, reply, ready
 
     @contextmanager
     def __call__(self) -> Iterator[Callable[[], bool]]:
@@ -70,7 +73,7 @@ class StopOnSignal:
             yield lambda: self._requested
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._requested:
+        if self._requested or not self.ready:
             raise KeyboardInterrupt
         self._requested = True
         _print(self._reply)

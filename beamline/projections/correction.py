@@ -31,6 +31,8 @@ from recon.prep.correct import Correction, Projections, References, Transmission
 from recon.prep.counts import Photons
 from recon.prep.resample import Resampling
 
+_STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
+
 Warn = Callable[[str], None]
 """Takes a sentence about something that is wrong though work goes on."""
 
@@ -92,17 +94,18 @@ class ScanCorrection:
         Args:
             frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
-            told: how many of how many frames were read.
+            told: how many of how many frames are done; each is read, divided by the flat, and freed of zingers.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
         """
-        data, frames = self._read(frames, rows, told)
+        steps = 1 if self._references is None else _STEPS
+        data, frames = self._read(frames, rows, lambda n, of: told(n // steps, of))
         if not frames.size:
             raise self._no_view()
         if self._references is None:
             return self._retrieved(_as_given(data, frames), rows)
-        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows)
+        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, told=told)
 
     def in_batches(
         self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, told: Callable[[int, int], None]
@@ -312,13 +315,16 @@ class ScanCorrection:
         frames: NDArray[np.int64],
         last: bool,
         rows: slice | None = None,
+        told: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
+        n = frames.size
         try:
             views = None
-            if frames.size:
-                views = self._transmission(correction, data, frames)
+            if n:
+                views = self._transmission(correction, data, frames, lambda done: told((n + done) // _STEPS, n))
                 correction.survey(views)
-            return self._retrieved(correction.line_integrals(views, last), rows)
+            lines = correction.line_integrals(views, last, lambda done: told((2 * n + done) // _STEPS, n))
+            return self._retrieved(lines, rows)
         except UnlitViewsError as error:
             advice = "" if self._selection.judge else " (--flags judge leaves out what the monitor finds dark)"
             raise DataError(
@@ -327,9 +333,15 @@ class ScanCorrection:
         except ValueError as error:
             raise self._refusal(error) from error
 
-    def _transmission(self, correction: Correction, data: NDArray[Any], frames: NDArray[np.int64]) -> Transmission:
+    def _transmission(
+        self,
+        correction: Correction,
+        data: NDArray[Any],
+        frames: NDArray[np.int64],
+        told: Callable[[int], None] = lambda done: None,
+    ) -> Transmission:
         try:
-            views = correction.transmission(data, frames.astype(np.float64), frames)
+            views = correction.transmission(data, frames.astype(np.float64), frames, told)
         except ValueError as error:
             raise self._refusal(error) from error
         if self._current_factor is not None:

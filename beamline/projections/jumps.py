@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -59,7 +59,14 @@ def longest_part(frames: I64, jumps: I64) -> I64:
     return frames[parts == np.bincount(parts).argmax()] if frames.size else frames
 
 
-def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64, axis_col: float) -> Jumps:
+def find_jumps(
+    source: ScanSource,
+    selection: Selection,
+    frames: I64,
+    jumps: I64,
+    axis_col: float,
+    told: Callable[[int, int], None] = lambda n, most: None,
+) -> Jumps:
     """Where the sample was in each part of a scan between jumps, and which of the views can be used.
 
     A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
@@ -69,6 +76,7 @@ def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64
     Args:
         frames: rows of the file that are to be used.
         jumps: rows from which on the sample is elsewhere.
+        told: how many guesses of where it moved were made, of at most how many.
     """
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
@@ -87,7 +95,7 @@ def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64
         return _done(fit, clusters, apart, [Displacement()])
     levels = fit.levels()
     looked = [fit.views(apart, factor, rounds) for factor, rounds in levels[:_ROUGH]]
-    found = _needed(fit.sizes, clusters, apart, looked)
+    found = _needed(fit.sizes, clusters, apart, looked, told)
     assert found.verdict is not None
     bad = np.flatnonzero(~_good(found.verdict))
     real = sorted({*found.jumps, *(one for one in clusters if np.isin(apart[[one[0], one[1] + 1]], bad).any())})
@@ -125,16 +133,31 @@ class _Guess:
     verdict: Judgement
 
 
-def _needed(sizes: I64, clusters: Sequence[tuple[int, int]], apart: I64, looked: Sequence[_Views]) -> _Guess:
+def _needed(
+    sizes: I64,
+    clusters: Sequence[tuple[int, int]],
+    apart: I64,
+    looked: Sequence[_Views],
+    told: Callable[[int, int], None],
+) -> _Guess:
     """The jumps that views held out need to be predicted, the one that helps most first.
 
     All guesses are judged by the same views, of the groups `apart` of all clusters. A cluster with too few views on one
     side is a jump in any case.
     """
     untold = [one for one in clusters if min(apart[one[0]], apart[one[1] + 1]) < 0]
-    best = _guess(sizes, untold, apart, looked)
+    left = len(clusters) - len(untold)
+    made, most = 0, 1 + left * (left + 1) // 2
+
+    def guess(jumps: list[tuple[int, int]]) -> _Guess:
+        nonlocal made
+        found, made = _guess(sizes, jumps, apart, looked), made + 1
+        told(made, most)
+        return found
+
+    best = guess(untold)
     while len(best.jumps) < len(clusters):
-        tried = [_guess(sizes, sorted([*best.jumps, one]), apart, looked) for one in clusters if one not in best.jumps]
+        tried = [guess(sorted([*best.jumps, one])) for one in clusters if one not in best.jumps]
         better = min(tried, key=lambda guess: guess.verdict.overall)
         if not better.verdict.overall < (1 - _HELPS) * best.verdict.overall:
             break

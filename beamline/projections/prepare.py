@@ -220,10 +220,10 @@ def prepare_projections(
         else:
             whole = selection.axis_rows
             by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
-            axis_col, axis = _axis_beside_jumps(source, by, usable, warn)
+            axis_col, axis = _axis_beside_jumps(source, by, usable, warn, phases.told)
     check_axis(source, axis_col)
-    phases.enter("jumps")
-    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col)
+    phases.enter("jumps", "guesses")
+    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col, phases.told)
     if jumps.said:
         warn(jumps.said)
     usable = replace(usable, frames=jumps.frames, left_out=usable.left_out + scan_frames.size - jumps.frames.size)
@@ -316,16 +316,20 @@ def _shares_of(
 
 
 def _axis_beside_jumps(
-    source: ScanSource, correction: ScanCorrection, usable: UsableViews, warn: Warn
+    source: ScanSource,
+    correction: ScanCorrection,
+    usable: UsableViews,
+    warn: Warn,
+    told: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
-            found = locate_axis(source, correction, part, lambda _: None)
+            found = locate_axis(source, correction, part, lambda _: None, told)
             if found[1].confident:
                 return found
-    return locate_axis(source, correction, usable.frames, warn)
+    return locate_axis(source, correction, usable.frames, warn, told)
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
@@ -428,7 +432,11 @@ def stated_axis(source: ScanSource) -> float:
 
 
 def locate_axis(
-    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
+    source: ScanSource,
+    correction: ScanCorrection,
+    frames: NDArray[np.int64],
+    warn: Warn,
+    told: Callable[[int, int], None] = lambda n, total: None,
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
 
@@ -440,7 +448,7 @@ def locate_axis(
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
     frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
-    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)))
+    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), told)
     try:
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:

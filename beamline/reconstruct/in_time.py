@@ -90,5 +90,6 @@ def fit_within(
 def warnings_told(warn: Warn) -> Iterator[None]:
     """Within the context what Python warns of is told as a sentence, without file and line."""
     with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
         warnings.showwarning = lambda message, *_: warn(str(message))
         yield

@@ -40,13 +40,18 @@ def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
 
 
 def odd_views_warning(
-    made: ReconOutcome, prepared: PreparedProjections, selection: Selection, told: Callable[[int, int], None]
+    made: ReconOutcome,
+    prepared: PreparedProjections,
+    selection: Selection,
+    told: Callable[[int, int], None] = lambda done, of: None,
 ) -> str:
-    """The warning that parts of views are not in the volume; empty where there are none.
+    """The warning that parts of views are not in the volume; empty where there are none, and of direct methods.
 
-    Args:
-        told: how many of how many views were compared.
+    So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
+    `told` hears how many of how many views were compared.
     """
+    if by_name(made.method).traits.direct or made.settings.get("ended_early"):
+        return ""
     views = prepared.projections.data
     found = odd_views.odd_views(made.volume, views, prepared.geometry, prepared.ray_factors(), told=told)
     if not found:

@@ -134,7 +134,6 @@ def write_result(
     before = clock.now()
     metrics = {made.method: judged(made.volume, made.seconds)}
     all_rays = (clock.now() - before) / residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
-    # Who stopped it waits for it, and a volume that was stopped differs from its views in many places.
     waited_for, direct_method = "ended_early" in made.settings, by_name(made.method).traits.direct
     left_out = []
     hiding = ""
@@ -144,18 +143,17 @@ def write_result(
         if hiding:
             sink(Event("warning", clock.now(), {"message": hiding}))
             context = replace(context, warnings=[*context.warnings, hiding])
-    if not (direct_method or waited_for):
-        if not context.leaves(_ODD_VIEWS * all_rays):
-            left_out.append("the look for views that do not fit the volume")
-        elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
-            sink(Event("warning", clock.now(), {"message": odd}))
-            context = replace(context, warnings=[*context.warnings, odd])
+    if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
+        left_out.append("the look for views that do not fit the volume")
+    elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
+        sink(Event("warning", clock.now(), {"message": odd}))
+        context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
     compared = not direct_method and target.report is not None and has_direct_method(prepared.geometry)
     if compared and (waited_for or not context.leaves(_DIRECT * all_rays)):
         left_out.append("FBP for comparison")
     elif compared:
-        phases.enter("FBP for comparison")
+        phases.enter("FBP for comparison", "slices")
         before = clock.now()
         grid, out = made.volume.grid, None
         if isinstance(made.volume.data, np.memmap):

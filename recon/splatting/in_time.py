@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.initialise import sample_gaussians
 from recon.splatting.splat import voxelize
 from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choice_cost
 from recon.voxels.ordered_fista import subsets_of
@@ -25,6 +26,7 @@ FINISH_SHARE = 0.8
 
 _GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
 _SLAB = 16  # slices that are filled to measure it
+_DRAWN = 8  # slices that Gaussians are drawn from to measure it
 _SWEPT_VIEWS = 8
 _COLS = 96  # of binned pixels, by which the time of a start is guessed
 # What goes before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a
@@ -57,6 +59,17 @@ def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     box = Grid.of_field(coarse, coarse.sample_pitch)
     share = math.prod(grid.shape) / math.prod(box.shape)
     return sweep_seconds(coarse, box, now) * share
+
+
+def first_draw_seconds(grid: Grid, count: int, now: Clock) -> float:
+    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, which is all matter."""
+    nz, ny, nx = grid.shape
+    slices = min(_DRAWN, nz)
+    slab, rng = grid.part(slice(0, slices), slice(0, ny), slice(0, nx)), np.random.default_rng(0)
+    noise = Volume(rng.random(slab.shape, dtype=np.float32), slab)
+    begin = now()
+    sample_gaussians(noise, max(1, count * slices // nz), rng, field_radius=math.inf)
+    return (now() - begin) * nz / slices
 
 
 def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:

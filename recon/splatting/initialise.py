@@ -158,7 +158,7 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:
-    """About how many sweeps of FISTA-TV over all views take as long as the first volume and what is drawn from it."""
+    """About how many sweeps of FISTA-TV over all views take as long as the first volume."""
     return 2 * _SWEEPS if _swept(geometry, start) else 1.0
 
 

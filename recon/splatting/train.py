@@ -24,8 +24,14 @@ from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.finish import finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.in_time import FINISH_SHARE, fill_seconds, finish_within, first_sweep_seconds
-from recon.splatting.initialise import leaves_the_field, place, sweeps_of_start
+from recon.splatting.in_time import (
+    FINISH_SHARE,
+    fill_seconds,
+    finish_within,
+    first_draw_seconds,
+    first_sweep_seconds,
+)
+from recon.splatting.initialise import default_count, leaves_the_field, place, sweeps_of_start
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, binned_geometry, coarser
 from recon.splatting.schedule import Schedule
@@ -204,15 +210,18 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     """
     if isinstance(method.gaussians, Gaussians):
         return 1
+    count = method.gaussians or default_count(Grid.of_field(geometry, grid.voxel_size))
     needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
+    needed += first_draw_seconds(grid, count, now)
     left = max(end - now(), 0.0)
     if needed <= left:
         return 1
     factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
     factor = next((n for n in factors if needed / n**3 <= _START_SHARE * left), factors[-1])
+    then = f"it starts from views binned {factor} x {factor}, and ends with what is left of the time"
     warnings.warn(
-        f"seconds={method.seconds:g} do not suffice for the start of the fit, which takes about {needed:.3g} s. It "
-        f"starts from views binned {factor} x {factor}, and ends with what is left of the time",
+        f"{method.seconds:.3g} s do not suffice for the start of the fit, which takes about {needed:.3g} s: "
+        f"{then if factor > 1 else 'it ends late'}",
         stacklevel=2,
     )
     return factor

@@ -20,6 +20,7 @@ from recon.voxels.view_weights import circle_weights, fan_shares
 F64 = NDArray[np.float64]
 
 _f = np.float32
+_SAMPLES = 4  # of a projector take as long as a voxel in a view
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
 
 
@@ -119,7 +120,7 @@ def fdk(
         prepared = _prepared(projections[start : start + slab], part, rays, (before, after), filter)
         if not np.isfinite(prepared).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
-        for layers in calls(y.size, part.n_views * x.size * z.size):
+        for layers in calls(y.size, _SAMPLES * part.n_views * x.size * z.size):
             some = slice(layers.start, layers.stop)
             _back_project(
                 prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0] + before,

@@ -19,6 +19,8 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
 from recon.base.method import Progress
 from recon.splatting import optimise as fit
+from recon.splatting import train
+from recon.splatting.initialise import place
 from recon.voxels import direct
 from recon.voxels import fbp as fbp_module
 from recon.voxels.fbp import FbpPlan, fbp, fbp_block
@@ -77,6 +79,21 @@ def test_a_fit_that_is_interrupted_twice_leaves_nothing(folder: Path, monkeypatc
     _signal_at_step(monkeypatch, signal.SIGINT, {20}, times=2)
     result = beamline("recon", "scan.h5", "--steps", "100000", "--gaussians", "50", "--no-report")
     assert result.exit_code == 130
+    assert left(folder) == {"scan.h5"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_fit_that_is_interrupted_before_its_first_step_ends_at_once_and_leaves_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        if arguments[1].n_views == SCAN.angles.size:  # not the toy that is fitted before
+            signal.raise_signal(number)
+        return place(*arguments, **options)
+
+    monkeypatch.setattr(train, "place", interrupted)
+    result = beamline("recon", "scan.h5", "-m", "r2", "--gaussians", "50", "--no-report")
+    assert result.exit_code == 130, result.output
     assert left(folder) == {"scan.h5"}
 
 

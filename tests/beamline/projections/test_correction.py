@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError
+from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
-from recon.prep.correct import CorrectionSettings, merge_and_empty
+from recon.prep.correct import Correction, CorrectionSettings, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
@@ -28,6 +31,30 @@ def test_only_what_was_asked_for_is_read() -> None:
     assert {rows for frames, rows in source.was_read if min(frames) >= 2} == {2}
     assert max(len(frames) for frames, rows in source.was_read if rows == 4) == 1  # a whole reference, to judge it
     assert {f for frames, _ in source.was_read for f in frames} == {0, 1, 2, 3, 4, 5, 6}
+
+
+def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()])
+    source = ArraySource(data.astype(np.uint16), [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
+    told: list[tuple[int, int]] = []
+    read, transmission = read_binned, Correction.transmission
+    after = dict[str, int]()  # how many were told when a step had ended
+
+    def reading(*arguments: Any) -> Any:
+        found = read(*arguments)
+        after["reading"] = told[-1][0] if told else 0
+        return found
+
+    def dividing(*arguments: Any) -> Any:
+        found = transmission(*arguments)
+        after["dividing"] = told[-1][0]
+        return found
+
+    correction = ScanCorrection(source, Selection(), pytest.fail)  # type: ignore[arg-type]
+    monkeypatch.setattr(module, "read_binned", reading)
+    monkeypatch.setattr(Correction, "transmission", dividing)
+    correction.at_once(np.arange(2, 47), told=lambda n, of: told.append((n, of)))
+    assert after == {"reading": 15, "dividing": 30} and told == sorted(told) and told[-1] == (45, 45)
 
 
 @pytest.mark.parametrize("air", ["auto", "none", (3, 3)])

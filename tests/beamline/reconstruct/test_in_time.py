@@ -1,0 +1,153 @@
+"""The seconds of a call: what its fit gets of them, what is said where they are too few, and what is then left out."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.events import Event
+from beamline.projections.prepare import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.reconstruct import in_time
+from beamline.reconstruct.finished import reconstruct_file
+from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.result import OutputPaths
+from beamline.storage.readers.open import SourceOptions
+from drivers.clock import SystemClock
+from recon.base.geometry import Geometry
+from recon.prep.correct import Projections
+from recon.splatting.r2 import R2
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 32, endpoint=False), (4, 40))
+SWEEP = 10.0  # s
+
+
+class At:
+    """A clock that shows one time."""
+
+    def __init__(self, time: float) -> None:
+        self.time = time
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self.time += seconds
+
+
+class Ticking(At):
+    """A clock that each look at it moves on by a tenth of a second."""
+
+    def now(self) -> float:
+        self.time += 0.1
+        return self.time
+
+
+def _prepared() -> PreparedProjections:
+    shape = (VIEWS.n_views, *VIEWS.detector_shape)
+    mask = np.zeros(VIEWS.detector_shape, bool)
+    ones = np.ones(VIEWS.n_views, np.float32)
+    lines = Projections(np.ones(shape, np.float32), np.arange(VIEWS.n_views), 0.0, ones, mask)
+    return PreparedProjections(lines, VIEWS, 19.5, None, None, VIEWS.n_views, "px", "counts")
+
+
+@pytest.fixture
+def sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sweeps that take ten seconds."""
+    monkeypatch.setattr(in_time, "first_sweep_seconds", lambda *_: SWEEP)
+
+
+def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, Deadline, list[str]]:
+    """What the fit gets, the deadline, and what was said."""
+    said: list[str] = []
+    target = OutputPaths(Path("out.h5"), Path("out.html") if report else None)
+    method, deadline = fit_within(
+        R2(seconds=seconds), _prepared(), target, (100.0, 0.0), At(100.0 + spent), said.append
+    )
+    assert method.seconds is not None
+    return method.seconds, deadline, said
+
+
+@pytest.mark.usefixtures("sweeps")
+def test_a_fit_gets_what_reading_before_it_and_measuring_and_writing_after_it_leave() -> None:
+    left, deadline, said = _within(100.0, spent=20.0)
+    measuring = SWEEP / 2 * 16 / VIEWS.n_views  # of sixteen views there, not back
+    assert left + 20 + measuring + deadline.after == pytest.approx(100)
+    assert 5 <= deadline.after <= 20 and said == []
+    without_report, _, _ = _within(100.0, spent=20.0, report=False)
+    assert without_report == pytest.approx(100 - 20 - measuring, abs=0.1)
+
+
+@pytest.mark.usefixtures("sweeps")
+def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> None:
+    left, _, said = _within(12.0, spent=9.0)
+    assert left == 0
+    assert len(said) == 1 and "12 s do not suffice" in said[0] and "correcting it took 9 s" in said[0]
+
+
+def test_a_deadline_leaves_time_for_what_ends_before_the_report() -> None:
+    clock = At(50.0)
+    deadline = Deadline(end=60.0, after=4.0, now=clock.now)
+    assert deadline.leaves(6.0) and not deadline.leaves(6.1)
+    assert Deadline().leaves(math.inf)
+
+
+def test_warnings_of_python_are_told_as_sentences() -> None:
+    said: list[str] = []
+    before = warnings.showwarning
+    with warnings_told(said.append):
+        warnings.warn("the fit starts from coarse views", stacklevel=1)
+    assert said == ["the fit starts from coarse views"] and warnings.showwarning is before
+
+
+def _told(
+    folder: Path, method: R2, clock: At | SystemClock, stop: Callable[[], bool] = lambda: False
+) -> tuple[list[Event], list[str]]:
+    """Events of a reconstruction, and its phases."""
+    events: list[Event] = []
+    options = ReconOptions(
+        source=SourceOptions(write_exchange(folder / "scan.h5", TwoCylinders(shape=(2, 40), pixel_size_mm=0.5))),
+        target=OutputPaths(folder / "out.h5", folder / "out.html"),
+        selection=Selection(),
+        method=method,
+    )
+
+    @contextmanager
+    def scope() -> Iterator[Callable[[], bool]]:
+        yield stop
+
+    reconstruct_file(options, events.append, clock, scope)
+    return events, list(events[-1].data["times"])
+
+
+def test_a_call_with_too_few_seconds_says_so_before_the_fit_and_leaves_out_what_it_can(tmp_path: Path) -> None:
+    events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), Ticking(0.0))
+    said = [str(event.data.get("message", "")) for event in events]
+    fit = next(n for n, event in enumerate(events) if event.data.get("stage") == "recon")
+    assert any("2 s do not suffice" in text for text in said[:fit])
+    assert "FBP for comparison" not in phases and "fbp" not in events[-1].data
+    remark = next(text for text in said[fit:] if text.startswith("Left out, as the seconds"))
+    assert remark in (tmp_path / "out.html").read_text()
+
+
+def test_a_call_with_seconds_enough_leaves_nothing_out(tmp_path: Path) -> None:
+    events, phases = _told(tmp_path, R2(seconds=1e4, steps=5, finish=0, gaussians=50), SystemClock())
+    assert "FBP for comparison" in phases
+    assert not [event for event in events if "Left out" in str(event.data.get("message"))]
+
+
+def test_who_stops_a_fit_waits_for_no_comparison(tmp_path: Path) -> None:
+    events, phases = _told(tmp_path, replace(R2(gaussians=50), steps=100), SystemClock(), stop=lambda: True)
+    assert events[-1].data["ended_early"] and "FBP for comparison" not in phases
+    assert any("the reconstruction was stopped" in str(event.data.get("message")) for event in events)
