@@ -37,7 +37,7 @@ _TABLE_LINES, _LINES_EACH = 18, 3  # rows of the tables, and lines that one valu
 
 
 def _line(size: float, factor: float = 1.3) -> float:
-    """Inches of a line of text."""
+    """Height of a line of text, inches."""
     return size * factor / 72
 
 

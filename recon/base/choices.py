@@ -17,7 +17,7 @@ FlatFields = Literal["groups", "dynamic"]
 Start = Literal["fbp", "tv"]
 
 KERNEL = Kernel.COMPACT
-"""Of a fit's Gaussians."""
+"""Shape of a fit's Gaussians."""
 
 DEFAULT_STEPS = 400
 """Steps of a fit that a finish on voxels follows."""
