@@ -222,7 +222,7 @@ def _cut(file: h5py.File, committed: int, there: int) -> int:
 
 
 def _rows_within(item: h5py.Dataset, there: int) -> int:
-    """Rows before the first that is not within so many bytes of the file."""
+    """Number of rows that lie wholly within the first so many bytes of the file."""
     if item.chunks is None:
         return len(item)
     chunks = set[int]()
