@@ -53,4 +53,4 @@ def test_what_is_found(tmp_path: Path, text: str) -> None:
 
 def test_sentences_end_at_stops_items_and_rows() -> None:
     text = "One, e.g. this. Two\ngoes on.\n\n- three\n- four\n\nname: five. Six `a. b` X. Ray.\n  a    b\n"
-    assert split(text) == ["One, eg this.", "Two goes on.", "three", "four", "five.", "Six code X Ray.", "a b"]
+    assert split(text) == ["One, e.g this.", "Two goes on.", "three", "four", "five.", "Six code X Ray.", "a b"]
