@@ -1,4 +1,4 @@
-"""Trials: methods on a part of a scan, judged by what their volumes predict of views that they have not seen."""
+"""Trials: methods on a part of a scan, judged by how well their volumes predict unseen views."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _DULL = 0.8  # of the steepness of another volume that is as good in all else
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What a volume predicts of views that it has not seen, and what it leaves of those that it was made from.
+    """How well a volume predicts unseen views, and how well it explains its own.
 
     Attributes:
         at: number of its method.
@@ -56,7 +56,7 @@ class Score:
 
     @property
     def residual(self) -> float:
-        """Of views held out."""
+        """Residual of the views held out."""
         return float(self.residuals.mean())
 
     @property
@@ -78,7 +78,7 @@ def predicts_best(
     spare: int | None = None,
     order: Sequence[int] | None = None,
 ) -> tuple[int | None, str]:
-    """Which of the methods predicts best what one of eight views shows that it has not seen; all residuals in words.
+    """Which of the methods predicts unseen views best (one of eight is held out), with all residuals in words.
 
     None where `control` ends the trials before two are done; one that it cuts short is not judged.
 

@@ -14,14 +14,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+ROOT = Path(__file__).parents[1]
 LONGEST = 25
 """Words of a sentence."""
 HARD = (
     r"\bof which\b",
     r"\bis none of\b",
     r"\bnone of the [\w ]+['’]s\b",
-    r"\bwhich of which\b",
-    r"\bthat is none\b",
+    r"\b[Ww]hat (?:\w+ ){1,7}that\b",
 )
 """Patterns that a reader has to read twice."""
 

@@ -88,7 +88,7 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     """The live volume of a run each time that it is written anew, at last the finished one; ends with the run.
 
     Args:
-        run: its folder. Of a run that is over, the volume that it has.
+        run: its folder. A run that is over gives its last volume.
 
     Raises:
         DataError: no folder of a run.

@@ -28,7 +28,7 @@ _HEAD = ("time (UTC)", "sample", "frames", "state", "size", "flags", "folder")
 def runs(folder: Path | None, as_json: bool) -> None:
     """List the runs in FOLDER (./runs), newest first: sample, frames, state, size on the disk, flags.
 
-    A run that was resumed is one line. Of a run that is not complete, frames are those in its files and those planned.
+    A run that was resumed is one line. A run that is not complete shows the frames in its files and the frames planned.
     `died`: its process ended without a word; `beamline recover` keeps its frames.
 
     Exit code: 0 also where there is no run, 2 no folder.

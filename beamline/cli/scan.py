@@ -110,7 +110,7 @@ def scan(
 
 
 def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
-    """Do what a run lacks that has all its frames, and say it as `beamline recover` does."""
+    """Join the files of a run that has all its frames, and report it as `beamline recover` does."""
     from beamline.scan.resume import recover_run
 
     found, left_out = recover_run(run)
@@ -124,7 +124,7 @@ def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
 
 
 def _faults(result: RunResult) -> list[str]:
-    """What is wrong with the frames of a complete scan, and what that means for it."""
+    """The faults of the frames of a complete scan, and their consequences."""
     from beamline.storage.flag_legend import counted
 
     said = []

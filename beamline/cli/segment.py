@@ -40,10 +40,14 @@ _PERCENT = FiniteRange(min=0, max=100)
 @click.option("--percentiles", type=_PERCENT, nargs=2, default=(0.5, 99.5), show_default=True, metavar="LOW HIGH",
               help="Grey values below and above are cut.")  # fmt: skip
 @click.option("--gamma", type=POSITIVE, default=1.0, show_default=True, help="Power of the grey values, from 0 to 1.")
-@click.option("--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Of the Gaussian filter, voxels.")
-@click.option("--clusters", type=click.IntRange(2, 12), help="Of grey values (k-means). Default: by the elbow rule.")
+@click.option(
+    "--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Width of the Gaussian filter, voxels."
+)
+@click.option(
+    "--clusters", type=click.IntRange(2, 12), help="Classes of grey values (k-means). Default: by the elbow rule."
+)
 @click.option("--radius", type=click.IntRange(0, 20), default=1, show_default=True,
-              help="Of opening and closing, voxels; 0: neither.")  # fmt: skip
+              help="Radius of opening and closing, voxels; 0: neither.")  # fmt: skip
 @click.option("--smallest", type=click.IntRange(min=0), default=27, show_default=True,
               help="Voxels of the smallest particle that is kept.")  # fmt: skip
 @click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,

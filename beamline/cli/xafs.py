@@ -53,17 +53,19 @@ def box(ctx: click.Context, param: click.Parameter, value: str | None) -> PixelB
 @click.option("--from", "low", type=POSITIVE, metavar="KEV", help="First energy; a scene needs it.")
 @click.option("--to", "high", type=POSITIVE, metavar="KEV", help="Last energy; a scene needs it.")
 @click.option("--step", type=POSITIVE, metavar="KEV", help="Between a scene's energies; 0.001 unless given.")
-@click.option("--material", metavar="NAME", help="Of the scene; the one with a state of charge unless given.")
+@click.option("--material", metavar="NAME", help="Material of the scene. Default: the one with a state of charge.")
 @click.option(
     "--angle",
     type=FiniteRange(min=-360, max=360),
     metavar="DEG",
     help="At which the scene's stage stands; 0 unless given.",
 )
-@click.option("--seed", type=SEED, help="Of all random numbers of a scene; 0 unless given.")
+@click.option("--seed", type=SEED, help="Seed of all random numbers of a scene. Default: 0.")
 @click.option("--region", callback=box, metavar=_BOX, help="The material in a file's frames; all of them unless given.")
 @click.option("--around", callback=box, metavar=_BOX, help="Its surroundings, for the contrast; none unless given.")
-@click.option("--unit", type=click.Choice(["keV", "eV"]), help="Of a file's energies; as in the file, else keV.")
+@click.option(
+    "--unit", type=click.Choice(["keV", "eV"]), help="Unit of a file's energies. Default: as in the file, else keV."
+)
 @click.option(
     "--quantity",
     type=click.Choice(["counts", "line-integrals"]),

@@ -127,7 +127,7 @@ def _number(value: float) -> str:
 
 
 def _words(branch: Schema) -> str:
-    """What a value that is not one of a few choices may be."""
+    """The legal values where they are no short list of choices."""
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"

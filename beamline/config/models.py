@@ -113,14 +113,14 @@ class ScanSection(Section):
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 0.1
     """Wait after each move of a step scan."""
     without_watchdog: Literal["warn", "pause"] = "warn"
-    """What a scan does that has no watchdog, or whose watchdog ended and could not be replaced."""
+    """The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."""
     darks: Fields = Fields()
     flats: Fields = Fields()
 
 
 class OpticsSection(Section):
     pixel_size_um: Annotated[float, Field(gt=0, le=1e6)]
-    """Of an unbinned pixel at the sample."""
+    """Size of an unbinned pixel at the sample."""
     energy_kev: Annotated[float, Field(gt=0, le=1e6)] | None = None
     distance_mm: Annotated[float, Field(ge=0, le=1e7)] | None = None
     """Sample to detector."""

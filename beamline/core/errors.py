@@ -112,8 +112,8 @@ def user_message(error: BaseException) -> str:
 
 
 def leave_traceback(error: BaseException, folder: Path) -> Path | None:
-    """The new file that has the traceback of a defect: in `folder`, else in that of temporary files; None where
-    neither can be written to. Of an error that has one already, that one."""
+    """The new file that has the traceback of a defect: in `folder`, else in the folder for temporary files. None where
+    neither can be written to. An error that already has such a file keeps it."""
     if (left := getattr(error, "traceback_file", None)) is not None:
         return Path(left)
     text = "".join(traceback.format_exception(error))

@@ -66,7 +66,7 @@ class PauseRequest:
 
     @property
     def reason(self) -> str:
-        """Why the scan should wait, and what ends that; "" where it should not."""
+        """Why the scan should wait, and how the wait ends; "" where it should not wait."""
         return self._by_operator or next(iter([*self._held_by.values()]), "")
 
     @property

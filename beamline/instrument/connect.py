@@ -79,7 +79,7 @@ def connect(
     Args:
         clock: takes the place of the configured one.
         ask: puts a request to the operator (manual shutter and sample mover); the terminal unless given.
-        check_stop: called again and again while there is something to wait for; what it raises ends that.
+        check_stop: called again and again while there is something to wait for; an exception from it ends the wait.
 
     Raises:
         DeviceError: a device does not answer; those opened before it are closed again.

@@ -75,7 +75,8 @@ class BandsState:
 class BandsCheck:
     """Score: fraction of its light that a preview row or column has lost (negative: gained).
 
-    The default: two black rows across two preview blocks of 8 take an eighth of the light of each.
+    The default limit comes from two black rows across two preview blocks of 8: they take an eighth of the light of
+    each.
     """
 
     name: ClassVar[str] = "bands"

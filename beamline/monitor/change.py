@@ -1,4 +1,4 @@
-"""Change: what a view has that the turning of the sample since the views before it does not explain.
+"""Change: the part of a view that the turning of the sample since the views before does not explain.
 
 Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the

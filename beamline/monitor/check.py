@@ -96,7 +96,7 @@ class ScanContext:
             projection.
         view: the frame on this grid; None where it is no projection, or has no light.
         truncated: the sample is wider than the field, in this view or those before; or there are no flats to tell.
-        change: what it has that turning since the views before does not explain; None where these are too few, or at
+        change: the part that turning since the views before does not explain; None where these are too few, or at
             uneven steps.
     """
 

@@ -41,7 +41,7 @@ class Watched:
 
     @property
     def volumes(self) -> tuple[Path, ...]:
-        """Where a volume of it may be, the best first."""
+        """Paths where a volume of the run may be, the best first."""
         return () if self.folder is None else (self.folder / RECON, self.folder / SNAPSHOT)
 
 

@@ -40,9 +40,9 @@ Warn = Callable[[str], None]
 class ScanCorrection:
     """Reads frames of one scan as line integrals, in the rows and with the binning of a selection.
 
-    `at_once` corrects frames that are all there. `feed` takes them in batches as they come and gives the same line
-    integrals to the bit, as long as the references and the air columns stay the same. `outdated` says when they
-    did not. Then `renewed` corrects by what is known now.
+    `at_once` corrects frames that are all there. `feed` takes them in batches as they come. It gives the same line
+    integrals to the bit, as long as the references and the air columns stay the same. `outdated` says when they did
+    not. Then `renewed` corrects by what is known now.
     """
 
     def __init__(self, source: ScanSource, selection: Selection, warn: Warn) -> None:

@@ -302,7 +302,7 @@ def _done(
     none = np.setdiff1d(np.arange(fit.jumps.size), seen)
     if none.size:
         text.append(
-            f"Of the alarm of motion at {frames_text(fit.jumps[none])} the other views show nothing (less than "
+            f"After the alarm of motion at {frames_text(fit.jumps[none])} the other views show nothing (less than "
             f"{LARGEST:g} px): views on both sides are used as they are."
         )
     return Jumps(frames, fit.jumps, places, " ".join(text))

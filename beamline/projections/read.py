@@ -120,7 +120,7 @@ def with_dynamic_flats(
 def light_scale(source: ScanSource, use_current: bool = False) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
 
-    Of projections that differ the median counts. With `use_current` also from its own ring current.
+    If projections differ, the median counts. With `use_current` also from its own ring current.
     """
     scale = _to_median(source.exposures, source.image_key)
     return scale * current_scale(source) if use_current else scale

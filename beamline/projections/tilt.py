@@ -57,7 +57,7 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
 
 
 def turned_text(degrees: float) -> str:
-    """What was done about a tilt that was given."""
+    """How a given tilt was treated."""
     return f"Views are turned by {degrees:g} degrees."
 
 

@@ -30,7 +30,7 @@ from recon.voxels.direct import has_direct_method
 _RESERVE = 0.02  # of the budget, for what no part has measured
 _LATE = 0.1  # of the time used, when it is over, is what a volume of all pixels may take
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
-# Of the time a trial may take so much by prediction, and in fact a quarter more.
+# Share of the time that a trial may take by prediction; in fact it may take a quarter more.
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
 _LEVEL = 0.3  # dB: by the curves of four scans such methods are level
 

@@ -57,12 +57,12 @@ class OutputPaths:
 
     @property
     def partial(self) -> Path:
-        """Of a volume that is made in slabs, while it is made."""
+        """The file of a volume in slabs, while it is made."""
         return self.output.with_name(f"{self.output.stem}.partial.h5")
 
     @property
     def live_picture(self) -> Path:
-        """Of a volume that grows with its scan."""
+        """The file of a volume that grows with its scan."""
         return self.output.with_name(f"{self.output.stem}.live.png")
 
     def refuse_partial(self) -> None:

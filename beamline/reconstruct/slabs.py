@@ -1,4 +1,4 @@
-"""Slabs: what of a scan that does not fit into the memory is reconstructed at a time, and what that needs."""
+"""Slabs: the parts in which a scan too large for the memory is reconstructed, and the memory of each."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from recon.voxels.odd_views import odd_views_memory
 from recon.voxels.unexplained import unexplained_memory
 
 SHARE = 0.7
-"""Of the memory that is free, what a reconstruction may take by default."""
+"""Share of the free memory that a reconstruction takes by default."""
 
 _BATCH = 0.25  # of that, what views take while they are corrected
 _COPIES = 4  # float32 copies of a view while it is corrected

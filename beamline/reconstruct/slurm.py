@@ -32,15 +32,15 @@ class SlurmJobs(Section):
 
     jobs: PositiveInt = 4
     cores: PositiveInt = 8
-    """Of a job; it computes with as many threads as the process that submits it, see NUMBA_NUM_THREADS."""
+    """Cores of a job; it computes with as many threads as the process that submits it, see NUMBA_NUM_THREADS."""
     memory: str = Field("32GB", pattern=r"^\d+ ?[KMGT]i?B$")
-    """Of a job; --memory is less."""
+    """Memory of a job; --memory is less."""
     walltime: str = Field("04:00:00", pattern=r"^(\d+-)?\d+(:\d\d){0,2}$")
     """In quotes in YAML, which takes 12:00:00 for a number."""
     queue: Annotated[str, BeforeValidator(_text)] | None = None
     account: Annotated[str, BeforeValidator(_text)] | None = None
     interface: str | None = None
-    """Of the network between the jobs and this process, as ib0."""
+    """Network interface between the jobs and this process, such as ib0."""
     directives: tuple[str, ...] = ()
     """Further options of sbatch, as --exclusive."""
     prologue: tuple[str, ...] = ()

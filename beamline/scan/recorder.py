@@ -360,7 +360,7 @@ class _Progress:
         self._last_event = -EVENT_INTERVAL
 
     def expect_more(self, done: int, n: int, seconds: float) -> None:
-        """After `done` frames `n` come that were not planned, in `seconds`."""
+        """Count `n` frames that were not planned; they come after `done` frames and take `seconds`."""
         before, after = self._ahead[: done + 1] + seconds, self._ahead[done:]
         self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
         self.total += n

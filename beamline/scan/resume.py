@@ -37,7 +37,7 @@ from beamline.storage.writers import layout
 from drivers.frame import FrameKind
 
 _UNTOUCHED = "Nothing was changed."
-_IDENTITY = (  # what a device says of itself that no scan and no day changes
+_IDENTITY = (  # facts about a device that stay the same from scan to scan and day to day
     "model", "identity", "serial", "firmware", "axis", "device", "channel", "counts_per_turn", "vendor", "cameraid",
     "cameraversion",
 )  # fmt: skip

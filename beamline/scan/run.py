@@ -77,7 +77,7 @@ class RunResult:
     """A finished scan.
 
     Attributes:
-        path: the scan file; its folder holds everything else. Of a run that went on: the file that joins its parts.
+        path: the scan file; its folder holds everything else. The file that joins the parts of a resumed run.
         n_frames: rows of the file.
         missing: planned rows without a frame (a scan that misses some raises; the event `scan_done` names them).
         flags: frames that the monitor flagged: their number by check, then by level.

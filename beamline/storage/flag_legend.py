@@ -73,7 +73,7 @@ def mark_of(flags: Iterable[Flag]) -> Mark:
 
 _PLACES = {check.name: i for i, check in enumerate(CHECKS)}
 UNMARKED = mark_of(())
-"""Of a frame that no check flagged."""
+"""The value of a frame that no check flagged."""
 
 
 @dataclass(frozen=True, eq=False)

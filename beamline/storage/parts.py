@@ -271,7 +271,7 @@ def _target(item: h5py.HLObject) -> str:
 
 
 def _name_missing(files: Sequence[h5py.File], joined: h5py.File) -> None:
-    """Of the triggers that gave no frame, those that gave none in a later part either."""
+    """Triggers that gave no frame, in a later part either."""
     plan = json.loads(files[0]["/entry/record/plan"].asstr()[()])
     before = sum(plan[kind]["count"] for kind in ("darks", "flats") if plan[kind]["at"] in ("start", "both"))
     stored = {before + view for file in files for view in views_in(file)}

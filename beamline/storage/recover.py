@@ -79,7 +79,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
     """Clear the mark of the dead writer, cut what was not committed, and add what a writer adds at the end.
 
     Args:
-        say: is told what room that needs, before anything is written.
+        say: is told the room needed, before anything is written.
 
     Raises:
         DataError: no scan of ours, a damaged file, one that a running program has open, or one that changed within
@@ -171,7 +171,7 @@ def _require_ours(path: Path, file: h5py.File) -> None:
 
 
 def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
-    """What becomes of it, and what has to change for that."""
+    """The recovered file, and the changes that make it."""
     end = max(head.end, head.size) if head.open_for_writing else head.end
     overlay = Overlay(path, length=end)
     overlay.put(0, head.closed(end).head)
@@ -230,7 +230,7 @@ def _cut(file: h5py.File, committed: int, there: int) -> int:
 
 
 def _rows_within(item: h5py.Dataset, there: int) -> int:
-    """Rows before the first that is not within so many bytes of the file."""
+    """Number of rows that lie wholly within the first so many bytes of the file."""
     if item.chunks is None:
         return len(item)
     chunks = set[int]()
@@ -245,7 +245,7 @@ def _rows_within(item: h5py.Dataset, there: int) -> int:
 
 
 def _damaged(file: h5py.File) -> tuple[int, ...]:
-    """Of the last frames, those that differ from their checksum."""
+    """The last frames that differ from their checksum."""
     data, checksums = file[layout.DATA], file["/entry/digest/checksum"][()]
     first = max(0, len(data) - COMPARED // max(1, data.id.get_storage_size() // max(1, len(data))))
     image, found = np.empty((1, *data.shape[1:]), data.dtype), []

@@ -64,7 +64,7 @@ class Superblock:
 
 
 def superblock(path: Path) -> Superblock | None:
-    """Of a file; None where it has none of these versions at its beginning, with addresses of eight bytes."""
+    """The superblock of a file. None unless the file begins with one of these versions and addresses of eight bytes."""
     with path.open("rb") as file:
         head = file.read(SIZE)
     if len(head) < SIZE or head[:8] != _SIGNATURE or head[8] not in (2, 3) or head[9] != 8:

@@ -39,7 +39,7 @@ class Properties:
         return self._dcam.prop_getvalue(self._camera, prop)
 
     def find(self, prop: Property) -> float | None:
-        """Its value; None if this camera has no such property."""
+        """The value of a property; None if this camera has no such property."""
         try:
             return self.get(prop)
         except DcamError as error:

@@ -120,7 +120,7 @@ class Wiring:
     timeout: float = key(1.0, "For a reply.", unit="s", gt=0)
     baudrate: int = key(115_200, gt=0)
     pulse_width: float | None = key(
-        None, "Of the trigger pulses; null: the driver's choice, or what the controller has.", unit="s", gt=0
+        None, "Width of the trigger pulses; null: the driver's choice, or what the controller has.", unit="s", gt=0
     )
     active_high: bool = key(True, "Trigger pulses are high; refused where the controller has no such choice.")
     transcript: Path | None = key(

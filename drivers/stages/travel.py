@@ -26,7 +26,7 @@ def least_interval(limits: StageLimits) -> int:
 
 @dataclass(frozen=True)
 class Travel:
-    """What a stage of that name may do, in counts and in words."""
+    """The limits of a named stage, in counts and in words."""
 
     name: str
     limits: StageLimits

@@ -18,7 +18,7 @@ FlatFields = Literal["groups", "dynamic"]
 Start = Literal["fbp", "tv", "published"]
 
 KERNEL = Kernel.COMPACT
-"""Of a fit's Gaussians."""
+"""Shape of a fit's Gaussians."""
 
 DEFAULT_STEPS = 400
 """Steps of a fit that a finish on voxels follows."""

@@ -63,8 +63,8 @@ def ring_offsets(residual: F32) -> F32:
 
     The median over the views of what a model leaves of them, less its own neighbourhood along the row, and along the
     column: the wall of a can around the axis stays in all views, too, but in all rows alike (-1.1 dB on a battery). 0
-    where it does not stand out of its scatter by three standard errors. Of few views it cannot be told from the sample:
-    then it is 0.
+    where it does not stand out of its scatter by three standard errors. With few views noise cannot be told from the
+    sample: then it is 0.
 
     Args:
         residual: views less a model's views, [view, row, col].

@@ -17,7 +17,7 @@ F32 = NDArray[np.float32]
 
 _GRID = 0.5
 """Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
-are parted, with it 1. Of 40 pairs of touching balls 38 are parted, for 40."""
+are parted, with it 1. With it 38 of 40 pairs of touching balls are parted, without it 40."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Particles:
 
     @property
     def diameter(self) -> NDArray[np.float64]:
-        """Of the ball of the same volume, (6 V / π)^(1/3)."""
+        """Diameter of the ball of the same volume, (6 V / π)^(1/3)."""
         return np.cbrt(6 * self.volume / np.pi)
 
     def statistics(self) -> dict[str, float]:

@@ -82,7 +82,7 @@ class Counts:
             raise ValueError("the flat is nowhere above the dark: there is no beam")
 
     def photons(self, view: int) -> tuple[F64, F64, F64]:
-        """Of a view's pixels [row, col]: photons counted and photons without the sample, both above v, and v.
+        """Three images [row, col] of a view: photons counted, photons without the sample, both above v, and v.
 
         Pixels where the flat is not above the dark have 0 photons without the sample; NaN counts stay NaN.
         """

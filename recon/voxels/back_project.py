@@ -38,8 +38,8 @@ _STEPS = 2048  # of the kernel's table within a cell
 _LEAST = 7e-5  # 1/pixel, of filter and linear interpolation: what the latter adds is followed down to it
 _MOST = 30  # cycles a column, at most
 
-# ns for sixteen slices, on two cores (sum of both) with AVX-512 in halves. Of a voxel in a view, of a point on its way
-# into the Fourier plane, of a cell of that plane, of a point in the plan.
+# ns for sixteen slices, on two cores (sum of both) with AVX-512 in halves. They are for a voxel in a view, a point on
+# its way into the Fourier plane, a cell of that plane, a point in the plan.
 _NS_A_RAY, _NS_A_POINT, _NS_A_CELL, _NS_OF_PLAN = 5, 85, 150, 20
 
 

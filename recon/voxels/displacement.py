@@ -52,7 +52,7 @@ class Displacement:
     turn: float = 0.0
 
     def farthest(self, radius: float) -> float:
-        """mm by which a point so far from the axis moves, at most about."""
+        """Upper bound, about, of the motion in mm of a point so far from the axis."""
         return math.hypot(self.x, self.y, self.z) + abs(self.turn) * radius
 
 

@@ -29,7 +29,7 @@ _HALVINGS = 5  # at most
 _ROUNDS = 3  # of sweeps, at most
 _BREGMAN_RUNS = 5  # one once, and two twice
 MOST_SWEEPS = _ROUNDS * _SWEEPS
-"""Of a finish, where views held out prefer them."""
+"""Sweeps of a finish, where views held out prefer them."""
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
 _LEVEL = 0.002  # residuals of views held out that differ by less are equal
 

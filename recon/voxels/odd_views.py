@@ -58,13 +58,14 @@ def odd_views(
     limit: float = LIMIT,
     told: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[OddView, ...]:
-    """Views in which something was in the beam, or the sample was elsewhere, for few views: p - A x, seen by place.
+    """Views in which something crossed the beam or the sample was elsewhere, found in the differences p - A x, place by
+    place.
 
     The difference of each view from the volume's projection, less what all its pixels have in common (light). It is
     averaged over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views
     fully: at edges that it blurs, at rings, at what lies outside the field. So a difference counts relative to the 18
-        views of the nearest angles at the same place. It also counts relative to the edges of the volume in the view
-        itself: a face or a crack parallel to the rays is sharp in few views only [our own].
+    views of the nearest angles at the same place. It also counts relative to the edges of the volume in the view
+    itself: a face or a crack parallel to the rays is sharp in few views only [our own].
 
     Args:
         projections: [view, row, col].
@@ -151,8 +152,8 @@ def _differences(
     side: int,
     told: Callable[[int, int], None],
 ) -> tuple[F32, F32]:
-    """[view, cell, cell] each, averaged over cells, in standard deviations of noise: of the views from the volume, and
-    what edges explain of that."""
+    """The difference of the views from the volume, and the part of it that edges explain. [view, cell, cell] each,
+    averaged over cells, in standard deviations of noise."""
     rows, cols = (n // side for n in geometry.detector_shape)
     # Means over cells: of the difference in light, what edges explain of it, the pixels that are known, the view in
     # light, the light, and the difference.

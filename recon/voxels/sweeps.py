@@ -3,7 +3,7 @@
     x <- x + relaxation C A_sᵀ R (p_s - A_s x)        R = 1 / row sums of A,  C = 1 / column sums of A_s
 
 One subset of all views is SIRT (Gilbert 1972; Gregor & Benson 2008), one view a subset is SART (Andersen & Kak 1984).
-Of the column sums of the subsets the largest are taken, so that one volume serves all and no step is too long.
+The largest column sums of all subsets are taken, so that one volume serves all and no step is too long.
 """
 
 from __future__ import annotations

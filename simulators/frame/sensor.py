@@ -26,7 +26,7 @@ OFFSET = MappingProxyType({"standard": 200.0, "ultra_quiet": 200.0, "photon_numb
 READ_NOISE = MappingProxyType({"standard": 0.43, "ultra_quiet": 0.27, "photon_number": 0.27})
 """Electrons rms in each readout."""
 LARGEST_PHOTON_NUMBER = 200
-"""Of an unbinned pixel."""
+"""Values of an unbinned pixel."""
 DARK_CURRENT = 0.0036
 """Electrons a second and pixel."""
 FULL_WELL = 7000.0

@@ -50,7 +50,7 @@ LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: H
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
 ESRF_VERSION = 1.5
-"""Of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest that has all of ours."""
+"""Version of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest with all of ours."""
 
 ENTRY = "/entry"
 DETECTOR = "/entry/instrument/detector"
@@ -79,7 +79,8 @@ BEAM = "/entry/record/beam"
 BEAM_TIME, BEAM_VALUE = f"{BEAM}/time", f"{BEAM}/value"
 AXIS_COL = "/entry/record/axis_col"
 SOURCE_DISTANCE = "/entry/record/source_distance"
-"""Of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes for cones."""
+"""Only in the files of a cone beam. NXsource has a distance too, but synchrotrons state it for beams that nobody takes
+for cones."""
 
 _SCALARS_PER_CHUNK = 512  # 4 KiB: the least that a flush writes for each column
 _MARKS_PER_CHUNK = 32  # frames, of scores and regions
@@ -416,7 +417,7 @@ def field_of_view(file: h5py.File) -> str:
 
 
 def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
-    """Of the views that are planned, in radians; one that is not known where the plan does not say them."""
+    """Angles of the planned views, in radians; unknown where the plan does not say them."""
     try:
         return np.radians(np.asarray(json.loads(info.plan)["angles_deg"], np.float64))
     except (ValueError, LookupError, TypeError):  # a plan of another program, or none

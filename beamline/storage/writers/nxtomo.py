@@ -152,7 +152,7 @@ class NXtomoWriter:
 
     @property
     def safe(self) -> int:
-        """Of these, what the disk has, as far as is known: after a failed fsync it may have lost what came since the
+        """Of these, what the disk has, as far as is known: after a failed fsync it may have lost everything since the
         last one that succeeded."""
         return self._to_disk.rows if self._to_disk.failed else self._committed
 

@@ -14,7 +14,7 @@ _PATIENCE = 60.0  # s that the last calls may take
 
 
 class ToDisk:
-    """Calls `to_disk` in a thread, one call at a time: a writer that waited for it would be as slow as both together.
+    """Calls `to_disk` in a thread, one call at a time: so a writer need not wait for the disk.
 
     The thread is a daemon: a disk that hangs does not keep the program from ending.
 

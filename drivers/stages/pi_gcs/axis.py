@@ -214,7 +214,7 @@ class PiGcsAxis:
             )
 
     def _take_accelerations(self, rate: Fraction) -> None:
-        """By ACC and DEC; a controller that does not know them has parameters for both."""
+        """Set accelerations by ACC and DEC; a controller without these commands has parameters for both."""
         for command, parameter in (("ACC", ACCELERATION), ("DEC", DECELERATION)):
             try:
                 self._take_rate(command, rate)

@@ -108,7 +108,7 @@ class GcsLine:
             )
 
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
-        """A query as text, or as a control byte; the match of its whole reply with `form`."""
+        """Send a query, a text or a control byte. Returns the match of its whole reply with `form`."""
         if isinstance(request, bytes):
             return self._serial.query_raw(request, form, meant, self._state())
         return self._serial.query(request, form, meant, self._state())

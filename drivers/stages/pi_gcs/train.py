@@ -1,8 +1,9 @@
 """Trigger trains by PI GCS 2.0's mode 0 (PositionDistance): step and window for a train, and when a train is spent.
 
-The controller gives a pulse each step travelled while it is between the thresholds and came in by the start one. The
+The controller gives a pulse at each step between the thresholds, if the stage entered through the start threshold. The
 stop threshold lies half an interval behind the last pulse, so that it does not matter whether the threshold itself
-fires. Where the first pulse comes no manual says; taken from memory as being at the start threshold, see `FirstPulse`.
+fires. No manual says where the first pulse comes. We take it to come at the start threshold, from memory, see
+`FirstPulse`.
 """
 
 from __future__ import annotations

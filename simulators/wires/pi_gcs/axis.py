@@ -162,7 +162,7 @@ class GcsAxis:
                 self._at_end = act
 
     def reference(self, kind: str) -> None:
-        """FRF, FNL or FPL."""
+        """Start the reference move of a command FRF, FNL or FPL."""
         if not self.build.reference_switch and kind == "FRF":
             raise GcsError(31)
         if not self.build.limit_switches and kind != "FRF":

@@ -2,7 +2,7 @@
 
 A command line ends with LF (CR is ignored, case does not matter) and is one item; single control bytes act at once.
 Settings are not answered: what is wrong with a line, the error register says (ERR?, which clears it; the last error
-wins). An unknown query is not answered either. Of a reply of several lines all but the last end with SPACE LF.
+wins). An unknown query is not answered either. In a reply of several lines all but the last end with SPACE LF.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
 MAX_PULSES = 200_000
-"""Of a train; a limit of this stand-in, which works all of them out when a move begins."""
+"""Most pulses of a train; a limit of this stand-in, which works all of them out when a move begins."""
 MODES = (
     (Output.OFF, 0.0),
     (Output.GATE, 0.0),

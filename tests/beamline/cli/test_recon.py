@@ -220,7 +220,7 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     for options, code, error in (
         (way, 2, "--phase needs --distance-mm, which scan.h5 does not say"),
         (("--distance-mm", "20"), 2, "--distance-mm, --energy-kev and --unsharp are for --phase"),
-        (("--phase", "born:3"), 2, "none of none, paganin:RATIO"),
+        (("--phase", "born:3"), 2, "expected none, paganin:RATIO"),
         ((*way, "--distance-mm", "20", "--phase", "paganin:bone"), 2, "'bone' is neither a material"),
         ((*way, "--distance-mm", "20", "--unsharp", "3"), 2, "is not SIGMA:WEIGHT"),
     ):

@@ -297,7 +297,7 @@ REMARKS = {
     "rounding": (
         {"angles": angles.fixed(181), "period": 0.2},
         "the step of 0.994475° is 994.475 counts; triggers fall on whole counts, so it becomes 994 counts = 0.994°, "
-        "which moves views by up to 0.0855",
+        "and views move by up to 0.0855",
     ),
     "whole counts a second": (
         {"angles": angles.fixed(36_000), "period": 0.6},
