@@ -18,8 +18,8 @@ PARTS = [
     if part.suffix == ".py" or (part.is_dir() and part.name != "__pycache__")
 ]
 SITE = (
-    "architecture", "commands", "corrections", "energies", "faults", "file_layout", "glossary", "index", "numerics", "page", "performance",
-    "python", "reconstruction", "scan_files", "scan_layout", "states", "volume_layout",
+    "architecture", "commands", "corrections", "energies", "faults", "file_layout", "glossary", "index", "numerics",
+    "page", "performance", "python", "reconstruction", "scan_files", "scan_layout", "states", "volume_layout",
 )  # fmt: skip
 PAGES = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", *(f"docs/{name}.md" for name in SITE))
 

@@ -32,8 +32,7 @@ def _limits_of(check: Check) -> Any:
     """The section with the limits of a check, and its default, as pydantic.create_model takes a field."""
     types = get_type_hints(type(check), include_extras=True)
     keys: dict[str, Any] = {limit.name: (types[limit.name], limit.default) for limit in fields(check)}
-    name = type(check).__name__.removesuffix("Check")
-    section = create_model(f"{name}Limits", __base__=Section, __doc__=f"Flag: {check.meaning}.", **keys)
+    section = create_model(f"{type(check).__name__}Limits", __base__=Section, __doc__=f"Flag: {check.meaning}.", **keys)
     return section, section()
 
 

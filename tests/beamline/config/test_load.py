@@ -65,7 +65,7 @@ def test_schema_describes_a_configuration() -> None:
     json.dumps(schema)
     assert schema["additionalProperties"] is False
     assert {"sample", "scan", "devices", "optics"} <= set(schema["required"])
-    period = schema["$defs"]["Scan"]["properties"]["period_s"]
+    period = schema["$defs"]["ScanSection"]["properties"]["period_s"]
     assert period["exclusiveMinimum"] == 0
     assert "fly scan" in period["description"]
 
