@@ -50,7 +50,7 @@ class MethodConformance:
         raise NotImplementedError
 
     def test_it_is_an_immutable_value_that_says_who_it_is(self, method: Method) -> None:
-        assert is_dataclass(method) and method.__dataclass_params__.frozen  # type: ignore[attr-defined]
+        assert is_dataclass(method) and method.__dataclass_params__.frozen
         assert method.name and method.label and isinstance(method.traits, Traits)
         type(method)()  # every setting has a default
 
