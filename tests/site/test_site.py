@@ -34,6 +34,9 @@ from tests.site.site_of_an_instrument.stages import SiteStage, SiteStageSettings
 from tests.site.site_of_an_instrument.wires import SiteBuild
 
 HERE = Path(__file__).parent
+GROUPS = [
+    f"splatline.{kind}" for kind in ("method", "reader", "volume_format", "stage", "wire", "camera", "check", "effect")
+]
 NAMES = (f"site-{number}" for number in itertools.count())
 FIGURES = {
     "counts_per_turn": 360_000, "max_speed": math.radians(30), "acceleration": math.radians(60),
@@ -105,12 +108,14 @@ with warnings.catch_warnings(record=True) as told:
     text = suffixes_text()
     from simulators.wires.registry import WIRES
 
-left_out = sorted(str(one.message).split(" was left out")[0] for one in told if "left out" in str(one.message))
-assert left_out == [
-    "The effect 'gone' of the package site-of-an-instrument (no_such_module:Gone)",
-    "The method 'fbp' of the package site-of-an-instrument (site_of_an_instrument.methods:Mean)",
-    "The volume format 'taken' of the package site-of-an-instrument (beamline.storage.volumes.plain:Npy)",
-], left_out
+left_out = {str(one.message).split(" was left out")[0] for one in told if "left out" in str(one.message)}
+package = "of the package site-of-an-instrument"
+kinds = ("method", "reader", "volume format", "stage", "wire", "camera", "check", "effect")
+assert left_out == {f"The {kind} 'wrong' {package} (math:pi)" for kind in kinds} | {
+    f"The effect 'gone' {package} (no_such_module:Gone)",
+    f"The method 'fbp' {package} (site_of_an_instrument.methods:Mean)",
+    f"The volume format 'taken' {package} (beamline.storage.volumes.plain:Npy)",
+}, left_out
 
 grid = recon.Grid((2, 8, 8), 1.0)
 volume = recon.Volume(np.arange(128, dtype=np.float32).reshape(grid.shape), grid)
@@ -179,6 +184,7 @@ def test_one_of_each_kind_is_found_by_its_entry_point_and_what_does_not_fit_is_n
     _installed(
         tmp_path,
         [
+            *((group, "wrong = math:pi") for group in GROUPS),
             ("splatline.method", "fbp = site_of_an_instrument.methods:Mean"),
             ("splatline.effect", "gone = no_such_module:Gone"),
             ("splatline.volume_format", "taken = beamline.storage.volumes.plain:Npy"),
