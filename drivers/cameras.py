@@ -8,6 +8,7 @@ from typing import Any, Protocol
 from drivers.clock import Clock
 from drivers.plugins import plugins
 from drivers.protocols import Camera, CameraSettings, CameraTiming
+from drivers.stages.settings import with_keys
 
 
 class CameraDriver(Protocol):
@@ -29,5 +30,5 @@ class CameraDriver(Protocol):
         ...
 
 
-CAMERAS: Mapping[str, CameraDriver] = plugins("camera", ("dcam", "simulated_orca"))
+CAMERAS: Mapping[str, CameraDriver] = plugins("camera", ("dcam", "simulated_orca"), with_keys)
 """Kind, as a configuration names it -> the driver."""

@@ -133,7 +133,11 @@ def _entries() -> Mapping[str, Entry]:
     def made(name: str, method: type[Method]) -> Entry:
         if method.name != name:
             raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
-        return Entry(method.__module__, method.__name__, hasattr(method, "stream"))
+        entry = Entry(method.__module__, method.__name__, hasattr(method, "stream"))
+        if getattr(import_module(entry.module), entry.cls, None) is not method:
+            raise ValueError(f"its class {method.__qualname__} is not at the top of the module {entry.module}")
+        _ = method(), method.label, method.traits.direct  # every setting has a default
+        return entry
 
     return {**REGISTRY, **plugins("method", (*REGISTRY, AUTO), made)}
 

@@ -7,6 +7,7 @@ legend in a scan file, and its name in `beamline info` follow.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import fields
 from importlib import import_module
 
 from beamline.monitor.check import Check, Flag, Level
@@ -57,6 +58,7 @@ def _plugged(ours: tuple[Check, ...]) -> tuple[Check, ...]:
         check = kind()
         if check.name != name:
             raise ValueError(f"its class calls itself {check.name!r}; expected the entry point's name")
+        _ = check.policy, check.unit, check.meaning, check.start(), fields(check)
         found = _distinct(*found, check)
         return check
 

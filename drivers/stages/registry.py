@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from importlib import import_module
 
 from drivers.plugins import plugins
-from drivers.stages.settings import StageDriver
+from drivers.stages.settings import StageDriver, with_keys
 
 REGISTRY = {  # kind, as a configuration names it: class in the kind's module `stage`
     "pm16c": "PM16CStage",
@@ -18,6 +18,6 @@ REGISTRY = {  # kind, as a configuration names it: class in the kind's module `s
 }
 STAGES: Mapping[str, StageDriver] = {
     **{kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name) for kind, name in REGISTRY.items()},
-    **plugins("stage", REGISTRY),
+    **plugins("stage", REGISTRY, with_keys),
 }
 """Kind -> the driver."""

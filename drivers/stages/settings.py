@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from drivers.clock import Clock
+from drivers.flat import flat_fields
 from drivers.protocols import RotationStage, StageLimits
 
 FARTHEST = 1e9
@@ -47,6 +48,18 @@ def key(default: Any = MISSING, doc: str = "", *, unit: str = "", **bounds: Any)
     """A dataclass field that a configuration writes; `default` in the key's unit."""
     inside = math.radians(default) if unit in ANGULAR and isinstance(default, float) else default
     return field(default=inside, metadata={"key": Key(unit, default, doc, bounds)})
+
+
+def with_keys(name: str, driver: Any) -> Any:
+    """The driver of another package, where a configuration can write every field of its settings.
+
+    Raises:
+        ValueError: it cannot.
+    """
+    without = [field.name for field in flat_fields(driver.Settings) if not isinstance(field.metadata.get("key"), Key)]
+    if without:
+        raise ValueError(f"{', '.join(without)} of {driver.Settings.__name__} have no key(...)")
+    return driver
 
 
 @dataclass(frozen=True)

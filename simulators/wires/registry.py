@@ -23,9 +23,17 @@ REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's modul
     "pi_gcs": "PiGcsBuild",
     "zaber": "ZaberBuild",
 }
+
+
+def _fitting(name: str, found: type[Build]) -> type[Build]:
+    """The class, if an option of it can be read."""
+    _ = flat_fields(found), found.matching
+    return found
+
+
 WIRES: dict[str, type[Build]] = {
     **{kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()},
-    **plugins("wire", REGISTRY),
+    **plugins("wire", REGISTRY, _fitting),
 }
 """Kind -> how its simulated controller is built."""
 

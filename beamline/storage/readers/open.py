@@ -34,9 +34,17 @@ REGISTRY = (  # modules in this folder, asked in this order
     "nxtomo",
     "dxchange",
 )
+
+
+def _fitting(name: str, found: Any) -> ScanFormat:
+    if not isinstance(found, ScanFormat):
+        raise ValueError(f"it is a {type(found).__name__}; expected a ScanFormat, see beamline.storage.readers.base")
+    return found
+
+
 FORMATS: tuple[ScanFormat, ...] = (
     *(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY),
-    *plugins("reader", REGISTRY).values(),
+    *plugins("reader", REGISTRY, _fitting).values(),
 )
 """Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 

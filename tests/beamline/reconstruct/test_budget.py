@@ -162,7 +162,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
     """More steps than were best on other scans follow the noise."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
     monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: (0, 0.0))
-    monkeypatch.setattr(module, "best_steps", lambda method: 7)
+    monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
     done = _spend(prepared, 60.0, Ticking(0.1), methods=(R2(),))
     assert done.result.history[-1].step == 7 and done.seconds < 30
 

@@ -1,0 +1,55 @@
+"""Readers of ours pass the suite that is shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from beamline.testing import ReaderConformance
+from tests.beamline.storage.readers.test_dxchange import store
+from tests.beamline.storage.readers.test_nxtomo import foreign
+
+FRAMES = np.arange(6 * 4 * 5, dtype=np.uint16).reshape(6, 4, 5)
+
+
+def _exchange(path: Path) -> Path:
+    theta = np.linspace(0, 180, 4)
+    return store(path, {"data": FRAMES[2:], "data_white": FRAMES[1:2], "data_dark": FRAMES[:1], "theta": theta})
+
+
+def _pages(path: Path) -> Path:
+    tifffile.imwrite(path, FRAMES, photometric="minisblack")
+    return path
+
+
+def _series(path: Path) -> Path:
+    path.mkdir()
+    for n, frame in enumerate(FRAMES):
+        tifffile.imwrite(path / f"{n:03}.tif", frame)
+    return path
+
+
+SCANS: dict[str, tuple[str, Callable[[Path], Path]]] = {
+    "nxtomo": ("scan.nxs", foreign),
+    "dxchange": ("scan.h5", _exchange),
+    "tiff_stack": ("scan.tif", _pages),
+    "tiff_series": ("scan", _series),
+}
+
+
+class TestReaders(ReaderConformance):
+    @pytest.fixture(params=SCANS.values(), ids=SCANS.keys())
+    def path(self, request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+        name, write = request.param
+        found: Path = write(tmp_path / name)
+        return found
+
+    @pytest.fixture
+    def frames(self) -> NDArray[Any]:
+        return FRAMES
