@@ -20,7 +20,7 @@ def polyhedron(rays: Row, p: Packed, b: int, place: Reals, facets: Reals, lines:
     """Parallel rays; `lines` float64 [4, faces] is scratch memory."""
     row, u, per_mm, v, _ = rays
     dv = v - place[2]
-    left, right, high, low = place[3], place[4], 0, 0
+    left, right, high, low = place[3], place[4], np.int64(0), np.int64(0)  # numba compiles twice for the literal 0
     for f in range(p.first_face[b], p.first_face[b + 1]):
         a, slope = facets[f, 0] - facets[f, 1] * dv, facets[f, 2]
         if facets[f, 3] > 0:
@@ -33,7 +33,7 @@ def polyhedron(rays: Row, p: Packed, b: int, place: Reals, facets: Reals, lines:
             left, right = _bounded(left, right, slope, a)
     first, stop = _opened(u, per_mm, place[0], lines, high, low, left, right)
     if max(high, low) > 8:
-        return _walk(rays, place[0], p.attenuation[b], lines, high, low, (first, stop), False)
+        return _walk(rays, place[0], p.attenuation[b], lines, high, low, (first, stop))
     _add_gap(row[first:stop], u[first:stop], place[0], p.attenuation[b], lines, high, low)
     return first, stop
 
@@ -46,7 +46,7 @@ def cone_polyhedron(rays: Row, p: Packed, b: int, axes: Reals, place: Reals, lin
     front, back = sod / (sod + place[1] + place[5]), sod / (sod + place[1] + place[6])
     left, right = place[0] + place[3], place[0] + place[4]
     left, right = min(left * front, left * back) - middle, max(right * front, right * back) - middle
-    high = low = 0
+    high = low = np.int64(0)
     for f in range(p.first_face[b], p.first_face[b + 1]):
         nu, nb, nv = in_lab(p.faces[f], axes)
         inside = p.faces[f, 3] + nu * place[0] + nb * (sod + place[1]) + nv * place[2]
@@ -60,7 +60,7 @@ def cone_polyhedron(rays: Row, p: Packed, b: int, axes: Reals, place: Reals, lin
             lines[2, low], lines[3, low] = at_middle / inside, nu / inside
             low += 1
     first, stop = _opened(u, per_mm, middle, lines, high, low, left, right)
-    return _walk(rays, middle, p.attenuation[b], lines, high, low, (first, stop), True)
+    return _walk(rays, middle, p.attenuation[b], lines, high, low, (first, stop))
 
 
 @njit(**KERNEL)
@@ -136,11 +136,9 @@ def _add_gap(row: Reals, u: Reals, middle: float, attenuation: float, lines: Rea
 
 
 @njit(**KERNEL)
-def _walk(
-    rays: Row, middle: float, attenuation: float, lines: Reals, high: int, low: int, span: Span, cone: bool
-) -> Span:
+def _walk(rays: Row, middle: float, attenuation: float, lines: Reals, high: int, low: int, span: Span) -> Span:
     """Add attenuation x the gap in a range of columns, from kink to kink; in a cone the gap is that of t."""
-    row, u, per_mm, _, _ = rays
+    row, u, per_mm, _, sod = rays
     first, stop = span
     if first >= stop:
         return 0, 0
@@ -168,7 +166,7 @@ def _walk(
             kink = min(kink, meets)
         end = min(stop, max(begin, columns(u, per_mm, -np.inf, middle + kink)[1]))
         part, where = row[begin:end], u[begin:end]
-        if cone:
+        if sod < np.inf:
             a, b, c, d = lines[0, k], lines[1, k], lines[2, m], lines[3, m]
             for i in range(part.size):
                 s, z = a + b * (where[i] - middle), c + d * (where[i] - middle)

@@ -123,7 +123,7 @@ def _depth_rows(p: Packed, view: View, scratch: Scratch, rows: NDArray[np.int64]
     place, facets, lines, touched, base = scratch.place, scratch.facets, scratch.lines, scratch.touched, scratch.base
     _locate_all(p, view, place, facets)
     whole = out.shape[0] == view.v.size
-    known = -1
+    known = np.int64(-1)  # numba compiles twice for the literal
     for r in range(rows.size):
         j = rows[r]
         row = out[j] if whole else out[r]
@@ -147,7 +147,7 @@ def _count_rows(
     place, facets, lines, touched, row, base, of_base = scratch
     open_beam, air, top = counter
     _locate_all(p, view, place, facets)
-    known, base_in_doubt = -1, False
+    known, base_in_doubt = np.int64(-1), False
     for j in range(start, view.v.size, step):
         before = known
         known, first, stop = _base(p, view, j, known, place, base)
@@ -244,7 +244,7 @@ def _base(p: Packed, view: View, j: int, known: int, place: Reals, base: Reals) 
     for k in range(start, stop):
         b = view.round[k]
         if view.axes.shape[0] > 1:
-            locate(p, b, view.axes[j], view.origin[j], True, place[b], place[:0])
+            locate(p, b, view.axes[j], view.origin[j], view.sod == np.inf, place[b], place[:0])
         if abs(view.v[j] - place[b, 2]) <= p.size[b, 1] + 1e-9 * view.pitch:
             first, end = upright_cylinder(base, view.u, 1.0 / view.pitch, place[b, 0], p.size[b, 0], p.attenuation[b])
             left, right = min(left, first), max(right, end)
