@@ -14,6 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
+from recon.kernels.cpu.engine import Active, Gradients, grid_layout
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
@@ -21,6 +22,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.back_project import compile_gridding
 from recon.voxels.fbp import is_gridded
+from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.view_weights import covers_the_circle
 
 _SHAPE, _VIEWS = (12, 16), 4
@@ -60,6 +62,19 @@ def warm_up(
         reconstruct(data, views, (method or R2()).toy(), device=device, use=DataUse(weights))
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
+
+
+def warm_up_rest() -> None:
+    """Compile what an R2 fit needs last, beside a process in `warm_up`, which finds it in numba's cache when it comes
+    to it: two processor cores compile."""
+    views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
+    data = np.ones((_VIEWS, *_SHAPE), np.float32) * np.hanning(_SHAPE[1]).astype(np.float32)
+    reconstruct(data, views, FistaTv(tv_weight=0.01).toy())
+    grid, one = Grid.matching(views), np.ones(1, np.float32)
+    turned = np.eye(3, dtype=np.float32).reshape(1, 9)
+    blob = Active(np.zeros((1, 3), np.float32), np.full((1, 3), 2, np.float32), turned, one, FitSettings().kernel)
+    layout, into = grid_layout(blob, grid, 0.01, 3.0), Gradients.zeros(1)
+    layout.backward(layout.fill(), into.means, into.log_scales, into.rotations, into.densities)
 
 
 @contextmanager

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +19,7 @@ from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.narration import sentence
+from beamline.core.process import ChildProcess
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from drivers.clock import SystemClock
@@ -47,11 +50,20 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
         config = load(config_folder() / "demo.yaml", overrides)
         stop = StopRequest()
         last: list[Event] = []
-        with stop_signals(stop), Terminal(sys.stderr) as terminal:
+        with stop_signals(stop), _compiling(), Terminal(sys.stderr) as terminal:
             run_demo(config, output, [terminal, last.append, *sinks], stop, shlex.join(["beamline", *sys.argv[1:]]))
     if not as_json:
         click.echo(f"{'folder':<10}{Path(last[-1].data['output']).parent}")
         click.echo(results(last[-1].data))
+
+
+@contextmanager
+def _compiling() -> Iterator[None]:
+    """A process of low priority that compiles, from now on, what the fit needs last: once on a machine."""
+    with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
+        words = [sys.executable, "-c", "from recon.warm_up import warm_up_rest; warm_up_rest()"]
+        with ChildProcess(words, nowhere, lambda line: None, behind=True):
+            yield
 
 
 REPORT = "report.html"

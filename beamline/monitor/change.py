@@ -14,8 +14,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.jit import njit
 from beamline.monitor.view import CellGrid, CellValues, CellView
@@ -101,26 +103,12 @@ def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> Sam
         return None
     # A gain that has changed is no velocity.
     gained = np.float32(sum(one.brighter for one in last[1:]))
-    found = np.zeros(5)
-    residual, image, turning = (np.empty_like(view.depth) for _ in range(3))
     weight = np.minimum(view.weight, last[-1].weight)
-    _fit(
-        view.depth,
-        last[-1].depth,
-        last[-2].depth,
-        last[0].depth - gained,
-        weight,
-        steps,
-        residual,
-        image,
-        turning,
-        found,
-    )
-    gain, across, down, turn, noise = (float(x) for x in found)
-    causes = Causes(image, turning, weight, float(steps), grid.cell)
-    return SampleChange(
-        math.expm1(-gain), across * grid.cell, down * grid.cell, turn / float(steps), residual, noise, causes
-    )
+    fit = _fit(view.depth, last[-1].depth, last[-2].depth, last[0].depth - gained, weight, steps)
+    gain, across, down, turn = fit.solution.tolist()
+    across, down, turn = across * grid.cell, down * grid.cell, turn / float(steps)
+    causes = Causes(fit.image, fit.turning, weight, float(steps), grid.cell)
+    return SampleChange(math.expm1(-gain), across, down, turn, fit.residual, fit.noise, causes)
 
 
 def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
@@ -152,81 +140,113 @@ def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers t
 
 
 @njit(nogil=True, cache=True)
-def _weigh(change, usual, weight, share, deviation):  # type: ignore[no-untyped-def]
-    """Fills `share`, the Huber weights of changes about their usual value; `deviation` is scratch."""
-    rows, cols = change.shape
+def _deviate(change, usual, weight, deviation, sample):  # type: ignore[no-untyped-def]
+    """Fills `deviation`; `sample` gets that of one cell of five, of those with a weight: their number."""
     n = 0
-    for row in range(rows):
-        for col in range(cols):
-            share[row, col] = abs(change[row, col] - usual) * np.sqrt(weight[row, col])
+    for row in range(change.shape[0]):
+        for col in range(change.shape[1]):
+            deviation[row, col] = abs(change[row, col] - usual) * np.sqrt(weight[row, col])
             if weight[row, col] > 0 and (row + col) % 5 == 0:
-                deviation[n] = share[row, col]
+                sample[n] = deviation[row, col]
                 n += 1
-    limit = HUBER * 1.4826 * np.median(deviation[:n]) + 1e-9 if n > 0 else 1.0
-    for row in range(rows):
-        for col in range(cols):
-            share[row, col] = min(1.0, limit / max(share[row, col], 1e-12))
+    return n
+
+
+def _deviation(change: CellValues, usual: float, weight: CellValues) -> tuple[CellValues, float | None]:
+    """Deviations from the usual value, and their standard deviation by the median; None where no cell has a weight."""
+    deviation, sample = np.empty_like(change), np.empty(change.size, np.float32)
+    n = _deviate(change, usual, weight, deviation, sample)
+    return deviation, 1.4826 * _median(sample[:n]) if n else None
+
+
+def _median(values: CellValues) -> float:
+    """As np.median, which takes longer to begin than for a few thousand values."""
+    half = values.size // 2
+    low = half - 1 + values.size % 2
+    ordered = np.partition(values, (low, half), axis=None)
+    return float(0.5 * (ordered[low] + ordered[half]))
+
+
+def _shares(change: CellValues, usual: float, weight: CellValues) -> CellValues:
+    """Huber weights of changes about their usual value."""
+    deviation, spread = _deviation(change, usual, weight)
+    limit = np.float32(1.0 if spread is None else HUBER * spread + 1e-9)
+    return np.minimum(np.float32(1), limit / np.maximum(deviation, np.float32(1e-12)))
 
 
 @njit(nogil=True, cache=True)
-def _fit(now, one, two, four, weight, steps, residual, image, turning, found):  # type: ignore[no-untyped-def]
-    """Fills `residual`, `image`, `turning` and `found`: minus gain, across, down in cells, turn in steps, noise."""
-    rows, cols = now.shape
+def _add_normal(smooth, image, turning, weight, share, normal, right):  # type: ignore[no-untyped-def]
+    """Adds the normal equations of the four causes: the upper half of `normal` [4, 4], and `right` [4]."""
+    rows, cols = smooth.shape
+    basis = np.zeros(4)
+    for row in range(rows):
+        above, below = max(row - 1, 0), min(row + 1, rows - 1)
+        for col in range(1, cols - 1):
+            w = weight[row, col] * share[row, col]
+            if w <= 0 or weight[row, col - 1] <= 0 or weight[row, col + 1] <= 0:
+                continue
+            basis[0] = 1.0
+            basis[1] = 0.5 * (image[row, col - 1] - image[row, col + 1])
+            basis[2] = (image[above, col] - image[below, col]) / max(below - above, 1)
+            basis[3] = turning[row, col]
+            for i in range(4):
+                right[i] += w * basis[i] * smooth[row, col]
+                for j in range(i, 4):
+                    normal[i, j] += w * basis[i] * basis[j]
+
+
+@njit(nogil=True, cache=True)
+def _take_off(change, smooth, image, turning, weight, solution, residual, left_over):  # type: ignore[no-untyped-def]
+    """Fills `residual` and `left_over`, what the causes do not explain of the change and of the smooth one."""
+    rows, cols = change.shape
+    for row in range(rows):
+        above, below = max(row - 1, 0), min(row + 1, rows - 1)
+        for col in range(cols):
+            left, beside = max(col - 1, 0), min(col + 1, cols - 1)
+            explained = (
+                solution[0]
+                + solution[1] * (image[row, left] - image[row, beside]) / max(beside - left, 1)
+                + solution[2] * (image[above, col] - image[below, col]) / max(below - above, 1)
+                + solution[3] * turning[row, col]
+            )
+            residual[row, col] = change[row, col] - explained if weight[row, col] > 0 else 0.0
+            left_over[row, col] = smooth[row, col] - explained
+
+
+class _Fit(NamedTuple):
+    """What explains the change best: minus gain, across, down in cells, turn in steps; and what it leaves."""
+
+    solution: NDArray[np.float64]
+    residual: CellValues
+    noise: float
+    image: CellValues
+    turning: CellValues
+
+
+def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, weight: CellValues, steps: float) -> _Fit:
+    """The causes of the change from `one`, the view before; `two` and `four` are those before that.
+
+    The median and the solution are numpy's: numba's take ten seconds to compile, in a machine's first scan.
+    """
     velocity = (one - four) * np.float32(steps / 3)
     change = now - one - velocity
-    line = np.empty(cols, np.float32)
-    smooth, left_over = np.empty_like(now), np.empty_like(now)
+    line = np.empty(now.shape[1], np.float32)
+    image, turning, smooth, residual, left_over = (np.empty_like(now) for _ in range(5))
     # Half a step back, as `change` compares now with one: the gradient is that of the middle.
     _smooth((one + two) * np.float32(0.5) + velocity, image, line)
     _smooth(velocity, turning, line)
     _smooth(change, smooth, line)
-    share, deviation = np.empty_like(now), np.empty(rows * cols, np.float32)
-    _weigh(smooth, np.median(smooth), weight, share, deviation)
-    normal, right, solution = np.zeros((4, 4)), np.zeros(4), np.zeros(4)
-    basis = np.zeros(4)
+    solution: NDArray[np.float64] = np.zeros(4)
+    share = _shares(smooth, _median(smooth), weight)
     for robust in range(2):
-        normal[:], right[:] = 0.0, 0.0
-        for row in range(rows):
-            above, below = max(row - 1, 0), min(row + 1, rows - 1)
-            for col in range(1, cols - 1):
-                w = weight[row, col] * share[row, col]
-                if w <= 0 or weight[row, col - 1] <= 0 or weight[row, col + 1] <= 0:
-                    continue
-                basis[0] = 1.0
-                basis[1] = 0.5 * (image[row, col - 1] - image[row, col + 1])
-                basis[2] = (image[above, col] - image[below, col]) / max(below - above, 1)
-                basis[3] = turning[row, col]
-                for i in range(4):
-                    right[i] += w * basis[i] * smooth[row, col]
-                    for j in range(i, 4):
-                        normal[i, j] += w * basis[i] * basis[j]
-        for i in range(4):
-            for j in range(i):
-                normal[i, j] = normal[j, i]
+        normal, right = np.zeros((4, 4)), np.zeros(4)
+        _add_normal(smooth, image, turning, weight, share, normal, right)
+        normal += np.triu(normal, 1).T
         # A cause that moves nothing (no sample, one row, a disc that turns) gets no share of the change.
-        floor = 1e-9 * normal[0, 0]
-        for i in range(4):
-            normal[i, i] += floor + 1e-12
-        solution[:] = np.linalg.solve(normal, right)
-        for row in range(rows):
-            above, below = max(row - 1, 0), min(row + 1, rows - 1)
-            for col in range(cols):
-                left, beside = max(col - 1, 0), min(col + 1, cols - 1)
-                explained = (
-                    solution[0]
-                    + solution[1] * (image[row, left] - image[row, beside]) / max(beside - left, 1)
-                    + solution[2] * (image[above, col] - image[below, col]) / max(below - above, 1)
-                    + solution[3] * turning[row, col]
-                )
-                residual[row, col] = change[row, col] - explained if weight[row, col] > 0 else 0.0
-                left_over[row, col] = smooth[row, col] - explained
+        normal += (1e-9 * normal[0, 0] + 1e-12) * np.eye(4)
+        solution = np.linalg.solve(normal, right)
+        _take_off(change, smooth, image, turning, weight, solution, residual, left_over)
         if robust == 0:
-            _weigh(left_over, 0.0, weight, share, deviation)
-    n = 0
-    for row in range(rows):
-        for col in range(cols):
-            if weight[row, col] > 0 and (row + col) % 5 == 0:
-                deviation[n] = abs(residual[row, col]) * np.sqrt(weight[row, col])
-                n += 1
-    found[:4] = solution
-    found[4] = 1.4826 * np.median(deviation[:n]) if n > 0 else 0.0
+            share = _shares(left_over, 0.0, weight)
+    _, noise = _deviation(residual, 0.0, weight)
+    return _Fit(solution, residual, noise or 0.0, image, turning)

@@ -94,6 +94,14 @@ def digest(
     return FrameDigest(*numbers, checksum, preview, peaks)
 
 
+def block_means(image: NDArray[np.uint16], side: int) -> NDArray[np.float32]:
+    """The preview of a digest, to the bit, without its kernel: for a few frames numba would take longer to load."""
+    rows, cols = (np.arange(0, n, side) for n in image.shape)
+    sums = np.add.reduceat(np.add.reduceat(image, cols, axis=1, dtype=np.uint64), rows, axis=0)
+    pixels = np.multiply.outer(*(np.diff(np.append(at, n)) for at, n in zip((rows, cols), image.shape, strict=True)))
+    return (sums / pixels).astype(np.float32)
+
+
 def checksum_of(image: NDArray[Any]) -> int:
     """CRC-32 of the pixels in memory order."""
     return zlib_ng.crc32(np.ascontiguousarray(image).data.cast("B"))
@@ -116,7 +124,8 @@ def _of_greys(
 ) -> Numbers:
     full = 65536 if saturation is None else math.ceil(min(max(saturation, 0), 65536))
     every = max(1, image.size // ENTROPY_PIXELS)
-    low, high, total, squares, saturated, histogram = _count_greys(image, full, every, preview_bin, preview, peaks)
+    least, high, total, squares, saturated, histograms = _count_greys(image, full, every, preview_bin, preview, peaks)
+    low, histogram = int(least.min()), histograms.sum(0, np.int64)
     size, total, squares = image.size, int(total), int(squares)  # of any length: no square overflows
     greys = np.flatnonzero(histogram)
     bins = np.minimum((greys - low) * ENTROPY_BINS // max(high - low, 1), ENTROPY_BINS - 1)
@@ -172,7 +181,7 @@ def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers t
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: ignore[no-untyped-def]
-    """(minimum, maximum, sum, sum of squares, pixels from `full` on, histogram of every k-th row).
+    """(minima of columns, maximum, sum, sum of squares, pixels from `full` on, two histograms of every k-th row).
 
     Fills preview and peaks. Short loops over one line each: the compiler makes vector instructions of all but the
     histogram's; a check for a division by zero would forbid them.
@@ -210,14 +219,15 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: igno
         for at in range(across):
             preview[block, at] = np.float64(parts[at]) / np.float64(pixels)
         preview[block, across - 1] = np.float64(parts[across - 1]) / np.float64(at_edge)
-        peaks[block] = most
-        top = most.max()
+        top = np.uint16(0)
+        for at in range(across):  # numba's own max, sum along an axis and assignment of rows compile for seconds
+            peaks[block, at], top = most[at], max(top, most[at])
         high = max(high, top)
         if top >= full:
             for row in range(first, last):
                 for col in range(cols):
                     saturated += image[row, col] >= full
-    return int(least.min()), int(high), total, squares, saturated, histogram.sum(0).astype(np.int64)
+    return least, int(high), total, squares, saturated, histogram
 
 
 @njit(nogil=True, cache=True)

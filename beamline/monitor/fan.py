@@ -101,7 +101,8 @@ def correlate(views, weights, out):  # type: ignore[no-untyped-def]  # numba inf
     for row in range(rows):
         for lag in range(lags):
             wide[:REACH] = views[lag, row, 0]
-            wide[REACH : REACH + cols] = views[lag, row]
+            for i in range(cols):  # an assignment of slices compiles numba's check of shapes, for seconds
+                wide[REACH + i] = views[lag, row, i]
             wide[REACH + cols :] = views[lag, row, cols - 1]
             for signal in range(signals):
                 w, target = weights[signal, lag], out[signal, row]

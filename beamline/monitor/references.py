@@ -81,8 +81,13 @@ class ReferenceFrame:
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
-        blocks = np.array(digest.preview[thinned(digest.preview)])
-        return cls(row, kind, exposure, digest.saturated_fraction, blocks, block)
+        return cls.seen(row, kind, exposure, digest.saturated_fraction, digest.preview, block)
+
+    @classmethod
+    def seen(
+        cls, row: int, kind: FrameKind, exposure: float, saturated: float, preview: NDArray[np.float32], block: int
+    ) -> ReferenceFrame:
+        return cls(row, kind, exposure, saturated, np.array(preview[thinned(preview)]), block)
 
 
 class FaultKind(StrEnum):

@@ -102,8 +102,10 @@ def _search(older, newer, rules, sample, found):  # type: ignore[no-untyped-def]
                     continue
                 if abs(older[k, 2] - (col - speed * back)) <= cols:
                     seen[int(back)] = max(seen[int(back)], abs(older[k, 3]))
-            n = np.count_nonzero(seen)
-            total = seen.sum()
+            n, total = 0, 0.0  # numba's count_nonzero compiles for a second
+            for one in seen:
+                n += int(one > 0)
+                total += one
             if n >= least and n >= share * (age + 1) and total > best:
                 best = total
                 found[0], found[1], found[2], found[3] = older[j, 0], view, row, col

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from recon import warm_up as module
+from recon.base.choices import KERNEL
 from recon.base.geometry import Geometry
+from recon.kernels.cpu import joseph, tv, voxelize
 from recon.voxels.view_weights import covers_the_circle
-from recon.warm_up import toy_of, warm_up
+from recon.warm_up import toy_of, warm_up, warm_up_rest
 
 # In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
 _SCRIPT = """
@@ -117,3 +119,12 @@ def test_it_counts_what_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     counted: list[int] = []
     warm_up(on_kernel=counted.append)
     assert counted == [1, 2]
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_what_a_second_process_compiles_is_what_the_fit_calls() -> None:
+    kernels = (voxelize._FILL[KERNEL], voxelize._GATHER[KERNEL], joseph._forward, joseph._adjoint, tv._dual_step)
+    warm_up()
+    known = [set(kernel.signatures) for kernel in kernels]
+    warm_up_rest()
+    assert [set(kernel.signatures) for kernel in kernels] == known and all(known)

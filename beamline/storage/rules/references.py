@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.monitor.digest import digest
+from beamline.monitor.digest import block_means, digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
@@ -114,5 +114,8 @@ def _some(group: Frames) -> Frames:
 def _reference(source: ScanSource, row: int) -> ReferenceFrame:
     image = source.read([row])[0]
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
-    found = digest(image, saturation, BLOCK)
-    return ReferenceFrame.of(row, FrameKind(int(source.image_key[row])), float(source.exposures[row]), found, BLOCK)
+    about = row, FrameKind(int(source.image_key[row])), float(source.exposures[row])
+    if image.dtype == np.uint16:
+        saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
+        return ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
+    return ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)

@@ -244,7 +244,8 @@ def gather_footprint(table, i, rows, cols, gradient, moments, profile):  # type:
             mtt, mtv, mvv = mtt + (dx * t0 - shear * t1), mtv + t1, mvv + s2
         _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile)
     else:
-        _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments, profile)
+        # One type of the number, whatever that of the loop is: each would be compiled.
+        _gather_by_pixels(table, np.int64(i), row0, row1, col0, col1, gradient, moments, profile)
 
 
 @njit(inline="always", fastmath=True)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.stats import entropy as scipy_entropy
 
-from beamline.monitor.digest import ENTROPY_BINS, _count_greys, digest, preview_shape
+from beamline.monitor.digest import ENTROPY_BINS, _count_greys, block_means, digest, preview_shape
 
 shapes = st.tuples(st.integers(1, 17), st.integers(1, 17))
 counts = hnp.arrays(np.uint16, shapes)
@@ -183,3 +183,9 @@ def test_the_checksum_is_of_the_pixels_as_they_are_written(
 ) -> None:
     image = rng.integers(0, 200, (9, 7)).astype(dtype)
     assert digest(image, no_data=no_data).checksum == zlib.crc32(image.tobytes())
+
+
+@pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2), (1, 1)])
+def test_block_means_are_the_preview_of_a_digest(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).integers(0, 2**16, shape, np.uint16)
+    np.testing.assert_array_equal(block_means(image, 4), digest(image, 60_000, 4).preview)
