@@ -244,7 +244,7 @@ def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, we
         normal += np.triu(normal, 1).T
         # A cause that moves nothing (no sample, one row, a disc that turns) gets no share of the change.
         normal += (1e-9 * normal[0, 0] + 1e-12) * np.eye(4)
-        solution = np.linalg.solve(normal, right)
+        solution = np.asarray(np.linalg.solve(normal, right), np.float64)
         _take_off(change, smooth, image, turning, weight, solution, residual, left_over)
         if robust == 0:
             share = _shares(left_over, 0.0, weight)
