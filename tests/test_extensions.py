@@ -337,7 +337,7 @@ from beamline.core.errors import ConfigError
 from beamline.instrument.connect import connect
 from beamline.scan.preflight import dry_run
 from drivers.clock import SystemClock
-from simulators.wires.registry import stand_alone
+from simulators.wires.registry import WIRES
 
 turn = "kind: turn, port: 'sim://turn', counts_per_turn: 3600, max_speed_deg_s: 90, acceleration_deg_s2: 180"
 path = config_folder() / "simulated.yaml"
@@ -352,7 +352,7 @@ except ConfigError as error:
     assert "devices.stage" in str(error) and "gear" in str(error), error
 else:
     raise AssertionError("a gear of 0 was taken")
-wire = stand_alone("turn?counts=7", SystemClock())
+wire = WIRES["turn"](7).controller(SystemClock(), None)
 wire.receive(b"?")
 assert wire.transmit() == b"0007"
 """,

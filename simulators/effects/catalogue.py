@@ -26,16 +26,16 @@ class Entry:
         follows: effects of the same domain that must come before it: those with which the frame would differ if they
             came after it.
         reason: why they must.
-        final: it ends its domain: nothing of that domain may follow.
     """
 
     domain: Domain
     summary: str
     follows: frozenset[str] = frozenset()
     reason: str = ""
-    final: bool = False
 
 
+FINAL = frozenset({"photon_noise", "read_noise", "adc"})
+"""Effects that end their domain: nothing of that domain may follow."""
 _BEAM = frozenset({"beam_profile", "beam_bend", "narrow_field"})
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
 _OURS: Mapping[str, Entry] = MappingProxyType(
@@ -90,7 +90,7 @@ _OURS: Mapping[str, Entry] = MappingProxyType(
             frozenset({"scatter", "scintillator_blur"}),
             "pixels differ in their response to light that is spread already",
         ),
-        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random", final=True),
+        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
         "dark_current": Entry(Domain.ELECTRONS, "electrons that arise without light"),
         "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
         "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
@@ -106,9 +106,9 @@ _OURS: Mapping[str, Entry] = MappingProxyType(
             _CHARGE,
             "dead pixels hold a constant charge",
         ),
-        "read_noise": Entry(Domain.ELECTRONS, "noise of the readout", final=True),
+        "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
         "offset": Entry(Domain.COUNTS, "the digital bias"),
-        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one", final=True),
+        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
     }
 )
 

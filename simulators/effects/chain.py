@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label
-from simulators.effects.catalogue import CATALOGUE, order_error
+from simulators.effects.catalogue import CATALOGUE, FINAL, order_error
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Moments, Shot
@@ -36,7 +36,7 @@ class Effect(Protocol):
         super().__init_subclass__()
         name = cls.__module__.rpartition(".")[2]
         if entry := CATALOGUE.get(name):
-            cls.name, cls.domain, cls.final = name, entry.domain, entry.final
+            cls.name, cls.domain, cls.final = name, entry.domain, name in FINAL
 
 
 @runtime_checkable

@@ -1,8 +1,7 @@
 """Serial URL: `sim://name` opens a simulated device through pyserial, by the code path that opens a real port.
 
 pyserial finds the scheme in `simulators.wires.protocol_sim` once this module is imported. Names are process-wide, as
-the ports of a computer are. A name that nobody registered is a device by itself on the system's clock, built when it
-is first opened: `sim://pm16c`, or with options `sim://pm16c?channel=3&counts_per_turn=360000`; see `wires.registry`.
+the ports of a computer are.
 """
 
 from __future__ import annotations
@@ -12,8 +11,6 @@ import threading
 import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException, to_bytes
 
-from drivers.clock import SystemClock
-from simulators.wires.registry import WIRES, stand_alone
 from simulators.wires.wire import Wire
 
 SCHEME = "sim://"
@@ -41,14 +38,9 @@ class _Ports:
         with self._lock:
             if name in self._open:
                 raise SerialException(f"could not open port {SCHEME}{name}: it is open already")
-            if name not in self._wires and name.partition("?")[0] not in WIRES:
-                known = ", ".join(SCHEME + known for known in sorted({*self._wires, *WIRES}))
-                raise SerialException(f"could not open port {SCHEME}{name}: no such simulated port; there are {known}")
             if name not in self._wires:
-                try:
-                    self._wires[name] = stand_alone(name, SystemClock())
-                except ValueError as problem:
-                    raise SerialException(f"could not open port {SCHEME}{name}: {problem}") from problem
+                known = ", ".join(SCHEME + known for known in sorted(self._wires)) or "none"
+                raise SerialException(f"could not open port {SCHEME}{name}: no such simulated port; there are {known}")
             self._open[name] = self._wires[name]
             return self._wires[name]
 
