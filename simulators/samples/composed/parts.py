@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,12 +18,13 @@ from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.light.beam import Beam
 from simulators.light.effective_depth import effective_depth
-from simulators.light.materials import Material
-from simulators.light.palette import Palette
 from simulators.light.spectrum import Attenuation, Spectrum, light
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Solid, kind_of
 from simulators.samples.sample import Sample
+
+if TYPE_CHECKING:  # the tables are loaded where a scene names a material
+    from simulators.light.materials import Material
 
 Reals = NDArray[np.float64]
 
@@ -137,6 +139,8 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
         Constituent(Phantom.of([part.solid for part in parts if (part.material, part.instead_of) == kind]), *kind)
         for kind in kinds
     )
+    from simulators.light.palette import Palette
+
     reach = 2 * Phantom.of([part.solid for part in parts]).radius
     matter = dict.fromkeys(material for kind in kinds for material in kind if material is not None)
     spectrum = light(beam, [material.attenuation for material in matter], reach, filters or Palette().filters)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from simulators.frame.mapping import SceneError, build, choose, located
 from simulators.light.beam import Beam
-from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import SOLIDS, kind_of
+from simulators.samples.bodies.solids import SOLIDS
+from simulators.samples.composed.parts import Part, sample_of
 from simulators.samples.sample import Sample
 
 if TYPE_CHECKING:
     from simulators.light.palette import Palette
-    from simulators.samples.composed.parts import Part
 
 _OWN_KEYS = ("material", "instead_of", "name")
 
@@ -40,27 +39,17 @@ def sample_of_solids(where: str, mapping: Mapping[str, Any], beam: Beam) -> Samp
     keys = build(_Keys, where, mapping)
     entries = [(f"{where}.solids[{i}]", entry) for i, entry in enumerate(keys.solids or ())]
     used = {key for _, entry in entries if isinstance(entry, Mapping) for key in entry}
+    palette = None
     if "materials" in mapping or used & {"material", "instead_of"}:
-        return _of_materials(where, entries, keys.materials, beam)
-    solids, names = [], []
-    for at, entry in entries:
-        own = {"name": str(entry["name"])} if isinstance(entry, Mapping) and "name" in entry else {}
-        solids.append(choose(at, SOLIDS, {key: entry[key] for key in entry if key != "name"} if own else entry))
-        names.append(own.get("name", kind_of(solids[-1])))
-    return Phantom.of(solids, names)
+        from simulators.light.palette import palette_of
+
+        palette = palette_of(f"{where}.materials", keys.materials)
+    parts = [_part(at, entry, palette) for at, entry in entries]
+    return sample_of(parts, beam, None if palette is None else palette.filters)
 
 
-def _of_materials(where: str, entries: Sequence[tuple[str, Any]], materials: Any, beam: Beam) -> Sample:
-    from simulators.light.palette import palette_of
-    from simulators.samples.composed.parts import sample_of
-
-    palette = palette_of(f"{where}.materials", materials)
-    return sample_of([_part(at, entry, palette) for at, entry in entries], beam, palette.filters)
-
-
-def _part(where: str, entry: Any, palette: Palette) -> Part:
-    from simulators.samples.composed.parts import Part
-
+def _part(where: str, entry: Any, palette: Palette | None) -> Part:
+    """`palette`: None where the scene names no material."""
     if not isinstance(entry, Mapping):
         return Part(choose(where, SOLIDS, entry))
     own = {key: entry[key] for key in _OWN_KEYS if key in entry}
@@ -70,6 +59,6 @@ def _part(where: str, entry: Any, palette: Palette) -> Part:
     if "material" in own and "attenuation" in rest:
         raise SceneError(f"{where}: attenuation and material exclude each other; give one of them")
     with located(where):
-        materials = {key: palette(own[key]) for key in ("material", "instead_of") if key in own}
+        materials = {key: palette(own[key]) for key in ("material", "instead_of") if palette and key in own}
         solid = choose(where, SOLIDS, rest | ({"attenuation": 1.0} if materials else {}))
         return Part(solid, **materials, name=own.get("name"))
