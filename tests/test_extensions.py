@@ -369,7 +369,73 @@ assert wire.transmit() == b"0007"
 """,
 )
 
-EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER, "stage": STAGE}
+STEP = Extension(
+    {
+        "beamline/projections/steps/lift.py": """
+from dataclasses import dataclass
+from typing import ClassVar
+
+from beamline.projections.steps.step import Done, option
+
+
+@dataclass(frozen=True)
+class Lift:
+    name: ClassVar[str] = "lift"
+    follows: ClassVar[tuple[str, ...]] = ("hardening",)
+    by: float = option("--lift", "0", "Add this to all line integrals.", parse=float, metavar="BY")
+
+    def __post_init__(self):
+        if self.by < 0:
+            raise ValueError("--lift: nothing is taken off.")
+
+    @property
+    def needs_finished(self):
+        return "--lift is for a finished scan." if self.by else ""
+
+    def apply(self, views, angles):
+        views.projections.data[...] += self.by
+        return Done(f"Lifted by {self.by:g}." if self.by else "")
+"""
+    },
+    (("beamline/projections/steps/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
+    """
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner
+from beamline.cli.main import main
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.lift import Lift
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.writers.recon_file import read_reconstruction
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+path = write_exchange(Path("lift.h5"), TwoCylinders())
+with open_scan(SourceOptions(path)) as source:
+    chosen = [Selection(axis_col=20.7, steps=steps) for steps in ((), (Lift(0.5),))]
+    plain, lifted = (prepare_projections(source, each, print).projections.data for each in chosen)
+np.testing.assert_allclose(lifted, plain + 0.5, atol=1e-6)
+
+def run(*options):
+    done = CliRunner().invoke(main, ["recon", "lift.h5", "-m", "fbp", "--axis", "20.7", *options])
+    return done.exit_code, done.output
+
+code, said = run("--lift", "0.5", "-o", "lifted.h5")
+assert code == 0 and "Lifted by 0.5." in said, said
+found, page = read_reconstruction(Path("lifted.h5")).parameters, Path("lifted.html").read_text()
+assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.") and "Lifted by 0.5." in page and "lift: 0.5" in found["recipe"]
+assert run("--config", "lifted.h5", "-o", "again.h5")[0] == 0
+assert read_reconstruction(Path("again.h5")).parameters["lift"] == 0.5
+followed = CliRunner().invoke(main, ["recon", "lift.h5", "--lift", "1", "--follow"])
+assert followed.exit_code == 2 and "--lift is for a finished scan" in followed.output
+assert run("--lift", "-1")[0] == run("--lift", "much")[0] == 2
+for command in ("recon", "tradeoff"):
+    assert "--lift BY" in CliRunner().invoke(main, [command, "--help"]).output
+""",
+)
+
+EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER, "stage": STAGE, "step": STEP}
 
 
 # Each proof in a namespace of its own; the last line printed says which failed, and how.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.projections.steps.step import Done, option
@@ -26,7 +26,7 @@ def _wanted(text: str) -> str | None:
     return None if text == "none" else text
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Hardening:
     """How beam hardening is corrected.
 
@@ -46,7 +46,7 @@ class Hardening:
         parse=_wanted,
         metavar="none|fit|MATERIAL:BEAM",
     )
-    spectrum: Spectrum | None = None
+    spectrum: Spectrum | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         if self.wanted is None or self.wanted == "fit" or self.spectrum is not None:

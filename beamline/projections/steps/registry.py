@@ -65,8 +65,9 @@ def recorded(steps: Sequence[Step], done: Mapping[str, Done]) -> dict[str, Value
     """What the file of a volume records of the steps, by name."""
     found: dict[str, Value] = {}
     for step in steps:
-        own = done.get(step.name, Done()).parameters
-        found |= _options(step) if own is None else own
+        did = done.get(step.name, Done())
+        said = {f"{step.name}_said": did.said} if did.said else {}
+        found |= _options(step) | said if did.parameters is None else did.parameters
     return found
 
 

@@ -70,7 +70,7 @@ class Done:
 
     Attributes:
         said: a sentence; empty where nothing was asked, or nothing found.
-        parameters: what the file of the volume records of it, by name; None: the step's options.
+        parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
     """
 
     said: str = ""
