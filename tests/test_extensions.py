@@ -406,29 +406,30 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.projections.steps.lift import Lift
+from beamline.projections.steps.registry import recorded
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.scans import TwoCylinders, write_exchange
 
-path = write_exchange(Path("lift.h5"), TwoCylinders())
+path = write_exchange(Path("lift.h5"), TwoCylinders(shape=(2, 40)))
 with open_scan(SourceOptions(path)) as source:
-    chosen = [Selection(axis_col=20.7, steps=steps) for steps in ((), (Lift(0.5),))]
-    plain, lifted = (prepare_projections(source, each, print).projections.data for each in chosen)
-np.testing.assert_allclose(lifted, plain + 0.5, atol=1e-6)
+    chosen = [Selection(axis_col=20.7, steps=(Air("none"), *steps)) for steps in ((), (Lift(0.5),))]
+    plain, lifted = (prepare_projections(source, each, print) for each in chosen)
+np.testing.assert_allclose(lifted.projections.data, plain.projections.data + 0.5, atol=1e-6)
+assert lifted.done["lift"].said == "Lifted by 0.5."
+found = recorded(chosen[1].in_order, lifted.done)
+assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.")
 
 def run(*options):
-    done = CliRunner().invoke(main, ["recon", "lift.h5", "-m", "fbp", "--axis", "20.7", *options])
+    done = CliRunner().invoke(main, ["recon", "lift.h5", "-m", "r2", "--axis", "20.7", *options])
     return done.exit_code, done.output
 
-code, said = run("--lift", "0.5", "-o", "lifted.h5")
-assert code == 0 and "Lifted by 0.5." in said, said
-found, page = read_reconstruction(Path("lifted.h5")).parameters, Path("lifted.html").read_text()
-assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.") and "Lifted by 0.5." in page and "lift: 0.5" in found["recipe"]
-assert run("--config", "lifted.h5", "-o", "again.h5")[0] == 0
-assert read_reconstruction(Path("again.h5")).parameters["lift"] == 0.5
-followed = CliRunner().invoke(main, ["recon", "lift.h5", "--lift", "1", "--follow"])
-assert followed.exit_code == 2 and "--lift is for a finished scan" in followed.output
+assert "lift: 0.5" in run("--lift", "0.5", "--write-config", "-")[1]
+Path("recipe.yaml").write_text("method: r2\\nlift: 0.7\\n")
+assert "lift: 0.7" in run("--config", "recipe.yaml", "--write-config", "-")[1]
+code, said = run("--lift", "1", "--follow")
+assert code == 2 and "--lift is for a finished scan" in said
 assert run("--lift", "-1")[0] == run("--lift", "much")[0] == 2
 for command in ("recon", "tradeoff"):
     assert "--lift BY" in CliRunner().invoke(main, [command, "--help"]).output

@@ -62,9 +62,8 @@ class ScanCorrection:
         self._filtered: dict[str, Done] = {}
         for step in selection.in_order:
             if isinstance(step, ViewStep):
-                found = step.on(source, selection)
+                found, self._filtered[step.name] = step.on(source, selection)
                 self._filters += [] if found is None else [found]
-                self._filtered[step.name] = step.untouched if found is None else found.done
         if self._filters:
             if counted:
                 raise ConfigError(

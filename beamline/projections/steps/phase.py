@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.step import Done, option, positive
+from beamline.projections.steps.step import Done, ViewFilter, option, positive
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -83,10 +83,6 @@ class Phase:
             raise ValueError(f"--phase: delta/beta is 0 or more, got {self.material}.")
 
     @property
-    def untouched(self) -> Done:
-        return Done("", {"phase": "not retrieved"})
-
-    @property
     def _ratio(self) -> float | None:
         """Delta over beta, where it was said as a number."""
         try:
@@ -102,16 +98,26 @@ class Phase:
 
         return delta_beta(str(self.material), energy_kev)
 
-    def on(self, source: ScanSource, selection: Selection) -> PhaseFilter | None:
-        """The filter for the pixels that the selection makes.
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+        from beamline.projections.steps.defects import Defects
+
+        if self.material is None:
+            return None, Done("", {"phase": "not retrieved"})
+        found, said = self.filter_of(source, selection)
+
+        def apply(views: Projections, first: int) -> Projections:
+            found.retrieve(views.data, selection.step(Defects).floor)
+            return views
+
+        return ViewFilter(apply, found.reach, "--phase mixes"), Done(said, {"phase": said})
+
+    def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
+        """The filter for the pixels that the selection makes, and a sentence about it.
 
         Raises:
             ConfigError: distance, energy or pixel size are not known, or give a filter that is wider than the frame.
         """
-        if self.material is None:
-            return None
         from beamline.projections.selection import cone_of, pixel_size
-        from beamline.projections.steps.defects import Defects
         from recon.prep.phase import Paganin, length_of
 
         cone, pitch = cone_of(source, selection), pixel_size(source, selection)
@@ -138,25 +144,7 @@ class Phase:
             )
         mask = "" if found.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*found.unsharp)
         said = f"Phase: Paganin's filter over {found.length:.3g} pixels ({said}){mask}."
-        return PhaseFilter(found, selection.step(Defects).floor, Done(said, {"phase": said}))
-
-
-@dataclass(frozen=True, eq=False)
-class PhaseFilter:
-    """Paganin's filter on the views of a scan; `floor` is the lowest transmission that counts."""
-
-    filter: Paganin
-    floor: float
-    done: Done
-    mixes: str = "--phase mixes"
-
-    @property
-    def reach(self) -> int:
-        return self.filter.reach
-
-    def apply(self, views: Projections, first: int) -> Projections:
-        self.filter.retrieve(views.data, self.floor)
-        return views
+        return found, said
 
 
 def _stated(source: ScanSource) -> float | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from beamline.core.errors import ConfigError
 from beamline.core.files import text_in
-from beamline.projections.steps.step import Done, option
+from beamline.projections.steps.step import Done, ViewFilter, option
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -88,16 +88,17 @@ class TiltAndLens:
         said = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
         return said if self.sought else ""
 
-    @property
-    def untouched(self) -> Done:
-        return self.done("")
-
-    def on(self, source: ScanSource, selection: Selection) -> ResamplingFilter | None:
-        found = self.of(source, selection)
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+        found, turned = self.of(source, selection), f"Views are turned by {self.tilt_deg:g} degrees."
         if found is None:
-            return None
-        said = f"Views are turned by {self.tilt_deg:g} degrees." if self.tilt_deg else ""
-        return ResamplingFilter(found, self.done(said))
+            return None, self.done("")
+
+        def apply(views: Projections, first: int) -> Projections:
+            found.apply(views.data, first)
+            return replace(views, masked=found.nearest(views.masked, first))
+
+        mixes = "--tilt and --distortion mix"
+        return ViewFilter(apply, found.reach, mixes), self.done(turned if self.tilt_deg else "")
 
     def done(self, said: str) -> Done:
         """What it did, with what is recorded where nothing was asked, too."""
@@ -120,23 +121,6 @@ class TiltAndLens:
             return None
         height, width = source.shape
         return Resampling((height, width), math.radians(self.tilt_deg), self.distortion, selection.binning)
-
-
-@dataclass(frozen=True, eq=False)
-class ResamplingFilter:
-    """The resampling of the views of a scan."""
-
-    resampling: resample.Resampling
-    done: Done
-    mixes: str = "--tilt and --distortion mix"
-
-    @property
-    def reach(self) -> int:
-        return self.resampling.reach
-
-    def apply(self, views: Projections, first: int) -> Projections:
-        self.resampling.apply(views.data, first)
-        return replace(views, masked=self.resampling.nearest(views.masked, first))
 
 
 def _plain(value: Any) -> float | str:

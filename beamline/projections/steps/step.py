@@ -93,39 +93,28 @@ class Step(Protocol):
         """Why the scan must have ended, as a sentence for who follows one; empty: it need not."""
 
 
-class ViewFilter(Protocol):
+@dataclass(frozen=True, eq=False)
+class ViewFilter:
     """A step on the views of one scan, which it takes a batch at a time.
 
     Attributes:
+        apply: views, and the row of the detector at which they begin, to as many views filtered; line integrals may be
+            changed in place.
         reach: rows, binned, beside a row from which it takes something.
         mixes: the subject and verb that say who mixes neighbouring pixels.
-        done: what it does.
     """
 
-    @property
-    def reach(self) -> int: ...
-    @property
-    def mixes(self) -> str: ...
-    @property
-    def done(self) -> Done: ...
-    def apply(self, views: Projections, first: int) -> Projections:
-        """The views filtered, with as many rows; their line integrals may be changed in place.
-
-        Args:
-            first: row of the detector at which they begin.
-        """
+    apply: Callable[[Projections, int], Projections]
+    reach: int
+    mixes: str
 
 
 @runtime_checkable
 class ViewStep(Step, Protocol):
     """A step on each view alone, also of a scan that still runs."""
 
-    @property
-    def untouched(self) -> Done:
-        """What is recorded where nothing is to be done."""
-
-    def on(self, source: ScanSource, selection: Selection) -> ViewFilter | None:
-        """The filter of a scan; None where nothing is to be done.
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+        """The filter of a scan, None where nothing is to be done; and what it does.
 
         Raises:
             ConfigError: the scan does not say what the step needs, or the step does not fit it.

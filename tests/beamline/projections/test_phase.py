@@ -58,14 +58,13 @@ def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
 def test_what_the_file_does_not_say_is_asked_for() -> None:
     source = _source()
     with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev, which"):
-        Phase("20").on(source, SELECTION)  # type: ignore[arg-type]
+        Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
     source.attributes, source.energy_kev = {"distance_mm": 50.0}, 20.0
-    found = Phase("20").on(source, SELECTION)  # type: ignore[arg-type]
-    known = PHASE.on(source, SELECTION)  # type: ignore[arg-type]
-    assert found is not None and known is not None and found.filter == known.filter
-    assert "delta/beta 20 at 20 keV, 50 mm behind" in found.done.said
+    found, said = Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
+    assert found == PHASE.filter_of(source, SELECTION)[0]  # type: ignore[arg-type]
+    assert "delta/beta 20 at 20 keV, 50 mm behind" in said
     with pytest.raises(ConfigError, match=r"filter over 702.4 pixels; array has 48 x 40"):
-        replace(PHASE, distance_mm=5e6).on(source, SELECTION)  # type: ignore[arg-type]
+        replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
         _correction(SELECTION.having(CountModel("counts")))
 
@@ -73,7 +72,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
 def test_a_cone_is_scaled_to_the_sample() -> None:
     source = _source()
     source.cone = (10.0, 40.0)
-    found = replace(PHASE, distance_mm=None).on(source, SELECTION)  # type: ignore[arg-type]
-    plane = replace(PHASE, distance_mm=7.5).on(_source(), replace(SELECTION, pixel_size_mm=0.25e-3))  # type: ignore[arg-type]
-    assert found is not None and plane is not None and "30 mm behind" in found.done.said
-    assert found.filter.length == pytest.approx(plane.filter.length)
+    found, said = replace(PHASE, distance_mm=None).filter_of(source, SELECTION)  # type: ignore[arg-type]
+    near = replace(SELECTION, pixel_size_mm=0.25e-3)
+    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near)  # type: ignore[arg-type]
+    assert "30 mm behind" in said and found.length == pytest.approx(plane.length)
