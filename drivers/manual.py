@@ -11,7 +11,7 @@ Ask = Callable[[str], None]
 class ManualShutter:
     """Implements `drivers.protocols.Shutter` by asking the operator.
 
-    The state of the shutter at the start is not known, so the first `open` or `close` always asks; later ones ask only
+    The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later ones ask only
     where the state changes.
     """
 

@@ -1,7 +1,7 @@
 """Tomographic reconstruction: arrays in, arrays out: `recon.correct`, `find_axis`, `remove_rings`, `reconstruct`.
 
-The values (Geometry, Grid, Volume, RunControl, DataUse) load at once; what computes loads torch and numba on first use,
-so that a program which only plans a scan starts quickly.
+The values (Geometry, Grid, Volume, RunControl, DataUse) load at once. Functions that compute load torch and numba on
+first use: a program that only plans a scan starts quickly.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.method import DataUse, Progress, RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import REGISTRY
@@ -26,7 +27,12 @@ if TYPE_CHECKING:
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
+    from recon.splatting.gaussians import Gaussians
+    from recon.splatting.published import R2Published
     from recon.splatting.r2 import R2
+    from recon.splatting.settings import FitSettings
+    from recon.splatting.splat import project, voxelize
+    from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
     from recon.voxels.methods.asd_pocs import AsdPocs
     from recon.voxels.methods.cgls import Cgls
@@ -34,6 +40,7 @@ if TYPE_CHECKING:
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
     from recon.voxels.methods.sart import Sart
     from recon.voxels.methods.sirt import Sirt
+    from recon.voxels.projector import Projector
 
 __all__ = [
     "R2",
@@ -46,22 +53,30 @@ __all__ = [
     "DataUse",
     "Fbp",
     "FistaTv",
+    "FitSettings",
+    "Gaussians",
     "Geometry",
     "Grid",
+    "Kernel",
     "OsSirtTv",
     "Progress",
     "Projections",
+    "Projector",
+    "R2Published",
     "Reconstruction",
     "References",
     "RunControl",
     "Sart",
     "Sirt",
+    "StreamingFit",
     "Volume",
     "WithoutRings",
     "correct",
     "find_axis",
+    "project",
     "reconstruct",
     "remove_rings",
+    "voxelize",
 ]
 
 _LAZY = {
@@ -73,6 +88,11 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
+    "FitSettings": "recon.splatting.settings",
+    "Gaussians": "recon.splatting.gaussians",
+    "Projector": "recon.voxels.projector",
+    "StreamingFit": "recon.splatting.stream",
+    **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),
     **{entry.cls: entry.module for entry in REGISTRY.values()},
 }
 

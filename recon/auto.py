@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -12,8 +11,9 @@ from recon.base.choices import AUTO
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Depth, Method, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import Method, MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
+from recon.methods import with_settings
 from recon.splatting.finish import SWEEPS
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.r2 import R2
@@ -32,11 +32,11 @@ class Auto:
     """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
 
     The part is a slab of 32 rows where most matter is; of a cone the rows in its middle, or all rows at half the
-    resolution. One of eight views is held out. Nothing is tried of fewer than 16 views, and of rolled or tilted ones:
-    the first candidate takes them; and of a sample that is wider than the field, which only a fit models. A volume that
-    is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so neither is
-    preferred. Where methods are level, the first one is taken that leaves no structure in its own views and does
-    not dull edges (docs/notes/exploration.md).
+    resolution. One of eight views is held out. There is no trial with fewer than 16 views, or with rolled or tilted
+    ones: the first candidate takes them. A sample wider than the field, which only a fit models, is not tried either. A
+    volume that is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so
+    neither is preferred. Where methods are level, the first one is taken that leaves no structure in its own views and
+    does not dull edges (docs/notes/exploration.md).
 
     Attributes:
         candidates: the methods, by preference.
@@ -44,8 +44,9 @@ class Auto:
 
     name: ClassVar[str] = AUTO
     label: ClassVar[str] = "Automatic choice"
-    colour: ClassVar[str] = "tab:green"
-    traits: ClassVar[Traits] = Traits(device=True, budget=True, halo=max(R2.traits.halo, FistaTv.traits.halo))
+    traits: ClassVar[Traits] = Traits(
+        device=True, budget=True, needs_matter=True, halo=max(R2.traits.halo, FistaTv.traits.halo)
+    )
 
     candidates: tuple[Method, ...] = field(default_factory=_candidates)
 
@@ -56,7 +57,7 @@ class Auto:
         A fit chooses its sweeps by views that it knows already, which asks for too few where it is far off.
         """
         first = self.candidates[0]
-        return replace(first, finish=3 * SWEEPS) if isinstance(first, R2) and first.finish is None else None
+        return with_settings(first, {"finish": 3 * SWEEPS}) if getattr(first, "finish", 0) is None else None
 
     @property
     def methods(self) -> tuple[Method, ...]:
@@ -95,15 +96,8 @@ class Auto:
     def toy(self) -> Self:
         return replace(self, candidates=tuple(method.toy() for method in self.candidates))
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return [TrialSettings("method")]
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return max(method.memory(geometry, grid, weighted) for method in self.candidates)
-
-    def work(self, n_views: int, binning: int) -> float:
-        return sum(method.work(n_views, binning) for method in self.candidates)
 
 
 def is_wider(problem: ReconProblem) -> bool:

@@ -34,9 +34,9 @@ _SWEPT_ROWS = 64  # fewer rows take longer each: 1.5 times at 16
 def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
     """Measure each part of a reconstruction on a part of the scan.
 
-    The first volume (FBP, or its replacement, see `first_volume`), placing and filling on a slab of rows; the
-    step on whole views, with the number of Gaussians that a fit would start from, spread over the matter in a
-    coarse first volume: the time of a step depends on how much they overlap.
+    The first volume (FBP, or its replacement, see `first_volume`), placing and filling run on a slab of rows. The step
+    runs on whole views, with the number of Gaussians that a fit would start from, spread over the matter in a coarse
+    first volume: the time of a step depends on how much they overlap.
 
     Args:
         projections: [view, row, col], line integrals.

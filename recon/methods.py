@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from importlib import import_module
 from typing import Any
 
+from drivers.plugins import plugins
+from recon.base.choices import AUTO
 from recon.base.method import Method
 
 
@@ -20,15 +23,18 @@ class Entry:
     Attributes:
         module, cls: of its settings class, see `recon.base.method.Method`.
         streams: it has `stream`, so that its volume can grow while views arrive.
+        compared: a trade-off tries it where no methods are named; not one that takes many times as long as all others.
     """
 
     module: str
     cls: str
     streams: bool = False
+    compared: bool = True
 
 
 REGISTRY: dict[str, Entry] = {
     "r2": Entry("recon.splatting.r2", "R2", streams=True),
+    "r2-published": Entry("recon.splatting.published", "R2Published", streams=True, compared=False),
     "fbp": Entry("recon.voxels.direct", "Fbp"),
     "sirt": Entry("recon.voxels.methods.sirt", "Sirt"),
     "sart": Entry("recon.voxels.methods.sart", "Sart"),
@@ -46,8 +52,13 @@ BASELINE = "fbp"
 
 
 def names() -> tuple[str, ...]:
-    """Names of all methods; loads none of them."""
-    return tuple(REGISTRY)
+    """Names of all methods; loads none of ours."""
+    return tuple(_entries())
+
+
+def names_compared() -> tuple[str, ...]:
+    """Names of the methods that a trade-off tries where none are named; loads none of them."""
+    return tuple(name for name, entry in REGISTRY.items() if entry.compared)
 
 
 def streams(name: str) -> bool:
@@ -71,7 +82,7 @@ def by_name(name: str) -> type[Method]:
 
 def taking(field: str) -> tuple[str, ...]:
     """Names of the methods that have a setting, such as "iterations", or "fit.loss" within another one."""
-    return tuple(name for name in REGISTRY if has_setting(by_name(name), field))
+    return tuple(name for name in _entries() if has_setting(by_name(name), field))
 
 
 def has_setting(method: type[Method], field: str) -> bool:
@@ -112,10 +123,22 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
 
 def with_trait(trait: str) -> tuple[str, ...]:
     """Names of the methods that can do something, by a field of `recon.base.method.Traits`."""
-    return tuple(name for name in REGISTRY if getattr(by_name(name).traits, trait))
+    return tuple(name for name in _entries() if getattr(by_name(name).traits, trait))
+
+
+@cache
+def _entries() -> Mapping[str, Entry]:
+    """Ours, and those of other packages."""
+
+    def made(name: str, method: type[Method]) -> Entry:
+        if method.name != name:
+            raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
+        return Entry(method.__module__, method.__name__, hasattr(method, "stream"))
+
+    return {**REGISTRY, **plugins("method", (*REGISTRY, AUTO), made)}
 
 
 def _entry(name: str) -> Entry:
-    if name not in REGISTRY:
-        raise ValueError(f"method must be one of {', '.join(REGISTRY)}, got {name!r}")
-    return REGISTRY[name]
+    if name not in _entries():
+        raise ValueError(f"method must be one of {', '.join(_entries())}, got {name!r}")
+    return _entries()[name]

@@ -102,8 +102,8 @@ def reconstruct(
 
     Args:
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
-            finite are filled from their neighbours and weigh nothing. Or what was counted, where photons are few: the
-            method is given line integrals and weights that carry the likelihood of the counts, see
+            finite are filled from their neighbours and weigh nothing. Or what was counted, where photons are few. The
+            method is then given line integrals and weights that carry the likelihood of the counts, see
             `recon.prep.counts.line_integrals`; `use.weights` multiply them.
         geometry: of these views.
         method: a name (see `recon.methods.names`) for a method with its default settings, or a method with settings
@@ -151,8 +151,8 @@ def reconstruct(
 
 
 def _refuse_one_side(geometry: Geometry) -> None:
-    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ;
-    # a cone's, and those that look down on the rotation axis, differ up to the whole turn.
+    # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
+    # A cone's, and those that look down on the rotation axis, differ up to the whole turn.
     turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
     if np.abs(np.sin(turn)).max() < 1e-6:
         raise ValueError(

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Method, RunControl
+from recon.base.method import Method, RunControl, candidates_of
 from recon.base.volume import Grid
 from recon.methods import with_settings
 from recon.reconstruction import reconstruct
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
@@ -68,15 +69,13 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
     """
     if isinstance(method, IterativeMethod):
         return _of_iterations(method, method.iterations, extent, now)
-    if isinstance(method, R2):
+    if isinstance(method, FitMethod):
         return _of_fit(method, extent, now)
-    if isinstance(method, Fbp):
-        return _of_fbp(extent, now)
-    candidates: Sequence[Method] = getattr(method, "candidates", ())
+    candidates = candidates_of(method)
+    if candidates[0] is method:
+        return _of_direct(method, extent, now)
     tried = Extent(extent.views, extent.cols, [32])
-    return sum(run_seconds(one, tried, now) for one in candidates) + (
-        run_seconds(candidates[0], extent, now) if candidates else 0.0
-    )
+    return sum(run_seconds(one, tried, now) for one in candidates) + run_seconds(candidates[0], extent, now)
 
 
 def _of_iterations(method: Method, iterations: int, extent: Extent, now: Clock) -> float:
@@ -112,19 +111,19 @@ def _took(
     return now() - begin, decide.made
 
 
-def _of_fbp(extent: Extent, now: Clock) -> float:
+def _of_direct(method: Method, extent: Extent, now: Clock) -> float:
     cols, views = min(extent.cols, _FBP_COLS), min(extent.views, _FBP_VIEWS)
     geometry, data = _sample(views, cols)
     times = []
     for _ in range(3):
         begin = now()
-        reconstruct(data, geometry, Fbp())
+        reconstruct(data, geometry, method)
         times.append(now() - begin)
     share = min(times) / fbp_nanoseconds(views, cols, _FEW_ROWS)
     return share * sum(fbp_nanoseconds(extent.views, extent.cols, height) for height in extent.heights)
 
 
-def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
+def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:
     geometry, data = _sample(_FIT_VIEWS, _FIT_COLS)
     count = default_count(Grid.matching(geometry))
 
@@ -147,7 +146,7 @@ def _of_fit(method: R2, extent: Extent, now: Clock) -> float:
     steps = method.seconds if method.seconds is not None else (method.planned_steps or 0) * step * fitted
     sweeps = 8 if method.finish is None else method.finish
     finish = _of_iterations(FistaTv(), sweeps, extent, now) if sweeps else 0.0
-    return steps + finish + _of_fbp(extent, now)
+    return steps + finish + _of_direct(Fbp(), extent, now)
 
 
 def _sample(views: int, cols: int, rows: int = _FEW_ROWS) -> tuple[Geometry, F32]:

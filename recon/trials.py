@@ -153,14 +153,13 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     """The score to prefer: of those that are level the first that hides nothing and dulls no edges. What loses weak
     matter is not asked, unless all do.
 
-    Dull are edges beside which those of another level one that follows noise no more are steeper: noise alone makes a
-    volume steeper where edges are soft.
-    Returns it, and for each level one that is passed over the reason, by its number.
+    A volume has dull edges if another level one has steeper edges and follows noise no more. Noise alone makes a volume
+    steeper where edges are soft. Returns it, and for each level one that is passed over the reason, by its number.
 
-    Level with the smallest residual are those within two of its standard errors (by its scatter over the views) and
-    4 %, and likewise by the penalised residual. The residual alone prefers a volume that lost some noise, and with it a
-    thin crack, which few rays see; and FISTA-TV to a fit that it finished, though from the fit it comes nearer to the
-    sample (0.1 to 2.6 dB). The penalised one alone prefers what is smooth.
+    A residual is level with the smallest one if it lies within two of its standard errors (by its scatter over the
+    views) and 4 %. The same holds for the penalised residual. The residual alone prefers a volume that lost some noise,
+    and with it a thin crack, which few rays see. It also prefers FISTA-TV to a fit that FISTA-TV finished, though that
+    is nearer to the sample (0.1 to 2.6 dB). The penalised one alone prefers what is smooth.
     """
     passed = {score.at: "loses weak matter" for score in scores if score.loses}
     scores = [score for score in scores if not score.loses] or scores

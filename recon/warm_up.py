@@ -38,8 +38,8 @@ def warm_up(
     """Reconstruct a toy: a fit takes 1 to 2 minutes the first time on a machine, a fraction of a second later.
 
     numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
-    What another kind of geometry, first volume or ray needs is compiled for it alone: leaning views, a cone or weights
-    add a sixth of that time, a start by TV a third, a short scan of a cone with exact rays two thirds.
+    What another kind of geometry, first volume or ray needs is compiled for it alone. Leaning views, a cone or weights
+    add a sixth of that time. A start by TV adds a third, a short scan of a cone with exact rays two thirds.
 
     Args:
         method: with the settings of the run to come; None: `R2` with its defaults.

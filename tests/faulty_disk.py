@@ -1,8 +1,8 @@
 """A disk that fails at the n-th write: a program is run under a small library (Linux; needs a C compiler, `cc`).
 
 It counts the calls that change files whose path contains a text (write, pwrite, writev, fwrite, sendfile,
-copy_file_range, ftruncate, posix_fallocate, fsync, rename, unlink), in the program and in those that it starts. Memory
-maps are not seen. Writes are counted from 1.
+copy_file_range, ftruncate, posix_fallocate, fsync, msync, rename, unlink), in the program and in those that it starts.
+What goes through a memory map is not seen but for its msync. Writes are counted from 1.
 
     n = faulty_disk.writes([python, "-c", code], "scan.h5")
     done = faulty_disk.run([python, "-c", code], "scan.h5", kill_at=n - 3)          # the write does not happen

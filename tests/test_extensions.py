@@ -43,7 +43,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.method import MethodResult, Traits, TrialSettings
+from recon.base.method import MethodResult, Traits
 from recon.base.volume import Volume
 
 
@@ -51,7 +51,6 @@ from recon.base.volume import Volume
 class Grey:
     name: ClassVar[str] = "grey"
     label: ClassVar[str] = "Grey"
-    colour: ClassVar[str] = "grey"
     traits: ClassVar[Traits] = Traits(direct=True)
     iterations: int = 1
     shade: float = 0.5
@@ -62,15 +61,8 @@ class Grey:
     def toy(self):
         return self
 
-    @classmethod
-    def trials(cls, gaussians, depth):
-        return [TrialSettings("method"), TrialSettings("shade", {"shade": 0.7})]
-
     def memory(self, geometry, grid, weighted):
         return 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
-
-    def work(self, n_views, binning):
-        return 1.0
 """
     },
     (
@@ -99,7 +91,7 @@ white = methods.build(methods.by_name("grey"), {"shade": 1.0})
 assert (recon.reconstruct(data, views, white).volume.data == 1).all()
 trials = plan(("grey", "fbp"), 60, 1000, "quick")
 labels = {t.label for t in trials if t.method == "grey"}
-assert labels == {"grey, 60 views", "grey, 30 views", "grey, 60 views, shade 0.7"}, labels
+assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 assert pareto_plot([(t, 1.0, 20.0) for t in trials], [0], "s", "dB").startswith(b"\\x89PNG")
 for offered in (command, tradeoff):
     assert "grey" in CliRunner().invoke(offered, ["--help"]).output
@@ -139,7 +131,7 @@ class Dummy:
         return Look(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
 '''
     },
-    (("beamline/monitor/checks.py", '    "dark": "Dark",', '    "dummy": "Dummy",'),),
+    (("beamline/monitor/checks.py", '    "dark": "DarkCheck",', '    "dummy": "Dummy",'),),
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
@@ -218,11 +210,11 @@ READER = Extension(
         "beamline/storage/readers/npy_stack.py": """
 import numpy as np
 
-from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
+from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
 from drivers.frame import FrameKind
 
 
-class NpyStack(ScanReader):
+class NpyStack(BaseSource):
     format = "npy_stack"
 
     def __init__(self, path):
@@ -239,7 +231,7 @@ class NpyStack(ScanReader):
         pass
 
 
-FORMAT = Format("an .npy stack", lambda path, opening: path.suffix == ".npy", lambda path, opening: NpyStack(path))
+FORMAT = ScanFormat("an .npy stack", lambda path, opening: path.suffix == ".npy", lambda path, opening: NpyStack(path))
 """
     },
     (
@@ -266,28 +258,13 @@ assert describe("scan.npy")["format"] == "npy_stack"
 STAGE = Extension(
     {
         "drivers/stages/turn/__init__.py": '"""A dummy controller, which answers with its counts."""\n',
-        "drivers/stages/turn/settings.py": '''
+        "drivers/stages/turn/stage.py": '''
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import serial
 
 from drivers.stages.settings import StageFigures, Wiring, key
-
-
-class TurnStage:
-    name = "stage"
-
-    def __init__(self, url, settings):
-        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
-        self._gear = settings.gear
-
-    def position(self):
-        self._line.write(b"?")
-        return int(self._line.read(4)) / self._gear
-
-    def close(self):
-        self._line.close()
 
 
 @dataclass(frozen=True)
@@ -302,8 +279,20 @@ class TurnSettings:
     def limits(self):
         return self.figures.limits(self.figures.acceleration, 0.0)
 
-    def connect(self, url, clock):
-        return TurnStage(url, self)
+
+class TurnStage:
+    name, Settings = "stage", TurnSettings
+
+    def __init__(self, url, settings, clock):
+        self.limits, self._line = settings.limits(), serial.serial_for_url(url, timeout=settings.wiring.timeout)
+        self._gear = settings.gear
+
+    def position(self):
+        self._line.write(b"?")
+        return int(self._line.read(4)) / self._gear
+
+    def close(self):
+        self._line.close()
 ''',
         "simulators/wires/turn/__init__.py": '"""The dummy controller."""\n',
         "simulators/wires/turn/wire.py": """
@@ -338,7 +327,7 @@ class TurnBuild:
 """,
     },
     (
-        ("drivers/stages/registry.py", '    "zaber": "ZaberSettings",', '    "turn": "TurnSettings",'),
+        ("drivers/stages/registry.py", '    "zaber": "ZaberStage",', '    "turn": "TurnStage",'),
         ("simulators/wires/registry.py", '    "zaber": "ZaberBuild",', '    "turn": "TurnBuild",'),
     ),
     """

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr
     from beamline.api.reading import monitor, stream, volumes
     from beamline.api.reconstruction import ReconResult, reconstruct
-    from beamline.projections.replay import Verdict
+    from beamline.projections.replay import ScanVerdict
     from beamline.projections.selection import Selection
 
 __all__ = [
@@ -34,9 +34,9 @@ __all__ = [
     "ScanAborted",
     "ScanResult",
     "ScanStopped",
+    "ScanVerdict",
     "Selection",
     "StopRequest",
-    "Verdict",
     "connect",
     "monitor",
     "reconstruct",
@@ -50,7 +50,7 @@ _LAZY = {
     **dict.fromkeys(("Instrument", "ScanResult", "connect", "scan", "to_stderr"), "beamline.api.instrument"),
     **dict.fromkeys(("monitor", "stream", "volumes"), "beamline.api.reading"),
     **dict.fromkeys(("ReconResult", "reconstruct"), "beamline.api.reconstruction"),
-    "Verdict": "beamline.projections.replay",
+    "ScanVerdict": "beamline.projections.replay",
     "Selection": "beamline.projections.selection",
 }
 

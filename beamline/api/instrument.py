@@ -86,7 +86,7 @@ class Instrument:
         last: result of the newest scan, also of one that raised; None before the first, and where it took no frame.
     """
 
-    def __init__(self, config: Config, connected: devices.Instrument, tell: Tell | None = to_stderr) -> None:
+    def __init__(self, config: Config, connected: devices.ConnectedDevices, tell: Tell | None = to_stderr) -> None:
         self.config = config
         self.last: ScanResult | None = None
         self._devices, self._tell = connected, tell
@@ -153,9 +153,9 @@ class Instrument:
         config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
         if _of_devices(config) != _of_devices(self.config):
             raise ConfigError(
-                f"of {', '.join(wanted)}, something belongs to devices that are open, and would have no effect: give "
-                "it to `connect`. A scan of its own can have other angles, times, optics, checks, and the camera's "
-                "roi, binning and readout. Nothing was started."
+                f"of {', '.join(wanted)}, something belongs to devices that are open, and would have no effect. Give "
+                f"it to `connect`. A scan of its own can have other angles, times, optics, checks, and the camera's "
+                f"roi, binning and readout. Nothing was started."
             )
         return config
 

@@ -18,7 +18,7 @@ from beamline.core.files import parts_of
 from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
-from beamline.projections.replay import Verdict, frames_of, replay, verdict
+from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
 from beamline.scan.run_folder import SCAN
 from beamline.scan.runs import describe
 from beamline.scan.states import State
@@ -44,7 +44,7 @@ def scan_file(path: str | Path) -> Path:
 
 def monitor(
     path: str | Path, *, config: str | Path | None = None, set: Mapping[str, object] | None = None, follow: bool = False
-) -> Verdict:
+) -> ScanVerdict:
     """What the checks of the monitor say of every frame of a scan of any format, as `beamline monitor` prints it.
 
     Args:
@@ -68,7 +68,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until its end.
 
     Frames are counts: `frame.counts` uint16 [row, col]. It only reads: who takes them slowly does not hold the scan up.
-    A running scan is followed from another program than the one that takes it (HDF5 shares a file within a program).
+    In the program that takes the scan, reading and writing wait for each other: a fast scan is read from another one.
 
     Args:
         path: a scan file, or the folder of a run (its newest part). It may not be there yet.

@@ -24,7 +24,7 @@ from recon.base.choices import N_GAUSSIANS, SIDE
 from recon.methods import by_name, names
 
 if TYPE_CHECKING:
-    from beamline.scan.rate import Load, RateRow
+    from beamline.doctor.rate import Load, RateRow
     from recon.bench import Timing, VolumeRow
 
 _STEPS = (125, 500, 2000)
@@ -72,10 +72,10 @@ def acquire(
     """Measure how fast frames are taken, checked and written to FOLDER, which is on the disk for scans.
 
     Five stages, one part of the acquisition more in each: a plain file with the same bytes, the writer of scans, its
-    digest of each frame, the monitor, and all of it behind the queue that a scan feeds. Half of the free disk is used
-    at most, and every file is removed. Run it on an idle machine; ratios of one round are more reliable than rates.
+    digest, the monitor, all of it behind the queue of a scan. Half of the free disk is used at most, and every file is
+    removed. Run it on an idle machine; ratios of one round are more reliable than rates.
     """
-    from beamline.scan.rate import rates, summary
+    from beamline.doctor.rate import rates, summary
 
     clock, taken = SystemClock(), []
     with terminated_like_interrupted(), json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
@@ -108,20 +108,20 @@ def acquire(
 
 def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
     from beamline.config.load import load
-    from beamline.config.models import Storage
+    from beamline.config.models import StorageSection
     from beamline.config.monitor import configured_checks
-    from beamline.scan.rate import Load
+    from beamline.doctor.rate import Load
     from drivers.protocols import CameraSettings, TriggerSource
 
     if file is None:
-        return Load(shape or orca_quest.SENSOR_SHAPE, Storage().preview_bin, Storage().flush_every)
+        return Load(shape or orca_quest.SENSOR_SHAPE, StorageSection().preview_bin, StorageSection().flush_every)
     config = load(file)
     camera, storage = config.devices.camera, config.storage
     settings = CameraSettings(
         config.scan.exposure_s, TriggerSource.EXTERNAL, camera.roi, camera.binning, camera.readout
     )
     work = Load(
-        orca_quest.timing(settings).shape, storage.preview_bin, storage.flush_every, configured_checks(config.monitor)
+        camera.timing_of(settings).shape, storage.preview_bin, storage.flush_every, configured_checks(config.monitor)
     )
     return work if shape is None else replace(work, shape=shape)
 

@@ -17,10 +17,10 @@ def _command(verb: str, help_text: str) -> click.Command:
     @click.command(verb, help=f"{help_text}\n\n{_EXIT_CODES}")
     @click.argument("run", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
     def send(run: Path | None) -> None:
-        from beamline.config.models import Storage  # here: help needs none of it
+        from beamline.config.models import StorageSection  # here: help needs none of it
         from beamline.scan.control import Verb, tell
 
-        run = run or _only(Path(Storage.model_fields["folder"].default))
+        run = run or _only(Path(StorageSection.model_fields["folder"].default))
         click.echo(f"{run}: {tell(run, Verb(verb))}")
 
     return send
@@ -28,7 +28,7 @@ def _command(verb: str, help_text: str) -> click.Command:
 
 pause = _command(
     "pause",
-    "Pause the scan in the folder RUN (the running one of ./runs): the stage stands, the shutter closes, and no view "
+    "Pause the scan in the folder RUN (the running one of ./runs). The stage stands, the shutter closes, and no view "
     "is lost or taken twice. `beamline resume` goes on.",
 )
 resume = _command("resume", "Let the paused scan in the folder RUN (the running one of ./runs) go on.")

@@ -14,18 +14,18 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import set_option
 from beamline.core.events import Event
 from beamline.core.signals import terminated_like_interrupted
-from beamline.doctor.check import Verdict
+from beamline.doctor.check import Grade
 from drivers.clock import SystemClock
 
 if TYPE_CHECKING:
-    from beamline.doctor.check import Check
+    from beamline.doctor.check import Diagnosis
 
 _STYLES = {
-    Verdict.OK: "green",
-    Verdict.WARNING: "yellow",
-    Verdict.FAILED: "bold red",
-    Verdict.NOT_APPLICABLE: "dim",
-    Verdict.CANNOT_CHECK: "dim",
+    Grade.OK: "green",
+    Grade.WARNING: "yellow",
+    Grade.FAILED: "bold red",
+    Grade.NOT_APPLICABLE: "dim",
+    Grade.CANNOT_CHECK: "dim",
 }
 _WIDTH = 120
 """Columns on a stdout that is no terminal."""
@@ -50,12 +50,12 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
     Exit code: 0 no check failed, 1 a check failed, 2 wrong configuration.
     """
     from beamline.config.load import load
-    from beamline.doctor.check import Check
+    from beamline.doctor.check import Diagnosis
     from beamline.doctor.examine import examine
 
     if file is None and overrides:
         raise click.UsageError("--set needs a CONFIG.")
-    clock, checks = SystemClock(), list[Check]()
+    clock, checks = SystemClock(), list[Diagnosis]()
     with terminated_like_interrupted(), json_events(as_json) as sinks:
         config = None if file is None else load(file, overrides)
         if not as_json:
@@ -66,15 +66,15 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
                 sink(Event("check", clock.now(), vars(check)))
         counts = Counter(check.verdict for check in checks)
         for sink in sinks:
-            sink(Event("done", clock.now(), {str(verdict).replace(" ", "_"): counts[verdict] for verdict in Verdict}))
+            sink(Event("done", clock.now(), {str(verdict).replace(" ", "_"): counts[verdict] for verdict in Grade}))
     if not as_json:
         _show(checks, compared=file is not None)
-        click.echo(", ".join(f"{counts[verdict]} {verdict}" for verdict in Verdict if counts[verdict]))
-    if counts[Verdict.FAILED]:
+        click.echo(", ".join(f"{counts[verdict]} {verdict}" for verdict in Grade if counts[verdict]))
+    if counts[Grade.FAILED]:
         click.get_current_context().exit(1)
 
 
-def _show(checks: Sequence[Check], compared: bool) -> None:
+def _show(checks: Sequence[Diagnosis], compared: bool) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -87,7 +87,7 @@ def _show(checks: Sequence[Check], compared: bool) -> None:
         table.add_column(column, no_wrap=column != "found")
     for check in checks:
         lines = [check.found]
-        if check.expected and (compared or check.verdict is not Verdict.OK):
+        if check.expected and (compared or check.verdict is not Grade.OK):
             lines.append(f"Expected: {check.expected}.")
         if check.advice:
             lines.append(f"{check.advice}.")

@@ -16,6 +16,7 @@ from beamline.core.events import Event
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
+from beamline.storage.volumes.registry import suffixes_text
 from drivers.clock import SystemClock
 
 if TYPE_CHECKING:
@@ -33,15 +34,22 @@ def window_of(text: str) -> tuple[float, float]:
     return low, high
 
 
+_PLY = ".ply"
+
+
+def _output_path(text: str) -> Path:
+    return Path(text) if Path(text).suffix.lower() == _PLY else volume_path(text)
+
+
 @click.command()
 @click.argument("volume", type=click.Path(path_type=Path))
 @click.option(
     "-o",
     "--output",
     metavar="PATH",
-    callback=parsed(volume_path),
+    callback=parsed(_output_path),
     required=True,
-    help="Its suffix names the format: .tif, .npy, .nrrd, .zarr, .h5, or none: a folder of TIFFs.",
+    help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply.",
 )
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values.")
 @click.option(
@@ -50,12 +58,19 @@ def window_of(text: str) -> tuple[float, float]:
     callback=parsed(window_of),
     help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
 )
+@click.option("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
 @click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
 @json_option
 def export(
-    volume: Path, output: Path, bits: str, window: tuple[float, float] | None, dataset: str | None, as_json: bool
+    volume: Path,
+    output: Path,
+    bits: str,
+    window: tuple[float, float] | None,
+    gaussians: bool,
+    dataset: str | None,
+    as_json: bool,
 ) -> None:
-    """Copy VOLUME to another format: TIFF (BigTIFF from 4 GB on), folder of TIFFs, NRRD, npy, OME-Zarr or NXtomoproc.
+    """Copy VOLUME to another format.
 
     Values stay as they are (float32) unless --bits and --window say otherwise. Slices are copied one at a time.
     Nothing is overwritten, and a failure leaves nothing.
@@ -64,6 +79,13 @@ def export(
     from beamline.storage.volumes.files import format_of, opened_volume, write_volume
 
     refuse_shared({"VOLUME": volume, "--output": output})
+    if (output.suffix.lower() == _PLY) != gaussians:
+        raise click.UsageError(f"-o {output}: --gaussians goes with the suffix {_PLY}, and voxels with another.")
+    if gaussians:
+        if window is not None or bits != "32" or dataset is not None:
+            raise click.UsageError("--gaussians does not go with --bits, --window or --dataset.")
+        _export_gaussians(volume, output, as_json)
+        return
     pixels = Pixels(int(bits), window)
     if pixels.bits == 32 and window is not None:
         raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")
@@ -93,6 +115,19 @@ def export(
     click.echo(f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}")
     if window is not None:
         click.echo(f"window   {window[0]:g} to {window[1]:g}; {share:.3%} of the voxels lie outside and are clipped")
+
+
+def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
+    from beamline.reconstruct.model import read_model, write_ply
+
+    with terminated_like_interrupted(), json_events(as_json) as sinks:
+        refuse_existing(output)
+        model = read_model(volume)
+        write_ply(output, model)
+        for sink in sinks:
+            sink(Event("done", SystemClock().now(), {"output": output, "gaussians": model.gaussians.n}))
+    if not as_json:
+        click.echo(f"output     {output} (PLY)\ngaussians  {model.gaussians.n}, {model.gaussians.kernel}")
 
 
 def _suggestion(record: ReconRecord) -> str:

@@ -215,6 +215,10 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
     if done.damaged:
         click.echo(f"damaged  {count(len(done.damaged), 'frame')} of {scan}, kept unchanged: {spans(done.damaged)}")
         verified += f", also its {count(len(done.damaged), 'damaged frame')}"
+    if done.altered:
+        click.echo(
+            f"altered  what {scan} says of frames {spans(done.altered)} is not as it was written; kept unchanged"
+        )
     click.echo(verified)
     raw, *others = map(str, done.sources)
     more = f"; where nothing but its frames is wanted of them, also {', '.join(others)}" if others else ""

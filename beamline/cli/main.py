@@ -1,8 +1,4 @@
-"""The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes.
-
-Exit codes: 0 done; 1 defect (its traceback is left in a file); 2 usage or configuration; 3 device; 4 stopped with
-reduced data; 5 data or disk; 6 a quality limit failed; 7 scan complete, but the monitor raised alarms; 130 interrupted.
-"""
+"""The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes."""
 
 from __future__ import annotations
 
@@ -70,9 +66,9 @@ _COMMANDS = {
     "archive": _Entry("files", "Write a compressed copy of a scan file, compared with it frame by frame."),
     "monitor": _Entry("monitor", "Look at the frames of a scan file with the checks of the monitor.", files=False),
     "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
-    "export": _Entry(
-        "export", "Copy a volume to another format: TIFF, npy, NRRD, OME-Zarr, with grey values if wanted."
-    ),
+    "export": _Entry("export", "Copy a volume to another format, with grey values if wanted."),
+    "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
+    "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 
@@ -117,7 +113,21 @@ class LazyGroup(click.Group):
             ctx.exit(exit_code(error))
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+_EXIT_CODES = """\b
+Exit codes:
+  0    done
+  1    a defect of this program; the message names the file with its traceback
+  2    wrong usage or configuration; nothing was started
+  3    a device failed or did not answer
+  4    stopped on request; the output holds the data so far
+  5    data or disk: frames are missing, or a file cannot be read or written
+  6    a quality limit failed
+  7    the scan is complete, but the monitor raised alarms
+  130  interrupted before there was a result, or aborted
+"""
+
+
+@click.group(cls=LazyGroup, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(version(), prog_name="beamline")
 @click.option("--debug", is_flag=True, envvar="BEAMLINE_DEBUG", help="End with the traceback of a defect.")
 def main(debug: bool) -> None:

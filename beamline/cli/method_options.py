@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -9,18 +11,19 @@ from typing import Any, get_args
 import click
 from click.core import ParameterSource
 
+from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import POSITIVE
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
-from recon.methods import build, by_name, has_setting, taking, with_trait
+from recon.methods import DEFAULT, build, by_name, has_setting, names, taking, with_trait
 
 SETTINGS = {
     "steps": "steps", "seconds": "seconds", "gaussians": "gaussians", "start": "start", "loss": "fit.loss",
     "kernel": "fit.kernel", "early_stop": "early_stop", "finish": "finish", "iterations": "iterations",
-    "tv_weight": "tv_weight", "allow_negative": "allow_negative",
+    "tv_weight": "tv_weight", "allow_negative": "allow_negative", "plain_splatting": "fit.rays.rectified",
 }  # fmt: skip
 """Options that are settings of methods, and the name of each setting: a method that has it takes the option."""
 
@@ -29,13 +32,30 @@ _TRAITS = {
 }  # fmt: skip
 """Options for methods with a trait, and the trait."""
 
+_INVERTED = ("plain_splatting",)  # flags that switch their setting off
+
+PRESETS_OF_METHODS = ("published",)
+"""Endings of names of methods that are another one with other settings, such as r2-published."""
+
 _ROW_SETTINGS = ("steps", "gaussians", "finish", "iterations", "tv_weight")
 _PLANS = ("budget", "quality")
 _TIMED = ("steps", "seconds", "gaussians")
-_OF_A_FIT = (*_TIMED, "start", "loss", "kernel", "device", "early_stop", "finish", "checkpoint", "resume")
+_OF_A_FIT = (
+    *_TIMED,
+    "start",
+    "loss",
+    "kernel",
+    "plain_splatting",
+    "device",
+    "early_stop",
+    "finish",
+    "checkpoint",
+    "resume",
+)
 # The options that exclude each of those that choose a plan.
 _CHOSEN = {"budget": ("quality", *_OF_A_FIT, "iterations"), "quality": ("budget", *_TIMED, "finish")}
-_FINISHED = (*(name for name in _OF_A_FIT if name not in _TIMED), "allow_negative")  # of scans that are finished only
+_STREAMED = (*_TIMED, "loss", "kernel", "plain_splatting")
+_FINISHED = (*(name for name in _OF_A_FIT if name not in _STREAMED), "allow_negative")  # of finished scans only
 
 
 def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
@@ -96,8 +116,61 @@ def method_with(name: str, options: Mapping[str, Any]) -> Method:
 
         return Auto(tuple(method_with(method.name, options) for method in Auto().candidates))
     method = by_name(name)
+    any_setting = options.get("any_setting") or {}
+    options = {option: value for option, value in options.items() if option != "any_setting"}
     paths = {option: SETTINGS.get(option, option) for option, value in options.items() if value is not None}
-    return build(method, {path: options[option] for option, path in paths.items() if has_setting(method, path)})
+    values = {path: not options[o] if o in _INVERTED else options[o] for o, path in paths.items()}
+    known = {path: value for path, value in values.items() if has_setting(method, path)}
+    try:
+        return build(method, known | {path: _of_kind(method, path, value) for path, value in any_setting.items()})
+    except (ValueError, TypeError) as error:
+        raise click.UsageError(f"--set: {error}. Nothing was computed.") from error
+
+
+def settings_given(ctx: click.Context, param: click.Parameter, values: tuple[str, ...]) -> dict[str, Any]:
+    """NAME=VALUE, several in one text apart by spaces, as a value by name: JSON, or else text."""
+    found: dict[str, Any] = {}
+    for word in " ".join(values).split():
+        name, equals, text = word.partition("=")
+        if not (name and equals and text):
+            raise click.BadParameter(f"{word!r} is no setting; expected NAME=VALUE, such as fit.decay=0.1")
+        try:
+            found[name] = json.loads(text)
+        except ValueError:
+            found[name] = text
+    return found
+
+
+def preset_of(method: str | None, preset: str | None) -> str | None:
+    """The name of the method with a preset's settings; the method itself without one.
+
+    Raises:
+        UsageError: the method has no such preset.
+    """
+    if preset is None:
+        return method
+    name = f"{method or DEFAULT}-{preset}"
+    if name not in names():
+        raise click.UsageError(f"--preset {preset} is of {DEFAULT}; it does not go with --method {method}.")
+    return name
+
+
+def _of_kind(method: type[Method], path: str, value: Any) -> Any:
+    """The value of a setting, if it is of the same kind as the method's own; None stays the method's choice."""
+    if not has_setting(method, path):
+        return value  # `build` names the methods that have it
+    own: Any = method()
+    for name in path.split("."):
+        own = getattr(own, name)
+    if isinstance(own, tuple) and isinstance(value, list):
+        return tuple(value)
+    numbers, given = isinstance(own, int | float), isinstance(value, int | float)
+    fits = isinstance(own, bool) == isinstance(value, bool) and numbers == given
+    if own is not None and (
+        not fits or dataclasses.is_dataclass(own) or isinstance(own, str) != isinstance(value, str)
+    ):
+        raise ValueError(f"{path}={value!r} is not of the kind of {own!r}, the default")
+    return value
 
 
 def options_of_a_method(ctx: click.Context) -> list[str]:
@@ -155,6 +228,16 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
+def preset_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Adds --preset."""
+    return click.option(
+        "--preset",
+        type=click.Choice(PRESETS_OF_METHODS),
+        help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
+        "The same as the method r2-published.",
+    )(command)
+
+
 _STEPS = click.option(
     "--steps",
     type=click.IntRange(min=1),
@@ -184,13 +267,15 @@ _ALLOW_NEGATIVE = click.option(
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
-_OF_ROWS = (_STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
+_OF_ROWS = (heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
 _OPTIONS = (
+    heading(METHOD),
     _STEPS,
     click.option(
         "--seconds",
         type=POSITIVE,
-        help="Time of the fit, instead of --steps. With --follow: after the end of the scan.",
+        help="Time of the whole call, from reading the scan to the volume and its report, instead of --steps; where "
+        "that is too little, it says so before the fit. With --follow: of the fit after the end of the scan.",
     ),
     click.option(
         "--budget",
@@ -207,31 +292,30 @@ _OPTIONS = (
     click.option(
         "--start",
         type=click.Choice(get_args(Start)),
-        default="fbp",
-        show_default=True,
-        help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views.",
+        help="Volume that the first Gaussians are drawn from; tv: slower, no streaks of few views; published: with the "
+        "plain ramp, drawn and weighted as published. Default: fbp; published by r2-published.",
     ),
     click.option(
         "--loss",
         type=click.Choice(get_args(Loss)),
-        default="l1",
-        show_default=True,
-        help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise.",
+        help="Loss of the fit, beside SSIM: absolute, squared, or squares weighted by photon noise. Default: l1.",
     ),
     click.option(
         "--kernel",
         type=click.Choice([kernel.value for kernel in Kernel]),
-        default=KERNEL.value,
-        show_default=True,
-        help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5.",
+        help="Shape of the Gaussians: true ones, or with an end of their own, (1 - r²/8)^1.5. "
+        f"Default: {KERNEL}; gaussian by r2-published.",
     ),
+    heading(RESOURCES),
     click.option("--device", default="cpu", show_default=True, metavar="cpu|cuda", help="Device of the fit."),
+    heading(METHOD),
     click.option(
         "--early-stop",
         is_flag=True,
         help="End the fit when views held out stop improving; holds out every tenth if --views leaves none.",
     ),
     _FINISH,
+    heading(OUTPUT),
     click.option(
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
@@ -244,7 +328,23 @@ _OPTIONS = (
         help="Continue the fit from this checkpoint, or make the slabs that this partial volume lacks: with the same "
         "data and options.",
     ),
+    heading(METHOD),
     _ITERATIONS,
     _TV_WEIGHT,
     _ALLOW_NEGATIVE,
+    click.option(
+        "--plain-splatting",
+        is_flag=True,
+        help="The uncorrected projection of 3DGS: one length for all rays in a Gaussian. It shows the bias that the "
+        "corrected projection does not have.",
+    ),
+    click.option(
+        "--set",
+        "any_setting",
+        multiple=True,
+        metavar="NAME=VALUE",
+        callback=settings_given,
+        help="Any setting of the method by its name in Python, such as fit.decay=0.1 or fit.policy.every=50. "
+        "May be repeated.",
+    ),
 )

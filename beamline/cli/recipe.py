@@ -19,10 +19,10 @@ from beamline.core.files import SETTINGS, require_regular, text_in
 
 _RAW = "beamline.raw"
 _OF_ONE_CALL = (
-    "output", "as_json", "report", "pdf", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
-    "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats",
+    "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
+    "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats", "preset",
 )  # fmt: skip
-"""Options that are of one scan or one call, not of a recipe."""
+"""Options that are of one scan or one call, not of a recipe; a preset is in the name of the method."""
 _NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint")
 _PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML takes as they are
 
@@ -55,11 +55,18 @@ def name_of(option: click.Option) -> str:
 def recipe_text(ctx: click.Context, method: str) -> str:
     """The recipe of this call, as YAML: the method, and the options given that hold for any scan."""
     values = {
-        name_of(option): _from_anywhere(str(value), option.type) if isinstance(option.type, click.Path) else value
+        name_of(option): _recipe_value(option, value)
         for option, value in given(ctx).items()
         if option.name not in _OF_ONE_CALL
     }
     return "".join(f"{name}: {_scalar(value)}\n" for name, value in ({"method": method} | values).items())
+
+
+def _recipe_value(option: click.Option, value: Any) -> Any:
+    """The value of an option as a recipe has it; those of one that may be repeated are apart by spaces."""
+    if option.multiple:
+        return " ".join(value)
+    return _from_anywhere(str(value), option.type) if isinstance(option.type, click.Path) else value
 
 
 def _scalar(value: Any) -> str:
@@ -113,7 +120,7 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_take,
-        help="Recipe: options by their long names (YAML), or a volume of which the recipe is taken. The command line "
+        help="Recipe: options by their long names (YAML), or a volume with its recipe. The command line "
         "goes before it.",
     )(command)
 
@@ -134,7 +141,8 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
             raise click.BadParameter(
                 f"{value}: {name} holds no text or several; expected one value, as on the command line"
             )
-        found[str(options[name].name)] = said
+        option = options[name]
+        found[str(option.name)] = said.split() if option.multiple else said
     ctx.default_map = found
 
 
@@ -161,5 +169,5 @@ def _text(path: Path) -> str:
 
     with opened_reconstruction(path) as record:
         if "recipe" not in record.parameters:
-            raise click.BadParameter(f"{path} holds no recipe; an older version wrote it")
+            raise click.BadParameter(f"{path} holds no recipe; expected a volume that `beamline recon` wrote")
         return str(record.parameters["recipe"])

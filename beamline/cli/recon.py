@@ -21,22 +21,25 @@ from beamline.cli.method_options import (
     method_options,
     method_with,
     options_of_a_method,
+    preset_of,
+    preset_option,
     refuse_contradictions,
     resumes_slabs,
 )
+from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
-from beamline.cli.recipe import Repeatable, config_option, recipe_text, repeating
+from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import LogLines, Terminal, counting, results
-from beamline.core.errors import QualityError, ScanStopped, user_message
+from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out, while_it_works
 from beamline.core.files import named_on_failure, refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
+from beamline.storage.volumes.registry import suffixes_text
 from drivers.clock import Clock, SystemClock
-from recon.assess.plans import Quality
-from recon.base.choices import AUTO, Filter
+from recon.base.choices import AUTO, Filter, Quality
 from recon.methods import DEFAULT, names
 
 if TYPE_CHECKING:
@@ -96,19 +99,26 @@ def region_of(text: str) -> Region:
 _SHEET = ".png"
 
 
-@click.command(cls=Repeatable)
+@click.command(
+    cls=Grouped,
+    first=("method", "views", "rows", "binning", "axis", "rings", "budget", "output", "follow", "dry"),
+)
+@heading(DATA)
 @config_option
 @click.argument("file", type=click.Path(path_type=Path))
+@heading(METHOD)
 @click.option(
     "-m",
     "--method",
     type=click.Choice((AUTO, *names())),
-    help="auto: the one of r2, fista-tv and fbp that predicts views held out best, hides no structure and dulls no "
-    "edges; r2: Gaussians fitted to the views; fbp: filtered back-projection; the others: iterations on voxels. "
-    "Default: auto; r2 with --follow and with options of the fit.",
+    help="auto chooses r2, fista-tv or fbp by how well it predicts views held out. r2 fits Gaussians to the views, "
+    "fbp is filtered back-projection, the others iterate on voxels. Default: auto; r2 with --follow and with "
+    "options of the fit.",
 )
 @selection_options
 @method_options
+@preset_option
+@heading(METHOD)
 @click.option(
     "--filter",
     "ramp",
@@ -117,13 +127,16 @@ _SHEET = ".png"
     show_default=True,
     help="Filter of fbp, also of the fbp for comparison with r2. hann is best for few or noisy views.",
 )
+@heading(OUTPUT)
 @click.option(
     "--max-residual",
     type=NOT_NEGATIVE,
     metavar="X",
     help="Exit with code 6 if the data residual (of views held out, if there are any) is larger.",
 )
+@heading(METHOD)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@heading(OUTPUT)
 @click.option(
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use."
 )
@@ -132,11 +145,16 @@ _SHEET = ".png"
     "--output",
     metavar="PATH",
     callback=parsed(output_path),
-    help="Output: .h5 (with all settings), .tif, .npy, .nrrd, .zarr, or no suffix: a folder of TIFFs; of --axis try a "
-    ".png. Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
+    help=f"Output: {suffixes_text()}; of --axis try a .png. "
+    "Default: FILE's stem + _METHOD.h5 (_axis.png), in this folder.",
 )
-@click.option("--report/--no-report", default=True, show_default=True, help="Write an HTML page beside the output.")
-@click.option("--pdf", is_flag=True, help="Write a logbook page beside the output: one sheet of A4, as PDF.")
+@click.option(
+    "--report/--no-report",
+    default=True,
+    show_default=True,
+    help="Write an HTML page beside the output; a browser prints it on A4, also as PDF.",
+)
+@heading(DATA)
 @click.option("--follow", is_flag=True, help="Follow a running scan: reconstruct while its file grows.")
 @click.option(
     "--earlier",
@@ -160,6 +178,7 @@ _SHEET = ".png"
 @click.option(
     "--unfinished", is_flag=True, help="Accept an unfinished scan, one that failed or still runs, and use its frames."
 )
+@heading(RESOURCES)
 @click.option(
     "--memory",
     metavar="SIZE",
@@ -174,6 +193,7 @@ _SHEET = ".png"
     help="Workers of dask.distributed that reconstruct slabs, where a volume is made in slabs: N on this machine, "
     "those of a scheduler, or jobs of Slurm by a YAML file.",
 )
+@heading(OUTPUT)
 @click.option(
     "--roi",
     metavar="Z0:Z1,Y0:Y1,X0:X1",
@@ -188,16 +208,20 @@ _SHEET = ".png"
 )
 @click.option("--log", type=click.Path(path_type=Path), help="Write everything that happens to this text file.")
 @click.option("-v", "--verbose", is_flag=True, help="Print everything that happens, with its time, to stderr.")
+@heading(RESOURCES)
 @click.option(
     "--dry-run",
     "dry",
     is_flag=True,
     help="Print the memory, time and disk space that it will take, by small runs of a few seconds, and end.",
 )
+@heading(OUTPUT)
 @json_option
 def recon(
     file: Path,
     method: str | None,
+    preset: str | None,
+    any_setting: dict[str, Any],
     budget: float | None,
     quality: Quality | None,
     device: str,
@@ -209,7 +233,6 @@ def recon(
     truth: str | None,
     output: Path | None,
     report: bool,
-    pdf: bool,
     follow: bool,
     earlier: tuple[Path, ...],
     enough_loss: float | None,
@@ -243,8 +266,9 @@ def recon(
 
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
+    method = preset_of(method, preset)
     if method is None:
-        method = DEFAULT if follow or set(options_of_a_method(context)) - {"budget"} else AUTO
+        method = DEFAULT if follow or any_setting or set(options_of_a_method(context)) - {"budget"} else AUTO
     refuse_contradictions(context, method, follow)
     for step in steps_said(values) if follow else ():
         if step.needs_finished:
@@ -261,8 +285,7 @@ def recon(
         raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
-    sheet = output.with_suffix(".pdf") if pdf else None
-    files = {"FILE": file, "--output": output, "report": page, "--pdf": sheet, "--checkpoint": checkpoint}
+    files = {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint}
     refuse_shared({**files, "--resume": resume, "--log": log})
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
     if cluster is not None and (follow or budget is not None):
@@ -281,9 +304,9 @@ def recon(
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=replace(source, earlier=earlier),
-        target=OutputPaths(output, page, pdf=sheet),
+        target=OutputPaths(output, page),
         selection=selection,
-        method=method_with(method, {**settings, "filter": ramp}),
+        method=method_with(method, {**settings, "filter": ramp, "any_setting": any_setting}),
         budget=budget,
         quality=quality,
         checkpoints=CheckpointOptions(checkpoint, None if partial else resume),
@@ -301,7 +324,7 @@ def recon(
         recipe=recipe_text(context, method),
     )
     if roi is not None and max_residual is not None and options.method.traits.direct:
-        raise click.UsageError("--max-residual needs the whole volume, of which fbp with --roi makes a part.")
+        raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
     if write_config is not None:
         _write_recipe(write_config, options.recipe)
         return
@@ -324,6 +347,8 @@ def recon(
             metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=StopOnSignal())
     if not as_json:
         click.echo(results(last[-1].data))
+    if lost := last[-1].data.get("checkpoint_lost"):
+        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
     if last[-1].data.get("ended_early"):
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:

@@ -65,9 +65,8 @@ def scan(
     Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, SIGTERM or a terminal that is
     closed stops the scan cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
-    Exit code: 0 done, 2 wrong configuration or violated limit, 3 device failed, 4 stopped, 5 frames missing or disk
-    error, 6 darks or flats cannot be used, 7 complete but frames have an alarm of the monitor, or darks or flats a
-    fault, 130 aborted, or interrupted before the first frame.
+    Exit codes: see `beamline --help`. 6 means that darks or flats cannot be used. 7 means that the scan is complete,
+    but frames have an alarm of the monitor, or darks or flats a fault.
     """
     from beamline.config.load import load
     from beamline.instrument.operator import ask_operator

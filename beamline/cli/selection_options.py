@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.projections.steps.registry import key_of, registered, steps_of
@@ -70,7 +71,8 @@ def distances(ctx: click.Context, param: click.Parameter, value: str | None) -> 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of `Selection`, from --views on, with those of every step, and what `scan_options` adds."""
-    for option in reversed((*_AFTER, *map(_of_step, _step_options()))):
+    after: list[Callable[..., Any]] = [*_AFTER, *map(_of_step, _step_options())]
+    for option in reversed(after):
         command = option(command)
     command = scan_options(command)
     for option in reversed(_BEFORE):
@@ -135,6 +137,7 @@ def _parsed(option: Option, ctx: click.Context, param: click.Parameter, value: s
 
 
 _BEFORE = (
+    heading(DATA),
     click.option(
         "--views",
         default="all",
@@ -167,6 +170,7 @@ _BEFORE = (
     ),
 )
 _AFTER = (
+    heading(DATA),
     click.option(
         "--pixel-size-um",
         type=POSITIVE,
@@ -178,4 +182,5 @@ _AFTER = (
         metavar="SOD:SDD",
         help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
     ),
+    heading(CORRECTIONS),
 )

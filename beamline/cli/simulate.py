@@ -25,7 +25,7 @@ from drivers.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
     from beamline.simulate.scene_file import Scan, SceneFile
-    from beamline.simulate.write import Simulated
+    from beamline.simulate.write import SimulatedScan
 
 _OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
 _VIEWS = click.IntRange(1)
@@ -174,7 +174,7 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict
     return {"truth": path}
 
 
-def _scan(scene: SceneFile, scan: Scan, out: Path, output: _Output, sink: Sink) -> Simulated:
+def _scan(scene: SceneFile, scan: Scan, out: Path, output: _Output, sink: Sink) -> SimulatedScan:
     from beamline.simulate.write import write_scan
 
     ending = StopOnSignal("Stopping after this frame. Ctrl-C again stops at once.")

@@ -10,8 +10,9 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.method_options import row_options, row_settings
+from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import SEED, json_option
-from beamline.cli.recipe import Repeatable, repeating
+from beamline.cli.recipe import repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
@@ -23,7 +24,11 @@ from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names
 
 
-@click.command(cls=Repeatable)
+@click.command(
+    cls=Grouped,
+    first=("methods", "truth", "views", "rows", "binning", "axis", "rings", "steps", "iterations", "output"),
+)
+@heading(METHOD)
 @click.argument("which", metavar="|".join(STUDIES), type=click.Choice(list(STUDIES)))
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
@@ -36,11 +41,13 @@ from recon.methods import BASELINE, DEFAULT, names
     show_default=True,
     help="Method of each row; may be repeated.",
 )
+@heading(DATA)
 @click.option(
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use."
 )
 @row_options
 @selection_options
+@heading(METHOD)
 @click.option(
     "--filter",
     "ramp",
@@ -57,6 +64,7 @@ from recon.methods import BASELINE, DEFAULT, names
     help="How often the study random draws its views.",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@heading(OUTPUT)
 @click.option(
     "-o",
     "--output",

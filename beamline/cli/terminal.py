@@ -30,6 +30,7 @@ SAY_EVERY = 0.2
 PLAIN_EVERY = 5.0
 """Real s between progress lines on a stream that is no terminal."""
 _OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
+_OF_ITSELF = ("axes", "slices", "views")  # stages named after what their progress counts
 _OF_TRIALS = {
     "tradeoff": "trials",
     "study": "trials",
@@ -102,8 +103,9 @@ class Terminal:
             self._show("written and compared", event.data["n"], event.data["of"], rate_text(event.data, "MB"))
         elif event.event == "progress" and event.data.get("stage") == "phase":
             self._show_phase(event.data)
-        elif event.event == "progress" and event.data.get("stage") == "axes":
-            self._show("axes", event.data["n"], event.data["of"], rate_text(event.data, "axes"))
+        elif event.event == "progress" and event.data.get("stage") in _OF_ITSELF:
+            what = event.data["stage"]
+            self._show(what, event.data["n"], event.data["of"], rate_text(event.data, what))
         elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:
             what = _OF_TRIALS[event.data["stage"]]
             self._show(what, event.data["n"], event.data["of"], trials(event.data, what))
@@ -237,7 +239,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
 def results(data: Mapping[str, Any]) -> str:
     """The result of a reconstruction, from its `done` event: files, grid, then a table of metrics by method."""
     lines = [f"{'output':<10}{data['output']}"]
-    lines += [f"{name:<10}{data[name]}" for name in ("report", "pdf") if data.get(name)]
+    lines += [f"{'report':<10}{data['report']}"] if data.get("report") else []
     lines.append(f"{'volume':<10}{' x '.join(str(n) for n in data['shape'])} in {data['units']}")
     lines.append(f"{'axis_col':<10}{data['axis_col']:.2f}")
     for name, key in (("chosen", "chosen"), ("next dB", "next_db_said")):

@@ -9,29 +9,34 @@ from typing import Any
 import click
 
 from beamline.cli.json_output import json_events
+from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import POSITIVE, SEED, json_option
-from beamline.cli.recipe import Repeatable, repeating
+from beamline.cli.recipe import repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
 from beamline.core.signals import terminated_like_interrupted
 from drivers.clock import SystemClock
-from recon.methods import names
+from recon.methods import names, names_compared
 
 
 def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    """Names of methods, separated by commas; all if none are given."""
+    """Names of methods, separated by commas; those that are compared unasked if none are given."""
     if value is None:
-        return names()
+        return names_compared()
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     unknown = [name for name in wanted if name not in names()]
     if unknown:
-        raise click.BadParameter(f"{unknown[0]!r} is none of {', '.join(names())}")
+        raise click.BadParameter(f"{unknown[0]!r} is not a method; expected {', '.join(names())}")
     return wanted
 
 
-@click.command(cls=Repeatable)
+@click.command(
+    cls=Grouped,
+    first=("methods", "quick", "max_seconds", "truth", "views", "rows", "binning", "axis", "rings", "output"),
+)
+@heading(DATA)
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option(
     "--truth",
@@ -39,16 +44,24 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
     help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views held out.",
 )
 @selection_options
+@heading(METHOD)
 @click.option(
-    "--methods", callback=listed, metavar="A,B,...", help=f"Methods to compare, of {', '.join(names())}. Default: all."
+    "--methods",
+    callback=listed,
+    metavar="A,B,...",
+    help=f"Methods to compare, of {', '.join(names())}. "
+    f"Default: all but {', '.join(name for name in names() if name not in names_compared())}.",
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
+@heading(RESOURCES)
 @click.option(
     "--max-seconds",
     type=POSITIVE,
     help="Longest wall time of all trials together; the table then has the trials done by that time.",
 )
+@heading(METHOD)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
+@heading(OUTPUT)
 @click.option(
     "-o",
     "--output",

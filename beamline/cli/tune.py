@@ -27,7 +27,7 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     """Take darks, flats and a view, and say counts, saturation, transmission, noise and the exposure to take.
 
     The shutter opens, the sample goes out and back, the stage turns to the view's angle and back. Two darks and two
-    flats tell noise from structure; flats and view are also taken at an eighth and a 64th of the exposure, in case
+    flats tell noise from structure. Flats and view are also taken at an eighth and a 64th of the exposure, in case
     they saturate. Nothing is written.
 
     Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the darks or flats would stop a scan.

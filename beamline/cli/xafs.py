@@ -26,11 +26,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.xafs.contrast import Curve
+    from beamline.monitor.view import PixelBox
+    from beamline.xafs.contrast import XafsCurve
     from beamline.xafs.results import XafsResult
     from beamline.xafs.series import Series, SeriesResult
-
-Box = tuple[int, int, int, int]
 
 MOST = 5000
 _SCENES = (".yaml", ".yml", "")
@@ -39,7 +38,7 @@ _OF_FILES = ("region", "around", "unit", "quantity")
 _BOX = "ROW:END,COL:END"
 
 
-def box(ctx: click.Context, param: click.Parameter, value: str | None) -> Box | None:
+def box(ctx: click.Context, param: click.Parameter, value: str | None) -> PixelBox | None:
     """`first:end,first:end` of rows and columns."""
     if value is None:
         return None
@@ -86,8 +85,8 @@ def xafs(
     material: str | None,
     angle: float | None,
     seed: int | None,
-    region: Box | None,
-    around: Box | None,
+    region: PixelBox | None,
+    around: PixelBox | None,
     unit: str | None,
     quantity: str | None,
     output: Path | None,
@@ -103,7 +102,7 @@ def xafs(
     Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6: no edge was found;
     picture and table are written, too.
     """
-    from beamline.xafs.contrast import Curve
+    from beamline.xafs.contrast import XafsCurve
     from beamline.xafs.edge import LEAST
     from beamline.xafs.measured import FileOptions, open_series
     from beamline.xafs.results import lines, refuse_existing_results, table_beside, write
@@ -118,7 +117,7 @@ def xafs(
     with json_events(as_json) as sinks, ExitStack() as opened:
         refuse_existing_results(target)
         opened.enter_context(stop_signals(stop))
-        series: Series | Curve
+        series: Series | XafsCurve
         if is_scene:
             from beamline.simulate.energy_scan import (
                 open_energy_scan,  # lazily: it imports xraylib, which measured files do not need
@@ -130,13 +129,13 @@ def xafs(
         else:
             options = FileOptions(low or 0.0, high or math.inf, region, around, unit, quantity)
             series = opened.enter_context(open_series(Path(source), options))
-            n = series.energies.size if isinstance(series, Curve) else series.n
+            n = series.energies.size if isinstance(series, XafsCurve) else series.n
             if n < LEAST:
                 within = " between --from and --to" if low or high else ""
                 raise DataError(f"{source}: {n} energies{within} are too few for an edge, which takes {LEAST}.")
         with Terminal(sys.stderr) as terminal:
             sink = fan_out(*(sinks or [terminal]))
-            if isinstance(series, Curve):
+            if isinstance(series, XafsCurve):
                 run, title = SeriesResult(series), Path(source).name
             else:
                 run, title = run_series(series, sink, clock, lambda: stop.stopping), series.title

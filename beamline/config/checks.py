@@ -8,7 +8,6 @@ from pathlib import Path
 from beamline.config.devices import DcamOrca
 from beamline.config.models import Config, FileAngles
 from beamline.plan.plan import Mode
-from drivers import orca_quest
 from drivers.protocols import CameraSettings, TriggerSource
 
 
@@ -70,7 +69,7 @@ def _camera(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
         config.scan.exposure_s, TriggerSource.EXTERNAL, camera.roi, camera.binning, camera.readout
     )
     try:
-        timing = orca_quest.timing(settings, camera.link if isinstance(camera, DcamOrca) else "usb3")
+        timing = camera.timing_of(settings)
     except ValueError as error:
         yield ("devices", "camera"), f"devices.camera: {error}"
         return

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
-from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    create_model,
+    model_validator,
+)
 
+from beamline.config.declared import declared, read_from
 from beamline.config.section import Section
 from beamline.config.stages import StageConfig
+from drivers import orca_quest
 from drivers.beam_monitors.page import url_problem
 from drivers.beam_monitors.reading import pattern_problem
 from drivers.beam_monitors.serial import PATTERN, QUERY
+from drivers.cameras import CAMERAS
+from drivers.clock import Clock
+from drivers.protocols import Camera, CameraSettings, CameraTiming
 from drivers.stages.registry import STAGES
 
 Roi = Annotated[
@@ -35,6 +48,10 @@ class _Orca(Section):
     """photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."""
     trigger_polarity: Literal["positive", "negative"] = "positive"
     """The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here."""
+
+    def timing_of(self, wanted: CameraSettings) -> CameraTiming:
+        """What the camera will say of its timing. ValueError for what it would refuse."""
+        return orca_quest.timing(wanted)
 
 
 class SimulatedOrca(_Orca):
@@ -73,6 +90,43 @@ class DcamOrca(_Orca):
     usb_serial: str | None = None
     """USB serial number, for the doctor, where there are several cameras."""
 
+    def timing_of(self, wanted: CameraSettings) -> CameraTiming:
+        return orca_quest.timing(wanted, self.link)
+
+
+class PluggedCamera(Section):
+    """A camera of another package, with the keys that its settings declare."""
+
+    kind: str
+    roi: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = None
+    """row0, col0, rows, cols on the sensor; null: all of it."""
+    binning: PositiveInt = 1
+    readout: str = "standard"
+
+    def timing_of(self, wanted: CameraSettings) -> CameraTiming:
+        """What the camera will say of its timing. ValueError for what it would refuse."""
+        driver = CAMERAS[self.kind]
+        return driver.timing_of(read_from(self, driver.Settings), wanted)
+
+    def connect(self, clock: Clock) -> Camera:
+        """Its driver, connected; see `CameraDriver`."""
+        driver = CAMERAS[self.kind]
+        return driver(read_from(self, driver.Settings), clock)
+
+
+def _plugged(kind: str) -> type[PluggedCamera]:
+    keys = {"kind": (Literal[kind], ...)} | declared(CAMERAS[kind].Settings)
+    return create_model(f"{kind.title()}CameraConfig", __base__=PluggedCamera, **keys)
+
+
+PLUGGED: tuple[type[PluggedCamera], ...] = tuple(map(_plugged, CAMERAS))
+"""Sections of the cameras of other packages."""
+
+if TYPE_CHECKING:
+    CameraConfig = SimulatedOrca | DcamOrca | PluggedCamera
+else:
+    CameraConfig = Union[(SimulatedOrca, DcamOrca, *PLUGGED)]
+
 
 class Simple(Section):
     """A device with nothing to set: simulated, or manual (the operator is asked to do it)."""
@@ -105,14 +159,14 @@ def _is_a_page(url: str) -> str:
 
 
 Pattern = Annotated[str, AfterValidator(_finds_a_number)]
-Scale = Annotated[float, Field(gt=0)]
+PositiveScale = Annotated[float, Field(gt=0)]
 
 
 class _BeamMonitor(Section):
     """What every beam monitor has."""
 
     unit: str
-    scale: Scale = 1.0
+    scale: PositiveScale = 1.0
     """What the number is multiplied by to be in `unit`."""
     timeout_s: PositiveFloat = 2.0
     period_s: PositiveFloat = 1.0
@@ -180,7 +234,7 @@ BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig
 
 class DeviceSection(Section):
     stage: Annotated[StageConfig, Field(discriminator="kind")]
-    camera: Annotated[SimulatedOrca | DcamOrca, Field(discriminator="kind")]
+    camera: Annotated[CameraConfig, Field(discriminator="kind")]
     shutter: Annotated[Simple | StageOutputShutter, Field(discriminator="kind")]
     sample_mover: Simple
     beam_monitor: Annotated[BeamMonitorConfig, Field(discriminator="kind")] = NoBeamMonitor()
@@ -202,7 +256,7 @@ class DeviceSection(Section):
         if not isinstance(shutter, StageOutputShutter):
             return self
         if taken is None:
-            with_outputs = [kind for kind, settings in STAGES.items() if settings.pulse_output is not None]
+            with_outputs = [kind for kind, driver in STAGES.items() if driver.Settings.pulse_output is not None]
             raise ValueError(
                 f"a {self.stage.kind} stage has no digital output for a shutter; set shutter.kind: manual, or use the "
                 f"output of another controller (stage.kind {' or '.join(with_outputs)})"

@@ -21,7 +21,7 @@ else:
     MethodName = Literal[(AUTO, *names())]
 
 
-class Sample(Section):
+class SampleSection(Section):
     name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)]
     """letters, digits and _ . + - (it ends the run folder's name)"""
     description: str = ""
@@ -85,7 +85,7 @@ class FileAngles(Section):
     """Relative to the configuration file."""
 
 
-Angles = Annotated[
+AnglesSection = Annotated[
     FixedAngles | SectorAngles | RandomAngles | InterlacedAngles | GoldenAngles | FileAngles,
     Field(discriminator="scheme"),
 ]
@@ -102,9 +102,9 @@ class Fields(Section):
     exposure_s: Seconds | None = None
 
 
-class Scan(Section):
+class ScanSection(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
-    angles: Angles
+    angles: AnglesSection
     exposure_s: Seconds
     period_s: Seconds
     """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""
@@ -116,7 +116,7 @@ class Scan(Section):
     flats: Fields = Fields()
 
 
-class Optics(Section):
+class OpticsSection(Section):
     pixel_size_um: PositiveFloat
     """Of an unbinned pixel at the sample."""
     energy_kev: PositiveFloat | None = None
@@ -126,7 +126,7 @@ class Optics(Section):
     """Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."""
 
 
-class Storage(Section):
+class StorageSection(Section):
     folder: Annotated[str, Field(min_length=1)] = RUNS
     preview_bin: PositiveInt = 4
     flush_every: PositiveInt = 16
@@ -148,7 +148,7 @@ class StopWhen(Section):
         return self
 
 
-class Recon(Section):
+class ReconSection(Section):
     live: bool = True
     """A volume while the scan runs; by a method that needs the whole scan, when it is complete."""
     method: MethodName = DEFAULT
@@ -174,7 +174,7 @@ class Speed(Section):
     """Simulated seconds per real second."""
 
 
-class Simulation(Section):
+class SimulationSection(Section):
     """Only with simulated devices."""
 
     scene: str | dict[str, Any] = "scenes/battery.yaml"
@@ -186,15 +186,15 @@ class Simulation(Section):
 class Config(Section):
     """A whole configuration file."""
 
-    sample: Sample
-    scan: Scan
+    sample: SampleSection
+    scan: ScanSection
     devices: DeviceSection
-    optics: Optics
-    storage: Storage = Storage()
+    optics: OpticsSection
+    storage: StorageSection = StorageSection()
     monitor: MonitorSection = MonitorSection()
     references: ReferencesSection = ReferencesSection()
-    recon: Recon = Recon()
-    simulation: Simulation | None = None
+    recon: ReconSection = ReconSection()
+    simulation: SimulationSection | None = None
 
     @model_validator(mode="after")
     def _all_simulated_or_none(self) -> Self:

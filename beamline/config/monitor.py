@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import Field, create_model
 
 from beamline.config.section import Section
 from beamline.monitor.check import Check, Policy
@@ -27,48 +27,19 @@ class MonitorBase(Section):
     retake_share: Annotated[float, Field(gt=0, le=1)] = 0.25
     """Share of the views that are taken again at most."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _without_earlier_keys(cls, data: Any) -> Any:
-        """Take out the keys of earlier versions, which their resolved files have with the values that did nothing:
-        `thresholds`, which held the limits, and `on_alarm`."""
-        if not isinstance(data, dict) or not {"thresholds", "on_alarm"} & data.keys():
-            return data
-        if data.get("on_alarm", "log") != "log":
-            raise ValueError(
-                "on_alarm is not a key any longer; write policy: {<check>: stop} for the checks whose alarms are to "
-                "stop the scan, and act_after: 1 to stop it at the first frame"
-            )
-        if old := data.get("thresholds"):
-            group, keys = next(iter(old.items())) if isinstance(old, dict) else ("<check>", None)
-            limit = next(iter(keys)) if isinstance(keys, dict) and keys else "<limit>"
-            raise ValueError(
-                f"thresholds is not a key any longer; write monitor.{group}.{limit} instead of "
-                f"monitor.thresholds.{group}.{limit}"
-            )
-        return {key: value for key, value in data.items() if key not in ("thresholds", "on_alarm")}
-
 
 def _limits_of(check: Check) -> Any:
     """The section with the limits of a check, and its default, as pydantic.create_model takes a field."""
     types = get_type_hints(type(check), include_extras=True)
     keys: dict[str, Any] = {limit.name: (types[limit.name], limit.default) for limit in fields(check)}
-    section = create_model(f"{type(check).__name__}Limits", __base__=Section, __doc__=f"Flag: {check.meaning}.", **keys)
+    name = type(check).__name__.removesuffix("Check")
+    section = create_model(f"{name}Limits", __base__=Section, __doc__=f"Flag: {check.meaning}.", **keys)
     return section, section()
-
-
-def _without_earlier_word(policy: Any) -> Any:
-    """`abort` was the word for a clean stop."""
-    if policy == "abort":
-        raise ValueError("abort is called stop now; write stop")
-    return policy
 
 
 def _policies() -> Any:
     """The section with the policy of each check, and its default, as pydantic.create_model takes a field."""
-    keys: dict[str, Any] = {
-        check.name: (Annotated[Policy, BeforeValidator(_without_earlier_word)], check.policy) for check in CHECKS
-    }
+    keys: dict[str, Any] = {check.name: (Policy, check.policy) for check in CHECKS}
     section = create_model("Policies", __base__=Section, __doc__="What alarms of each check do to a scan.", **keys)
     return section, section()
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import MISSING
-from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, Union
+from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import Field, create_model, model_validator
 
+from beamline.config.declared import declared, read_from
 from beamline.config.section import Section
-from drivers.flat import FlatField, flat_fields, from_flat
+from drivers.clock import Clock
+from drivers.protocols import RotationStage
 from drivers.stages.registry import STAGES
-from drivers.stages.settings import ANGULAR, Key, StageSettings
+from drivers.stages.settings import StageSettings
 
 
 class StageSection(Section):
@@ -41,63 +39,28 @@ class StageSection(Section):
     @property
     def settings(self) -> StageSettings:
         """What the driver is opened with."""
-        kind = STAGES[self.kind]
-        return from_flat(kind, {field.name: _inside(field, getattr(self, _name(field))) for field in flat_fields(kind)})
+        return read_from(self, STAGES[self.kind].Settings)
+
+    def connect(self, clock: Clock, url: str | None = None) -> RotationStage:
+        """Its driver, connected at the port, or at `url`; see `StageDriver`."""
+        return STAGES[self.kind](url or self.port, self.settings, clock)
+
+    def halt(self, clock: Clock) -> None:
+        """Stop it; see `StageDriver`."""
+        STAGES[self.kind].halt(self.port, self.settings, clock)
 
 
-def _key(field: FlatField) -> Key:
-    found = field.metadata["key"]
-    assert isinstance(found, Key)
-    return found
-
-
-def _name(field: FlatField) -> str:
-    """The key of a field."""
-    return _key(field).name_of(field.name)
-
-
-def _inside(field: FlatField, value: Any) -> Any:
-    """A key's value as the driver takes it: radians, and the type of the field."""
-    if value is None:
-        return None
-    if _key(field).unit in ANGULAR:
-        return math.radians(value)
-    return field.plain(value) if issubclass(field.plain, StrEnum | Path) else value
-
-
-def _declared(field: FlatField) -> tuple[Any, Any]:
-    """Type and default of a field's key, as pydantic takes them."""
-    key, plain = _key(field), field.plain
-    legal: Any = plain
-    if issubclass(plain, StrEnum):
-        legal = Literal[tuple(choice.value for choice in plain)]
-    elif issubclass(plain, Path):
-        legal = str
-    if key.bounds:
-        legal = Annotated[legal, Field(**key.bounds)]
-    if field.optional:
-        legal = legal | None
-    default = field.default
-    if default is MISSING:
-        default = ...
-    elif key.unit in ANGULAR:
-        default = key.default
-    elif isinstance(default, StrEnum):
-        default = default.value
-    return legal, Field(default, description=key.doc or None)
-
-
-def _section(kind: str, settings: type[StageSettings]) -> type[StageSection]:
-    keys: dict[str, Any] = {_name(field): _declared(field) for field in flat_fields(settings)}
+def _section(kind: str) -> type[StageSection]:
+    settings = STAGES[kind].Settings
     return create_model(
         settings.__name__.replace("Settings", "StageConfig"),
         __base__=StageSection,
         __doc__=(settings.__doc__ or "").partition("\n")[0],
-        **({"kind": (Literal[kind], ...)} | keys),
+        **({"kind": (Literal[kind], ...)} | declared(settings)),
     )
 
 
-STAGE_SECTIONS: Mapping[str, type[StageSection]] = {kind: _section(kind, settings) for kind, settings in STAGES.items()}
+STAGE_SECTIONS: Mapping[str, type[StageSection]] = {kind: _section(kind) for kind in STAGES}
 """Kind -> its section of the configuration."""
 
 if TYPE_CHECKING:

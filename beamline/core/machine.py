@@ -14,8 +14,8 @@ import psutil
 
 _CPUINFO, _STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
-# Of a control group: its line in _OWN_CGROUP, its tree, the files of its limit and of what it uses, and in memory.stat
-# the file cache that counts as used and is given up first.
+# Of a control group: its line in _OWN_CGROUP, its tree, the files of its limit and of its use. In memory.stat: the file
+# cache that counts as used and is given up first.
 _CGROUP_2 = (r"0::/(.*)", "", "memory.max", "memory.current", "inactive_file")
 _CGROUP_1 = (r"\d+:memory:/(.*)", "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 

@@ -1,1 +1,1 @@
-"""Doctor: checks of this computer (camera link, ports, disk, memory) against the needs of a scan."""
+"""Doctor: checks of this computer against the needs of a scan, and the rate at which it takes frames."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from beamline.config.devices import DcamOrca
-from beamline.doctor.check import Check, Verdict, of_error
+from beamline.doctor.check import Diagnosis, Grade, of_error
 from drivers import usb
 from drivers.dcam.abi import Dcam
 from drivers.dcam.codes import Text
@@ -21,21 +21,21 @@ LINK, LIBRARY = "camera link", "camera library"
 _SUPERSPEED = "one Hamamatsu camera on a SuperSpeed link (5 Gbit/s or more)"
 _LINK_ADVICE = {
     usb.Verdict.SLOW: "Use the vendor's USB 3 cable, shorter than 3 m, in a port marked SS or blue, without a hub or "
-    "extension; then switch the camera off and on. A camera at 480 Mbit/s gives about 2 full frames a second",
-    usb.Verdict.ABSENT: "Switch the camera on, wait for its lamp, check the cable at both ends; on Linux see whether "
+    "extension. Then switch the camera off and on. A camera at 480 Mbit/s gives about 2 full frames a second",
+    usb.Verdict.ABSENT: "Switch the camera on, wait for its lamp, check the cable at both ends. On Linux see whether "
     "`lsusb -d 0661:` lists it, on Windows the Device Manager",
     usb.Verdict.AMBIGUOUS: "Set devices.camera.usb_product or usb_serial to the ids listed here",
 }
 _VERDICTS = {
-    usb.Verdict.READY: Verdict.OK,
-    usb.Verdict.SLOW: Verdict.FAILED,  # the plan assumes the fast link: frames would be lost
-    usb.Verdict.ABSENT: Verdict.FAILED,
-    usb.Verdict.AMBIGUOUS: Verdict.WARNING,
-    usb.Verdict.UNKNOWN: Verdict.CANNOT_CHECK,
+    usb.Verdict.READY: Grade.OK,
+    usb.Verdict.SLOW: Grade.FAILED,  # the plan assumes the fast link: frames would be lost
+    usb.Verdict.ABSENT: Grade.FAILED,
+    usb.Verdict.AMBIGUOUS: Grade.WARNING,
+    usb.Verdict.UNKNOWN: Grade.CANNOT_CHECK,
 }
 
 
-def link(camera: DcamOrca | None, backend: Any = None) -> Check:
+def link(camera: DcamOrca | None, backend: Any = None) -> Diagnosis:
     """The camera on USB, from its descriptors.
 
     Args:
@@ -43,25 +43,25 @@ def link(camera: DcamOrca | None, backend: Any = None) -> Check:
         backend: of pyusb; None: the installed libusb.
     """
     if camera is not None and camera.link == "coaxpress":
-        return Check(
-            LINK, Verdict.NOT_APPLICABLE, "A CoaXPress camera is on its frame grabber, not on USB.", _SUPERSPEED
+        return Diagnosis(
+            LINK, Grade.NOT_APPLICABLE, "A CoaXPress camera is on its frame grabber, not on USB.", _SUPERSPEED
         )
     product, serial = (None, None) if camera is None else (camera.usb_product, camera.usb_serial)
     found = usb.preflight(product=product, serial=serial, backend=backend)
     verdict = _VERDICTS[found.verdict]
-    if verdict is Verdict.FAILED and camera is None:
-        verdict = Verdict.WARNING
-    return Check(
+    if verdict is Grade.FAILED and camera is None:
+        verdict = Grade.WARNING
+    return Diagnosis(
         LINK,
         verdict,
         found.message,
         _SUPERSPEED,
-        _LINK_ADVICE.get(found.verdict, "" if verdict is Verdict.OK else _no_libusb()),
+        _LINK_ADVICE.get(found.verdict, "" if verdict is Grade.OK else _no_libusb()),
         {"devices": [vars(device) for device in found.devices]},
     )
 
 
-def library(camera: DcamOrca | None, session: bool = False) -> Check:
+def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
     """The DCAM-API library and its version; with `session`, also the cameras that it finds.
 
     Args:
@@ -72,13 +72,13 @@ def library(camera: DcamOrca | None, session: bool = False) -> Check:
     try:
         loaded = Dcam(path, "camera")
     except DeviceError as error:
-        return of_error(LIBRARY, error, expected, Verdict.WARNING if camera is None else Verdict.FAILED)
+        return of_error(LIBRARY, error, expected, Grade.WARNING if camera is None else Grade.FAILED)
     file = _loaded_file(path)
     version = version_of(file)
     values: dict[str, Any] = {"library": None if file is None else str(file), "version": version}
     found = f"{file or path or 'the installed library'}, version {version or 'not known'}."
     if not session:
-        return Check(LIBRARY, Verdict.OK, found, expected, values=values)
+        return Diagnosis(LIBRARY, Grade.OK, found, expected, values=values)
     index = 0 if camera is None else camera.index
     try:
         cameras = _cameras(loaded)
@@ -88,15 +88,15 @@ def library(camera: DcamOrca | None, session: bool = False) -> Check:
     values["cameras"] = cameras
     listed = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
     if index >= len(cameras):
-        return Check(
+        return Diagnosis(
             LIBRARY,
-            Verdict.FAILED,
+            Grade.FAILED,
             f"{found} {len(cameras)} cameras: {listed}.",
             f"a camera of index {index}",
             "Set devices.camera.index to one of these cameras",
             values,
         )
-    return Check(LIBRARY, Verdict.OK, f"{found} {listed}.", expected, values=values)
+    return Diagnosis(LIBRARY, Grade.OK, f"{found} {listed}.", expected, values=values)
 
 
 def version_of(file: Path | None) -> str:

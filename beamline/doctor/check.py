@@ -11,7 +11,7 @@ from typing import Any
 from drivers.errors import DeviceError
 
 
-class Verdict(StrEnum):
+class Grade(StrEnum):
     OK = "ok"
     WARNING = "warning"  # it works, with a small margin
     FAILED = "failed"  # a scan would fail, or lose frames
@@ -20,7 +20,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Check:
+class Diagnosis:
     """One result.
 
     Attributes:
@@ -29,15 +29,15 @@ class Check:
     """
 
     name: str
-    verdict: Verdict
+    verdict: Grade
     found: str
     expected: str = ""
     advice: str = ""
     values: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
 
-def of_error(name: str, error: DeviceError, expected: str, verdict: Verdict = Verdict.FAILED) -> Check:
+def of_error(name: str, error: DeviceError, expected: str, verdict: Grade = Grade.FAILED) -> Diagnosis:
     """The check that failed with an error of a device."""
     reply = f" It answered {error.reply!r}." if error.reply else ""
     found = f"{error.problem[:1].upper()}{error.problem[1:]}.{reply}"
-    return Check(name, verdict, found, error.expected or expected, error.advice)
+    return Diagnosis(name, verdict, found, error.expected or expected, error.advice)

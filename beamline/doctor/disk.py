@@ -13,8 +13,8 @@ from typing import IO, Protocol
 import numpy as np
 
 from beamline.core.text import size
-from beamline.doctor.check import Check, Verdict
-from beamline.doctor.needs import Needs
+from beamline.doctor.check import Diagnosis, Grade
+from beamline.doctor.needs import ScanNeeds
 from beamline.scan.preflight import free_bytes
 from drivers.clock import Clock
 
@@ -73,22 +73,24 @@ def measure(
         return Measured(written, clock.now() - began)
 
 
-def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = temporary) -> Check:
+def speed(folder: Path, needs: ScanNeeds | None, clock: Clock, opens: Opens = temporary) -> Diagnosis:
     """Write speed of the disk that holds `folder`, or will hold it, against the rate of the frames."""
     expected = "" if needs is None else f"{size(needs.rate)}/s, with previews, at the highest frame rate"
     there = existing(folder)
     # The file is temporary, but must not fill the disk even for a moment.
     most = min(MOST, shutil.disk_usage(there).free // 4)
     if most < LEAST:
-        return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} has too little free space for a measurement.", expected)
+        return Diagnosis(SPEED, Grade.CANNOT_CHECK, f"{there} has too little free space for a measurement.", expected)
     try:
         measured = measure(there, clock, opens, most)
     except OSError as error:
         if error.errno == errno.EINVAL:  # a file system without fsync
-            return Check(SPEED, Verdict.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.", expected)
-        return Check(
+            return Diagnosis(
+                SPEED, Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.", expected
+            )
+        return Diagnosis(
             SPEED,
-            Verdict.FAILED,
+            Grade.FAILED,
             f"{there} cannot be written to ({error.strerror or error}).",
             expected or "a folder in which files can be created",
             "Choose another storage.folder, or correct its permissions or its disk",
@@ -97,34 +99,34 @@ def speed(folder: Path, needs: Needs | None, clock: Clock, opens: Opens = tempor
     found = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, synchronised)."
     values = {"bytes_per_s": rate, "written": measured.n_bytes, "seconds": measured.seconds}
     if needs is None:
-        return Check(SPEED, Verdict.OK, found, values=values)
+        return Diagnosis(SPEED, Grade.OK, found, values=values)
     backlog = needs.backlog(rate)
     values |= {"needed_bytes_per_s": needs.rate, "backlog": backlog, "waiting_bytes": needs.waiting_bytes}
     if rate >= COMFORT * needs.rate:
-        return Check(SPEED, Verdict.OK, found, expected, values=values)
+        return Diagnosis(SPEED, Grade.OK, found, expected, values=values)
     if backlog <= needs.waiting_bytes / 2:
         found += f" At most {size(backlog)} will wait in memory, which has room for {size(needs.waiting_bytes)}."
         advice = "Let no other program write to this disk during the scan, or choose a faster disk"
-        return Check(SPEED, Verdict.WARNING, found, expected, advice, values)
+        return Diagnosis(SPEED, Grade.WARNING, found, expected, advice, values)
     found += f" {size(backlog)} would have to wait in memory, which has room for {size(needs.waiting_bytes)}."
     advice = "Choose a storage.folder on a faster disk, or a longer period, a smaller roi or binning"
-    return Check(SPEED, Verdict.FAILED, found, expected, advice, values)
+    return Diagnosis(SPEED, Grade.FAILED, found, expected, advice, values)
 
 
-def room(folder: Path, needs: Needs | None) -> Check:
+def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:
     """Free space against the size of the file."""
     free = free_bytes(folder)
     found, values = f"{size(free)} free for {folder.absolute()}.", {"free_bytes": free}
     if needs is None:
-        return Check(ROOM, Verdict.OK, found, values=values)
+        return Diagnosis(ROOM, Grade.OK, found, values=values)
     values["needed_bytes"] = needs.file_bytes
     expected = f"{size(needs.file_bytes)} for the scan and a tenth more; as much again for its reconstruction"
     if free < needs.file_bytes:
         advice = "Free some space, choose another storage.folder, or reduce views, roi or binning"
-        return Check(ROOM, Verdict.FAILED, found, expected, advice, values)
+        return Diagnosis(ROOM, Grade.FAILED, found, expected, advice, values)
     if free < 2 * needs.file_bytes:
-        return Check(ROOM, Verdict.WARNING, found, expected, "Free some space before the next scan", values)
-    return Check(ROOM, Verdict.OK, found, expected, values=values)
+        return Diagnosis(ROOM, Grade.WARNING, found, expected, "Free some space before the next scan", values)
+    return Diagnosis(ROOM, Grade.OK, found, expected, values=values)
 
 
 def existing(folder: Path) -> Path:

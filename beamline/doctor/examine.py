@@ -9,12 +9,12 @@ from typing import Any
 
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
 from beamline.config.load import Config
-from beamline.config.models import Storage
+from beamline.config.models import StorageSection
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.doctor import camera, disk
-from beamline.doctor.check import Check, Verdict, of_error
-from beamline.doctor.needs import Needs, needs, ring_bytes
+from beamline.doctor.check import Diagnosis, Grade, of_error
+from beamline.doctor.needs import ScanNeeds, needs, ring_bytes
 from beamline.doctor.ports import port, ports
 from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run
@@ -26,7 +26,7 @@ from drivers.serial.ports import SerialPort, serial_ports
 _MEMORY, _RATE = "memory", "frame rate"
 
 
-def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Check]:
+def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: Any = None) -> Iterator[Diagnosis]:
     """Check the camera's link and library, ports, disk and memory. Nothing moves and nothing is overwritten.
 
     Args:
@@ -47,20 +47,20 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
         yield camera.library(cam, session)
     else:
         for name in (camera.LINK, camera.LIBRARY):
-            yield Check(name, Verdict.NOT_APPLICABLE, "The camera is simulated.")
+            yield Diagnosis(name, Grade.NOT_APPLICABLE, "The camera is simulated.")
     found = serial_ports()
     if config is None:
         yield ports(found)
     else:
         yield port("stage port", config.devices.stage.port, found)
         yield from _monitor(config.devices.beam_monitor, found, clock)
-    folder = Path((Storage() if config is None else config.storage).folder)
+    folder = Path((StorageSection() if config is None else config.storage).folder)
     yield disk.room(folder, need)
     yield disk.speed(folder, need, clock)
     yield memory(free_memory(), need)
 
 
-def frame_rate(worked: DryRun) -> Check:
+def frame_rate(worked: DryRun) -> Diagnosis:
     """Frames/s and bytes/s of the scan's blocks against what camera and link give."""
     frame, most = worked.timeline.frame_bytes, 1 / worked.camera.min_period
 
@@ -76,17 +76,17 @@ def frame_rate(worked: DryRun) -> Check:
     expected = f"at most {said(most)}, which camera and link give"
     values = {"frames_per_s": fastest, "bytes_per_s": fastest * frame, "most_frames_per_s": most}
     if fastest <= most * (1 + 1e-9):
-        return Check(_RATE, Verdict.OK, found, expected, values=values)
-    return Check(_RATE, Verdict.FAILED, found, expected, "`beamline check` says which limits it breaks", values)
+        return Diagnosis(_RATE, Grade.OK, found, expected, values=values)
+    return Diagnosis(_RATE, Grade.FAILED, found, expected, "`beamline check` says which limits it breaks", values)
 
 
-def _needs(config: Config, worked: DryRun) -> Needs:
+def _needs(config: Config, worked: DryRun) -> ScanNeeds:
     cam = config.devices.camera
     ring = ring_bytes(worked.timeline, cam.ring_mb * 1_000_000) if isinstance(cam, DcamOrca) else 0
     return needs(worked, ring)
 
 
-def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Clock) -> Iterator[Check]:
+def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
     """The beam monitor, if one is configured: its port, and one reading."""
     name = "beam monitor"
     if isinstance(config, NoBeamMonitor):
@@ -94,7 +94,7 @@ def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Cloc
     if isinstance(config, ElectrometerConfig):
         of_port = port(f"{name} port", config.port, found)
         yield of_port
-        if of_port.verdict in (Verdict.FAILED, Verdict.NOT_APPLICABLE):
+        if of_port.verdict in (Grade.FAILED, Grade.NOT_APPLICABLE):
             return
     try:
         with closing(make_beam_monitor(config, clock)) as monitor:
@@ -103,10 +103,10 @@ def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Cloc
         yield of_error(name, error, "a reading")
         return
     values = {"value": reading.value, "unit": reading.unit}
-    yield Check(name, Verdict.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+    yield Diagnosis(name, Grade.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
 
 
-def memory(free: int | None, needs: Needs | None) -> Check:
+def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:
     """Free memory against a scan's need.
 
     Args:
@@ -120,9 +120,9 @@ def memory(free: int | None, needs: Needs | None) -> Check:
         expected = " and ".join(parts) + ", besides the live reconstruction"
         values |= {"needed_bytes": needs.memory, "ring_bytes": needs.ring_bytes}
     if free is None:
-        return Check(_MEMORY, Verdict.CANNOT_CHECK, "This system does not report its free memory.", expected)
+        return Diagnosis(_MEMORY, Grade.CANNOT_CHECK, "This system does not report its free memory.", expected)
     found = f"{size(free)} free."
     if needs is None or free >= 2 * needs.memory:
-        return Check(_MEMORY, Verdict.OK, found, expected, values=values)
+        return Diagnosis(_MEMORY, Grade.OK, found, expected, values=values)
     advice = "Close other programs, or choose a smaller roi or binning"
-    return Check(_MEMORY, Verdict.WARNING if free >= needs.memory else Verdict.FAILED, found, expected, advice, values)
+    return Diagnosis(_MEMORY, Grade.WARNING if free >= needs.memory else Grade.FAILED, found, expected, advice, values)

@@ -12,7 +12,7 @@ from beamline.scan.recorder import WAITING_BYTES, WAITING_FRAMES
 
 
 @dataclass(frozen=True)
-class Needs:
+class ScanNeeds:
     """The disk and memory that a scan needs.
 
     Attributes:
@@ -45,7 +45,7 @@ class Needs:
         return most
 
 
-def needs(worked: DryRun, ring_bytes: int) -> Needs:
+def needs(worked: DryRun, ring_bytes: int) -> ScanNeeds:
     """The needs of a planned scan.
 
     Args:
@@ -53,7 +53,7 @@ def needs(worked: DryRun, ring_bytes: int) -> Needs:
     """
     timeline = worked.timeline
     per_row = timeline.total_bytes // timeline.n_frames
-    return Needs(
+    return ScanNeeds(
         stretches=tuple((block.n * per_row, block.n * block.period) for block in timeline.blocks),
         waiting_bytes=waiting_frames(timeline.frame_bytes) * timeline.frame_bytes,
         ring_bytes=ring_bytes,
@@ -68,7 +68,7 @@ def waiting_frames(frame_bytes: int) -> int:
 
 
 def ring_bytes(timeline: Timeline, most: int) -> int:
-    """Memory of the camera's ring buffer for the longest block, at most `most` bytes: one slot more than frames and at
+    """Memory of the camera's ring buffer for the longest block, at most `most` bytes. One slot more than frames and at
     least 16, like the driver."""
     frames = max(block.n for block in timeline.blocks)
     slots = max(2, min(max(frames + 1, 16), most // timeline.frame_bytes))

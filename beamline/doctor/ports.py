@@ -9,19 +9,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from beamline.doctor.check import Check, Verdict
+from beamline.doctor.check import Diagnosis, Grade
 from drivers.serial.ports import SerialPort
 
 CONNECT_TIMEOUT = 2.0
 """s for a TCP connection."""
 
 
-def ports(found: Sequence[SerialPort]) -> Check:
+def ports(found: Sequence[SerialPort]) -> Diagnosis:
     """All serial ports of this computer."""
     listed = "; ".join(map(str, found)) or "none"
-    return Check(
+    return Diagnosis(
         "serial ports",
-        Verdict.OK if found else Verdict.WARNING,
+        Grade.OK if found else Grade.WARNING,
         f"{listed}.",
         "the adapter of a stage on a serial line (a stage on the network shows none)",
         "" if found else "Plug the adapter in; on Linux `dmesg` shows whether the system recognised it",
@@ -29,7 +29,7 @@ def ports(found: Sequence[SerialPort]) -> Check:
     )
 
 
-def port(name: str, url: str, found: Sequence[SerialPort]) -> Check:
+def port(name: str, url: str, found: Sequence[SerialPort]) -> Diagnosis:
     """One device's port.
 
     Args:
@@ -38,34 +38,34 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Check:
         found: the serial ports of this computer.
     """
     if url.lower().startswith("sim://"):
-        return Check(name, Verdict.NOT_APPLICABLE, f"{url} is simulated.")
+        return Diagnosis(name, Grade.NOT_APPLICABLE, f"{url} is simulated.")
     if url.lower().startswith("socket://"):
         return _network(name, url)
     if "://" in url:
-        return Check(name, Verdict.CANNOT_CHECK, f"{url} can only be tried by opening it.")
+        return Diagnosis(name, Grade.CANNOT_CHECK, f"{url} can only be tried by opening it.")
     listed = "; ".join(map(str, found)) or "no serial ports"
     known = next((one for one in found if _same(one.device, url)), None)
     values = {"port": url, "ports": [vars(one) for one in found]}
     if known is None and (sys.platform == "win32" or not Path(url).exists()):
-        return Check(
+        return Diagnosis(
             name,
-            Verdict.FAILED,
+            Grade.FAILED,
             f"There is no port {url}; there are {listed}.",
             f"the port {url} of the configuration",
-            "Plug the adapter in, switch the controller on, and set the port to one of those found; a name "
-            "under /dev/serial/by-id stays the same when adapters are plugged in another order",
+            "Plug the adapter in, switch the controller on, and set the port to one of those found. A name under "
+            "/dev/serial/by-id stays the same when adapters are plugged in another order",
             values,
         )
     if sys.platform != "win32" and not os.access(url, os.R_OK | os.W_OK):
-        return Check(
+        return Diagnosis(
             name,
-            Verdict.FAILED,
+            Grade.FAILED,
             f"{known or url} may not be opened by this user.",
             f"permission to read and write {url}",
             "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again",
             values,
         )
-    return Check(name, Verdict.OK, f"{known or url}.", f"the port {url} of the configuration", values=values)
+    return Diagnosis(name, Grade.OK, f"{known or url}.", f"the port {url} of the configuration", values=values)
 
 
 def _same(device: str, url: str) -> bool:
@@ -74,7 +74,7 @@ def _same(device: str, url: str) -> bool:
     return device == url or Path(device).resolve() == Path(url).resolve()
 
 
-def _network(name: str, url: str) -> Check:
+def _network(name: str, url: str) -> Diagnosis:
     """A TCP connection, opened and closed without sending anything."""
     expected = f"a controller that accepts connections at {url}"
     try:
@@ -83,18 +83,18 @@ def _network(name: str, url: str) -> Check:
     except ValueError:
         host, number = "", None
     if not host or not number:
-        return Check(
-            name, Verdict.FAILED, f"{url} is not an address.", "socket://host:port", "Correct the configuration"
+        return Diagnosis(
+            name, Grade.FAILED, f"{url} is not an address.", "socket://host:port", "Correct the configuration"
         )
     try:
         socket.create_connection((host, number), CONNECT_TIMEOUT).close()
     except OSError as error:
-        return Check(
+        return Diagnosis(
             name,
-            Verdict.FAILED,
+            Grade.FAILED,
             f"{host}:{number} accepts no connection ({error}).",
             expected,
-            "Check the controller's power, its address and port on its panel, the network, and that no other program "
-            "is connected: many controllers accept only one connection",
+            "Check the controller's power, its address and port on its panel, and the network. Close other programs: "
+            "many controllers accept only one connection",
         )
-    return Check(name, Verdict.OK, f"{host}:{number} accepts connections.", expected)
+    return Diagnosis(name, Grade.OK, f"{host}:{number} accepts connections.", expected)

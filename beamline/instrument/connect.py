@@ -12,19 +12,19 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from beamline.config.devices import DcamOrca, NoBeamMonitor, StageOutputShutter
+from beamline.config.devices import DcamOrca, NoBeamMonitor, SimulatedOrca, StageOutputShutter
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError
 from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.instrument.cameras import make_camera, wait_until_cold
 from beamline.instrument.operator import ask_operator
-from beamline.instrument.simulated import Simulated, clock_of, scene_of, simulated_devices
-from drivers import orca_quest
+from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_devices
 from drivers.clock import Clock, SystemClock
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualSampleMover, ManualShutter
 from drivers.protocols import (
     BeamMonitor,
+    Camera,
     CameraSettings,
     CameraTiming,
     Devices,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Instrument:
+class ConnectedDevices:
     """Connected devices and what goes with them; leaving a `with` block closes them.
 
     Attributes:
@@ -54,7 +54,7 @@ class Instrument:
 
     devices: Devices
     clock: Clock
-    simulated: Simulated | None
+    simulated: SimulatedScene | None
     close: Callable[[], None]
     beam_monitor: BeamMonitor | None = None
     frame_memory: FrameMemory | None = None
@@ -73,7 +73,7 @@ class Instrument:
 
 def connect(
     config: Config, clock: Clock | None = None, ask: Ask | None = None, check_stop: Callable[[], None] = lambda: None
-) -> Instrument:
+) -> ConnectedDevices:
     """Open every device that the configuration names. Nothing moves.
 
     Args:
@@ -96,7 +96,7 @@ def connect(
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        return Instrument(devices, clock, simulated, opened.pop_all().close, monitor, memory)
+        return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory)
 
 
 @contextmanager
@@ -111,7 +111,7 @@ def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[Rotation
             yield instrument.devices.stage
         return
     chosen = config.devices.stage
-    with closing(chosen.settings.connect(chosen.port, clock or SystemClock())) as stage:
+    with closing(chosen.connect(clock or SystemClock())) as stage:
         yield stage
 
 
@@ -130,9 +130,8 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     if config.simulation is not None:
         scene_of(config)
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
-    link = config.devices.camera.link if isinstance(config.devices.camera, DcamOrca) else "usb3"
     try:
-        timing = orca_quest.timing(settings, link)
+        timing = config.devices.camera.timing_of(settings)
     except ValueError as error:
         raise ConfigError(f"devices.camera: {error}. Nothing was started.") from None
     return limits, timing, Travel("stage", limits).to_counts
@@ -148,14 +147,19 @@ def _instrument(
     config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack, memory: FrameMemory
 ) -> Devices:
     chosen = config.devices.camera
-    if not isinstance(chosen, DcamOrca):
+    if isinstance(chosen, SimulatedOrca):
         raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
-    stage = config.devices.stage.settings.connect(config.devices.stage.port, clock)
+    stage = config.devices.stage.connect(clock)
     opened.callback(stage.close)
-    camera = make_camera(chosen, clock, memory)
-    opened.callback(camera.close)
-    if chosen.cool_s:
-        wait_until_cold(camera, chosen.cool_s, clock, check_stop)
+    camera: Camera
+    if isinstance(chosen, DcamOrca):
+        camera = orca = make_camera(chosen, clock, memory)
+        opened.callback(camera.close)
+        if chosen.cool_s:
+            wait_until_cold(orca, chosen.cool_s, clock, check_stop)
+    else:
+        camera = chosen.connect(clock)
+        opened.callback(camera.close)
     return Devices(stage, camera, shutter_of(config, stage, clock, ask), ManualSampleMover(ask))
 
 

@@ -13,7 +13,7 @@ from uuid import uuid4
 
 from beamline.config.devices import StageOutputShutter
 from beamline.config.load import Config, config_folder, scene_mapping
-from beamline.config.models import Simulation, Speed
+from beamline.config.models import SimulationSection, Speed
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
 from drivers.clock import Clock, SystemClock
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Simulated:
+class SimulatedScene:
     """What is known of a simulated scene and cannot be known at an instrument.
 
     Attributes:
@@ -47,8 +47,8 @@ class Simulated:
 
 
 def simulated_devices(
-    config: Config, simulation: Simulation, clock: Clock, opened: ExitStack
-) -> tuple[Devices, Simulated]:
+    config: Config, simulation: SimulationSection, clock: Clock, opened: ExitStack
+) -> tuple[Devices, SimulatedScene]:
     """Every device of the configuration, connected, and what is known of the simulated scene.
 
     Args:
@@ -71,7 +71,7 @@ def simulated_devices(
     except ValueError as error:
         raise ConfigError(f"devices.stage.{error}. Nothing was started.") from error
     # A name of its own for every connection: two in one process must not share a controller.
-    stage = chosen.settings.connect(register(f"{chosen.kind}-{uuid4().hex}", controller), clock)
+    stage = chosen.connect(clock, register(f"{chosen.kind}-{uuid4().hex}", controller))
     opened.callback(stage.close)
     shutter: Shutter = SimulatedShutter()
     blade: BeamGate = shutter
@@ -83,7 +83,7 @@ def simulated_devices(
     pitch = config.optics.pixel_size_um * 1e-3
     camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
     opened.callback(camera.close)
-    known = Simulated(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
+    known = SimulatedScene(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
     return Devices(stage, camera, shutter, sample), known
 
 

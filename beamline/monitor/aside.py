@@ -25,7 +25,7 @@ class Aside:
     wider: int = 0
 
     def with_frame(self, context: ScanContext) -> Aside:
-        """After the next frame, of which the checks knew `context`."""
+        """After the next frame; the checks knew `context` of it."""
         if context.view is None or context.grid is None:
             return self
         return Aside(

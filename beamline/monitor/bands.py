@@ -1,9 +1,9 @@
 """Bands: rows or columns that lose or gain light at once while the others do not: a lost packet, a slit that moved.
 
 A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
-column is compared with what the views before let expect (it goes on as it did), and what all have in common is the
-beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their neighbours as they did
-at its beginning.
+column is compared with the value expected from the views before. A change that all have in
+common is the beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their neighbours
+as they did at its beginning.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pydantic import Field
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light
-from beamline.monitor.view import Region
+from beamline.monitor.view import PixelBox
 from drivers.frame import Frame, FrameKind
 
 CALIBRATION = 5  # frames of a kind before a verdict
@@ -72,7 +72,7 @@ class BandsState:
 
 
 @dataclass(frozen=True)
-class Bands:
+class BandsCheck:
     """Score: fraction of its light that a preview row or column has lost (negative: gained).
 
     The default: two black rows across two preview blocks of 8 take an eighth of the light of each.
@@ -131,7 +131,7 @@ class Bands:
                 region = (first, after, 0, shape[1]) if axis == 0 else (0, shape[0], first, after)
         return (rows, cols), self._flag(frame.index, score, limit, region, word)
 
-    def _flag(self, view: int, score: float, limit: float, region: Region, word: str) -> Flag:
+    def _flag(self, view: int, score: float, limit: float, region: PixelBox, word: str) -> Flag:
         first, after = region[:2] if word == "rows" else region[2:]
         advice = (
             f"Within {word} {first} ... {after - 1} the light {'fell' if score > 0 else 'rose'} by up to "

@@ -2,8 +2,8 @@
 
 Against the flats it is judged where there is air: the brightest of the places in a view. It is a drift: said once, and
 again only after it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
-air. These changes have errors of one sign where dense particles turn fast, which would sum up to a dip: one counts only
-where the light of the whole view moved with it.
+air. These changes have errors of one sign where dense particles turn fast; these would sum up to a dip. A change counts
+only where the light of the whole view moved with it.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from beamline.monitor.change import Change
+from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light, more_light
-from beamline.monitor.scatter import Scatter
-from beamline.monitor.view import Cells, Grid, View
+from beamline.monitor.scatter import FrameScatter
+from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.frame import Frame, FrameKind
 
-PLACES = (4, 16)  # parts of the field, down and across, the brightest of which is air
+PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
 COVERED = 0.1  # light that the brightest place has less than the flats: there is no air, or the beam fell before
 LASTS = 5  # views that a drift must last
 GONE = 0.5  # of the limit, below which a drift has gone
@@ -45,8 +45,8 @@ class BeamState:
         usual: level that is normal.
         dipping: views in a row with a dip.
         whole: logarithm of the light of the whole view before; NaN before any.
-        changes: of the light from view to view, none larger than half of `alarm`: so that one dip is no scatter, and
-            the limit at most 3.8 times `alarm`.
+        changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the
+            limit is at most 3.8 times `alarm`.
     """
 
     drifting: int = 0
@@ -56,15 +56,15 @@ class BeamState:
     usual: float = 0.0
     dipping: int = 0
     whole: float = math.nan
-    changes: Scatter = field(default_factory=Scatter)
+    changes: FrameScatter = field(default_factory=FrameScatter)
 
 
 @dataclass(frozen=True)
-class Beam:
+class BeamCheck:
     """Score: fraction of the light that is gone (negative: there is more).
 
-    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, which air beside the sample
-    allows; 10 % at once are no drift of a ring.
+    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, as air beside the sample
+    allows. 10 % at once are no drift of a ring.
     """
 
     name: ClassVar[str] = "beam"
@@ -98,7 +98,9 @@ class Beam:
         advice = f"{_size(score)} light than in the flats before. Take flats more often."
         return Flag(self.name, level, row, score, limit, advice)
 
-    def _dip(self, state: BeamState, row: int, change: Change | None, whole: float) -> tuple[BeamState, Flag | None]:
+    def _dip(
+        self, state: BeamState, row: int, change: SampleChange | None, whole: float
+    ) -> tuple[BeamState, Flag | None]:
         """A dip or a flash of more than `dip` is flagged in every view, until it is over or has become normal."""
         moved, state = whole - state.whole, replace(state, whole=whole)
         if change is None:
@@ -117,13 +119,13 @@ class Beam:
         )
         return replace(state, dipping=state.dipping + 1), Flag(self.name, Level.ALARM, row, score, limit, advice)
 
-    def _drift(self, state: BeamState, row: int, view: View, grid: Grid) -> Look[BeamState]:
+    def _drift(self, state: BeamState, row: int, view: CellView, grid: CellGrid) -> Look[BeamState]:
         score = -math.expm1(-_air(view, grid))
         if score > COVERED:
             if state.covered:
                 return Look(replace(state, drifting=0))
             advice = (
-                f"No part of the frame gets more than {1 - score:.0%} of the flats' light: the sample covers all of "
+                f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
                 "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
@@ -142,13 +144,13 @@ def _size(score: float) -> str:
     return f"{abs(score):.1%} {'less' if score > 0 else 'more'}"
 
 
-def _whole(view: View, grid: Grid) -> float:
+def _whole(view: CellView, grid: CellGrid) -> float:
     """Logarithm of the mean transmission of the lit cells; NaN where none is."""
     lit = grid.lit > 0
     return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan
 
 
-def _air(view: View, grid: Grid) -> float:
+def _air(view: CellView, grid: CellGrid) -> float:
     """Mean line integral of the brightest place of the lit field: 0 in air."""
     depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
     down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
@@ -157,7 +159,7 @@ def _air(view: View, grid: Grid) -> float:
     return float(means.min()) if means.size else 0.0
 
 
-def _places(image: Cells, down: int, across: int) -> Cells:
+def _places(image: CellValues, down: int, across: int) -> CellValues:
     """Sums over a grid of places."""
     rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)

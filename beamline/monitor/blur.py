@@ -2,8 +2,8 @@
 
 The figure is the contrast of second differences over two pixels against that of first differences over four, along the
 rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
-product of a difference and the same difference a line beside it: noise is independent from line to line and adds
-nothing on average, however few the photons, while edges go on. The light's level and a smooth beam cancel.
+product of a difference and the same difference a line beside it. Noise is independent from line to line and adds
+nothing on average, however few the photons; edges go on. The light's level and a smooth beam cancel.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pydantic import Field
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import Scatter
-from beamline.monitor.view import Cells
+from beamline.monitor.scatter import FrameScatter
+from beamline.monitor.view import CellValues
 from drivers.frame import Frame, FrameKind
 
 PIXELS = 2**16  # of a frame that are looked at, about
@@ -49,17 +49,17 @@ class BlurState:
 
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
-    dark: Cells | None = None
-    flat: Cells | None = None
-    across: Scatter = field(default_factory=Scatter)
-    down: Scatter = field(default_factory=Scatter)
-    first: tuple[Scatter, Scatter] | None = None
+    dark: CellValues | None = None
+    flat: CellValues | None = None
+    across: FrameScatter = field(default_factory=FrameScatter)
+    down: FrameScatter = field(default_factory=FrameScatter)
+    first: tuple[FrameScatter, FrameScatter] | None = None
     blurred: int = 0
     said: bool = False
 
 
 @dataclass(frozen=True)
-class Blur:
+class BlurCheck:
     """Score: share of its fine contrast that a view has lost against the views before.
 
     The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
@@ -83,7 +83,7 @@ class Blur:
         if context.view is None:
             return Look(state)
         if not context.follows:  # a sample may be less sharp from there
-            state = replace(state, across=Scatter(), down=Scatter(), blurred=0)
+            state = replace(state, across=FrameScatter(), down=FrameScatter(), blurred=0)
         across, down = sharpness(_lines(frame), state.dark, state.flat)
         after = replace(state, kind=frame.kind, across=_updated(state.across, across), down=_updated(state.down, down))
         if not after.across.ready:
@@ -105,7 +105,7 @@ class Blur:
         )
         return Look(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 
-    def _limit(self, usual: Scatter) -> float:
+    def _limit(self, usual: FrameScatter) -> float:
         return max(self.warn, SIGMAS * usual.sigma / usual.mean) if usual.mean > 0 else 1.0
 
     def _slow(self, state: BlurState, row: int) -> Look[BlurState]:
@@ -122,7 +122,7 @@ class Blur:
         return Look(replace(state, said=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
 
 
-def sharpness(lines: NDArray[Any], dark: Cells | None, flat: Cells | None) -> tuple[float, float]:
+def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
     """Fine contrast over coarse, along the rows and along the columns; NaN where there is none.
 
     Args:
@@ -164,17 +164,17 @@ def _with_reference(state: BlurState, frame: Frame) -> BlurState:
     return state
 
 
-def _mean(so_far: Cells | None, lines: Cells, n: int) -> Cells:
+def _mean(so_far: CellValues | None, lines: CellValues, n: int) -> CellValues:
     return lines if so_far is None or n == 1 else so_far + (lines - so_far) / np.float32(n)
 
 
-def _updated(usual: Scatter, figure: float) -> Scatter:
+def _updated(usual: FrameScatter, figure: float) -> FrameScatter:
     if not math.isfinite(figure):
         return usual
-    return usual.with_figure(figure) if usual.n else Scatter(1, figure)
+    return usual.with_figure(figure) if usual.n else FrameScatter(1, figure)
 
 
-def _loss(now: float, usual: Scatter) -> float:
+def _loss(now: float, usual: FrameScatter) -> float:
     return 1 - now / usual.mean if usual.mean > 0 else 0.0
 
 

@@ -4,8 +4,8 @@ Between neighbouring views each cell goes on as it did: depth + velocity, from t
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
 stage other than the last ones (turn). For the columns of the fit: d depth = -gain - across d/dx - down d/dy + turn
 velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The first pass
-weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964), so
-that a floater, a zinger or a band moves nothing.
+weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964). So a
+floater, a zinger or a band moves nothing.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from itertools import pairwise
 import numpy as np
 
 from beamline.core.jit import njit
-from beamline.monitor.view import Cells, Grid, View
+from beamline.monitor.view import CellGrid, CellValues, CellView
 
-SPAN = 4  # views before, of which the velocity is the mean of three steps
+SPAN = 4  # views before; the velocity is the mean of their three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
 LEAST_VARYING = 0.1  # of what a shift changes, which must differ from row to row
 MOST_STEPS = 4  # steps that a gap may have: after a longer one, velocities say nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class SampleChange:
     """The change from the view before.
 
     Attributes:
@@ -43,7 +43,7 @@ class Change:
     across: float
     down: float
     turn: float
-    residual: Cells
+    residual: CellValues
     noise: float
     causes: Causes | None = None
 
@@ -79,19 +79,19 @@ class Causes:
         cell: pixels a side.
     """
 
-    image: Cells
-    turning: Cells
-    weight: Cells
+    image: CellValues
+    turning: CellValues
+    weight: CellValues
     steps: float
     cell: int
 
-    def basis(self) -> Cells:
+    def basis(self) -> CellValues:
         """[cause, row, col]: what a pixel across, a pixel down and a turn of a step change."""
         down, across = np.gradient(self.image)
         return np.stack([-across / self.cell, -down / self.cell, self.turning * np.float32(self.steps)])
 
 
-def change_of(view: View, before: Sequence[View], grid: Grid) -> Change | None:
+def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> SampleChange | None:
     """The change of a view from those before it, oldest first; None without SPAN of them at steps like the last one."""
     if len(before) < SPAN:
         return None
@@ -118,10 +118,12 @@ def change_of(view: View, before: Sequence[View], grid: Grid) -> Change | None:
     )
     gain, across, down, turn, noise = (float(x) for x in found)
     causes = Causes(image, turning, weight, float(steps), grid.cell)
-    return Change(math.expm1(-gain), across * grid.cell, down * grid.cell, turn / float(steps), residual, noise, causes)
+    return SampleChange(
+        math.expm1(-gain), across * grid.cell, down * grid.cell, turn / float(steps), residual, noise, causes
+    )
 
 
-def _steps(view: View, last: Sequence[View]) -> float | None:
+def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
     """Steps since the view before: 1, more where views between were not used; None where the angles are uneven."""
     usual = (last[-1].angle - last[0].angle) / (SPAN - 1)
     if not math.isfinite(usual) or usual == 0:

@@ -15,10 +15,10 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.change import Change
+from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.spots import NO_SPOTS, Spots
-from beamline.monitor.view import Cells, Grid, Region, View
+from beamline.monitor.view import CellGrid, CellValues, CellView, PixelBox
 from drivers.frame import Frame
 
 State = TypeVar("State")
@@ -61,7 +61,7 @@ class Flag:
     score: float
     limit: float
     advice: str
-    region: Region | None = None
+    region: PixelBox | None = None
     first: int | None = None
 
     @property
@@ -83,8 +83,8 @@ class ScanContext:
         stored: views that are in an earlier file of the scan.
         cone: the beam is one; else it is parallel.
         axis_col: the axis as the scan states it, in columns of pixels; None where it does not.
-        model: line integrals that a volume has at an angle in radians, float32 [row, col] means of cells of so many
-            pixels a side; None where no volume is known.
+        model: line integrals of a volume at an angle in radians, float32 [row, col] means of cells of so many pixels a
+            side. None where no volume is known.
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
@@ -107,17 +107,17 @@ class ScanContext:
     stored: frozenset[int] = frozenset()
     cone: bool = False
     axis_col: float | None = None
-    model: Callable[[float, int], Cells] | None = None
+    model: Callable[[float, int], CellValues] | None = None
     dark: NDArray[np.float32] | None = None
     flat: NDArray[np.float32] | None = None
     flat_exposure: float = math.nan
-    grid: Grid | None = None
+    grid: CellGrid | None = None
     spots: Spots = NO_SPOTS
     follows: bool = True
     light_left: float = 1.0
-    view: View | None = None
+    view: CellView | None = None
     truncated: bool = False
-    change: Change | None = None
+    change: SampleChange | None = None
 
 
 @dataclass(frozen=True, eq=False)

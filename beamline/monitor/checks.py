@@ -6,10 +6,11 @@ legend in a scan file, and its name in `beamline info` follow.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 
 from beamline.monitor.check import Check, Flag, Level
+from drivers.plugins import plugins
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
 BITS = (*range(16), *range(32, 48))  # that a check may have, in the order in which they are given away
@@ -17,24 +18,24 @@ ALARMS = sum(1 << bit + ALARM_SHIFT for bit in BITS)  # a frame with any of thes
 
 
 REGISTRY = {  # module in this folder: class of the check
-    "beam": "Beam",
-    "saturation": "Saturation",
-    "stuck": "Stuck",
-    "bands": "Bands",
-    "timing": "Timing",
-    "mass": "Mass",
-    "dark": "Dark",
-    "lost": "Lost",
-    "gain": "Gain",
-    "motion": "Motion",
-    "floater": "Floater",
-    "ghost": "Ghost",
-    "pixels": "Pixels",
-    "field": "FieldOfView",
-    "blur": "Blur",
-    "zingers": "Zingers",
-    "opposite": "Opposite",
-    "model": "Model",
+    "beam": "BeamCheck",
+    "saturation": "SaturationCheck",
+    "stuck": "StuckCheck",
+    "bands": "BandsCheck",
+    "timing": "TimingCheck",
+    "mass": "MassCheck",
+    "dark": "DarkCheck",
+    "lost": "LostCheck",
+    "gain": "GainCheck",
+    "motion": "MotionCheck",
+    "floater": "FloaterCheck",
+    "ghost": "GhostCheck",
+    "pixels": "PixelsCheck",
+    "field": "FieldOfViewCheck",
+    "blur": "BlurCheck",
+    "zingers": "ZingersCheck",
+    "opposite": "OppositeCheck",
+    "model": "ModelCheck",
 }
 
 
@@ -47,9 +48,23 @@ def _distinct(*checks: Check) -> tuple[Check, ...]:
     return checks
 
 
-CHECKS: tuple[Check, ...] = _distinct(
-    *(getattr(import_module(f"beamline.monitor.{module}"), name)() for module, name in REGISTRY.items())
-)
+def _plugged(ours: tuple[Check, ...]) -> tuple[Check, ...]:
+    """Those of other packages."""
+    found = ours
+
+    def made(name: str, kind: Callable[[], Check]) -> Check:
+        nonlocal found
+        check = kind()
+        if check.name != name:
+            raise ValueError(f"its class calls itself {check.name!r}; expected the entry point's name")
+        found = _distinct(*found, check)
+        return check
+
+    return tuple(plugins("check", {check.name for check in ours}, made).values())
+
+
+_OURS = _distinct(*(getattr(import_module(f"beamline.monitor.{module}"), name)() for module, name in REGISTRY.items()))
+CHECKS: tuple[Check, ...] = (*_OURS, *_plugged(_OURS))
 """All checks with their default limits, in the order in which they look at a frame."""
 
 _BITS = {check.name: check.bit for check in CHECKS}

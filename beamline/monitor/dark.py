@@ -32,7 +32,7 @@ class DarkState:
 
 
 @dataclass(frozen=True)
-class Dark:
+class DarkCheck:
     """Score: dark over flat where the shutter seems open, else counts of drift.
 
     The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.

@@ -33,10 +33,10 @@ class FrameDigest:
         invalid_fraction: pixels that are not finite or hold the no-data value, over all pixels.
         saturated_fraction: pixels at or above the saturation value, over all pixels; 0 where none was given.
         entropy: bits; Shannon (1948) entropy of the histogram of 256 equal bins from minimum to maximum
-            (0 for a constant frame, at most 8); for counts, of every k-th row where there are more than 2**20 pixels.
+            (0 for a constant frame, at most 8). For counts, of every k-th row where there are more than 2**20 pixels.
         checksum: CRC-32 (IEEE 802.3) of the pixels in memory order: equal for a frame that was delivered twice.
         preview: float32 [ceil(row / bin), ceil(col / bin)], mean of each block's valid pixels (NaN where there is
-            none); blocks at the lower and right edge are smaller where bin does not divide the shape.
+            none). Blocks at the lower and right edge are smaller where bin does not divide the shape.
         peaks: float32, largest valid pixel of each of these blocks (NaN where there is none).
     """
 
@@ -100,8 +100,8 @@ def checksum_of(image: NDArray[Any]) -> int:
 
 
 def has_checksum(image: NDArray[Any], stored: int) -> bool:
-    """Whether this is its checksum, or that of its bytes swapped: `ingest` wrote such of big-endian frames."""
-    return stored == checksum_of(image) or stored == checksum_of(image.byteswap())
+    """Whether this is its checksum."""
+    return stored == checksum_of(image)
 
 
 Numbers = tuple[float, float, float, float, float, float, float, float]
@@ -150,8 +150,8 @@ def _entropy(histogram: NDArray[Any]) -> float:
 
 @njit(nogil=True, cache=True)
 def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers the types
-    """Sums and largest values of `side` neighbours each, from those of `side` rows: pairs of pairs while `side` is even
-    (and their sums fit into 32 bits), which the compiler makes vector instructions of."""
+    """Sums and largest values of `side` neighbours each, from those of `side` rows. They are pairs of pairs while
+    `side` is even (and their sums fit into 32 bits); the compiler makes vector instructions of them."""
     width = 1
     while side % (2 * width) == 0 and 2 * width * side <= 65536:
         n = sums.size // 2

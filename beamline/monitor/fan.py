@@ -2,10 +2,10 @@
 
 A point of the sample at the distance r from the axis moves by at most r times the angle's step from view to view. In a
 few neighbouring views the sample's line integrals are therefore a sum of patterns, each moving steadily at a speed
-between -limit and +limit: in the Fourier domain a fan, the "bow tie" of a sinogram (Rattey & Lindgren 1981, IEEE Trans.
-ASSP 29:994). With the covariance C of such patterns plus noise, the linear filter that finds a signal s with the best
-ratio to both is C^-1 s (matched filter; North 1943, Robey et al. 1992, IEEE Trans. AES 28:208). What the sample holds
-need not be known.
+between -limit and +limit. In the Fourier domain that is a fan, the "bow tie" of a sinogram (Rattey & Lindgren 1981,
+IEEE Trans. ASSP 29:994). With the covariance C of such patterns plus noise, the linear filter that finds a signal s
+with the best ratio to both is C^-1 s. (Matched filter; North 1943, Robey et al. 1992, IEEE Trans. AES 28:208). What the
+sample holds need not be known.
 
 Lengths are cells, times are views.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.jit import njit
-from beamline.monitor.view import Cells
+from beamline.monitor.view import CellValues
 
 Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
@@ -75,7 +75,7 @@ class Filters:
         speeds: float64 [signal], cells a view.
     """
 
-    weights: Cells
+    weights: CellValues
     strength: Reals
     speeds: Reals
 

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import BRIGHT, UNLIT, Grid, View
+from beamline.monitor.view import BRIGHT, UNLIT, CellGrid, CellView
 from drivers.frame import Frame, FrameKind
 
 LASTS = 5  # views in a row with matter at an edge
@@ -30,11 +30,11 @@ class FieldState:
 
 
 @dataclass(frozen=True)
-class FieldOfView:
+class FieldOfViewCheck:
     """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
 
-    The defaults: a line integral of 0.1 at the edges is a tenth of what a sample has in its middle, and more than phase
-    fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
+    The defaults: a line integral of 0.1 at the edges is a tenth of the value in a sample's middle. It is more than
+    phase fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
     """
 
     name: ClassVar[str] = "field"
@@ -87,13 +87,13 @@ class FieldOfView:
         )
         return Flag(self.name, Level.WARN, frame.index, share, self.unlit, advice, region)
 
-    def _cut(self, row: int, view: View, grid: Grid) -> Flag:
+    def _cut(self, row: int, view: CellView, grid: CellGrid) -> Flag:
         left, right = view.edges
         sides = " and ".join(side for side, depth in (("left", left), ("right", right)) if depth > self.edge)
         advice = (
-            f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there): "
-            "the total absorption says nothing, floaters must be faster to be seen, and reconstructions are brighter "
-            "at the rim."
+            f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there). "
+            f"The total absorption says nothing, floaters must be faster to be seen, and reconstructions are brighter "
+            f"at the rim."
         )
         rows, last = grid.shape[0] * grid.cell, grid.right + 1
         first = grid.left if left >= right else max(last - 2, 0)

@@ -1,9 +1,9 @@
 """Floater: a particle that crosses the field in some views, faster than the sample's turning carries anything.
 
-It is found by filters that are blind to all that turns within the field (beamline.monitor.fan), as peaks of absorption
-that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of the sample
-obeys col = a cos + b sin + c with sqrt(a² + b²) within the sample; a floater's line is steeper than any of these at its
-place.
+It is found by filters that are blind to all that turns within the field (beamline.monitor.fan). It shows as peaks of
+absorption that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of
+the sample obeys col = a cos + b sin + c with sqrt(a² + b²) within the sample; a floater's line is steeper than any of
+these at its place.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
-from beamline.monitor.view import Cells, Grid, View
+from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.frame import Frame
 
 LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
@@ -60,19 +60,19 @@ class FloaterState:
         peaks: of the last views.
     """
 
-    raw: tuple[View, ...] = ()
+    raw: tuple[CellView, ...] = ()
     indices: tuple[int, ...] = ()
-    depths: tuple[Cells, ...] = ()
+    depths: tuple[CellValues, ...] = ()
     filters: Filters | None = None
     step: float = math.nan
     rim: float = math.nan
     light: float = 1.0
-    usual: Cells | None = None
+    usual: CellValues | None = None
     peaks: Peaks = field(default_factory=no_peaks)
 
 
 @dataclass(frozen=True)
-class Floater:
+class FloaterCheck:
     """Score: mean of the filters' outputs along the trail, in standard deviations of what they usually give there."""
 
     name: ClassVar[str] = "floater"
@@ -117,7 +117,7 @@ class Floater:
             return Look(replace(state, peaks=no_peaks()))
         return self._linked(state, frame.index, peaks[:n], grid)
 
-    def _linked(self, state: FloaterState, now: int, new: Peaks, grid: Grid) -> Look[FloaterState]:
+    def _linked(self, state: FloaterState, now: int, new: Peaks, grid: CellGrid) -> Look[FloaterState]:
         """Link the peaks of the view that is judged with those of the views before."""
         judged = state.indices[-1 - LATER]
         new[:, 0] = judged
@@ -136,7 +136,7 @@ class Floater:
         return Look(state, flag)
 
 
-def _with_view(state: FloaterState, view: View, noise: float) -> FloaterState:
+def _with_view(state: FloaterState, view: CellView, noise: float) -> FloaterState:
     """The state with the view before the newest, without its zingers: they are in neither of its neighbours."""
     if len(state.raw) < 2:
         return replace(state, raw=(*state.raw, view))
@@ -159,7 +159,7 @@ def _designed(rim: float, noise: float) -> Filters:
     return filters(LAGS, Clutter(MARGIN * rim, STRUCTURE, COMMON, noise**2), signals, speeds)
 
 
-def _smooth(depth: Cells) -> Cells:
+def _smooth(depth: CellValues) -> CellValues:
     """Matched along the columns to SIZE; white noise keeps its variance."""
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / SIZE) ** 2)
     return scipy.ndimage.convolve1d(

@@ -9,11 +9,11 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from beamline.monitor.change import Change
+from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import Scatter
-from beamline.monitor.view import View
+from beamline.monitor.scatter import FrameScatter
+from beamline.monitor.view import CellView
 from drivers.frame import Frame
 
 SIGMAS = 8.0
@@ -25,14 +25,14 @@ ALIKE = 0.5  # of the gain, by which the parts may differ: a ghost is in some of
 class GainState:
     """`usual`: changes of the light between views."""
 
-    usual: Scatter = field(default_factory=Scatter)
+    usual: FrameScatter = field(default_factory=FrameScatter)
 
 
 @dataclass(frozen=True)
-class Gain:
+class GainCheck:
     """Score: relative change of the light of all places alike since the view before (beamline.monitor.change).
 
-    The default: flats divide a step out only if they are taken anew, and 1 % of light is 0.01 of line integral in every
+    The default: flats divide a step out only if they are taken anew. 1 % of light is 0.01 of line integral in every
     ray, a fifth of what 50 um of electrolyte do. A ring that is topped up every few minutes steps by less. The figure's
     own noise is 1e-4 on 128 x 512 pixels of 5000 photons.
     """
@@ -65,7 +65,7 @@ class Gain:
         return Look(after, Flag(self.name, level, frame.index, score, limit, advice))
 
 
-def _everywhere(change: Change, view: View | None) -> float:
+def _everywhere(change: SampleChange, view: CellView | None) -> float:
     """The gain, if it is the same in all fifths of the field, from left to right; else 0: it is a ghost."""
     assert view is not None
     starts = np.arange(PARTS) * view.depth.shape[1] // PARTS

@@ -1,8 +1,8 @@
 """Ghost: a broad hump of more or less light than any view should have that crosses the field from side to side.
 
-As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan), but they look at the mean of
-all rows on broad columns, for a hump as broad as a part of the field: 2 % of light in one cell are lost in the noise,
-and in the mean of thousands of pixels they are a hundred times its noise.
+As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan). But they look at the mean of
+all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are lost in the noise.
+In the mean of thousands of pixels they are a hundred times its noise.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
-from beamline.monitor.view import Cells
+from beamline.monitor.view import CellValues
 from drivers.frame import Frame
 
 COLUMNS = 32  # broad columns of the field
@@ -53,17 +53,17 @@ class GhostState:
         peaks: the highest of each of the last views.
     """
 
-    profiles: tuple[Cells, ...] = ()
+    profiles: tuple[CellValues, ...] = ()
     angle: float = math.nan
     filters: Filters | None = None
     step: float = math.nan
-    usual: Cells | None = None
+    usual: CellValues | None = None
     peaks: Peaks = field(default_factory=no_peaks)
 
 
 @dataclass(frozen=True)
-class Ghost:
-    """Score: relative change of the light in the middle of the ghost, without its sign: in the few views of a window, a
+class GhostCheck:
+    """Score: relative change of the light in the middle of the ghost, without its sign. In the few views of a window, a
     ghost that leaves a place looks like a shadow that comes.
     """
 
@@ -106,7 +106,7 @@ class Ghost:
         return self._judge(state, frame.index, outputs, radius * step / (COLUMNS / 2), context)
 
     def _judge(
-        self, state: GhostState, now: int, outputs: Cells, turn: float, context: ScanContext
+        self, state: GhostState, now: int, outputs: CellValues, turn: float, context: ScanContext
     ) -> Look[GhostState]:
         """The highest output, relative to what is usual there, and the peaks of the views before it."""
         assert state.filters is not None and context.grid is not None
@@ -142,19 +142,19 @@ class Ghost:
         return Look(state, Flag(self.name, level, now, light, limit, advice, region, int(trail.first)))
 
 
-def _profiles(depth: Cells, weight: Cells) -> Cells:
+def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
     """Mean line integral of the cells that are lit [part of the rows, broad column]."""
     starts = np.arange(min(PARTS, depth.shape[0])) * depth.shape[0] // min(PARTS, depth.shape[0])
     sums, lit = (_broad(np.add.reduceat(x, starts, axis=0)) for x in (depth, (weight > 0).astype(np.float32)))
     return np.asarray(sums / np.maximum(lit, 1), np.float32)
 
 
-def _broad(cols: Cells) -> Cells:
+def _broad(cols: CellValues) -> CellValues:
     """Sums over COLUMNS groups of columns."""
     return np.add.reduceat(cols, np.arange(COLUMNS) * cols.shape[1] // COLUMNS, axis=1)
 
 
-def _noise(profiles: tuple[Cells, ...], stride: int) -> float:
+def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
     """Noise of a profile, with what its sample does beyond moving on: from second differences over `stride` views."""
     seen = np.stack([profile.mean(axis=0) for profile in profiles])
     second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]

@@ -18,11 +18,11 @@ class LostState:
 
 
 @dataclass(frozen=True)
-class Lost:
+class LostCheck:
     """Score: share of the light that is gone from nine tenths of the frame, against the last view with light.
 
-    The default: half of the light goes neither by drift nor by the decay of a ring's current between two top-ups, and
-    a sample that turns takes no light from all places at once.
+    The default: neither drift nor the decay of a ring's current between two top-ups takes half of the light. A sample
+    that turns takes no light from all places at once.
     """
 
     name: ClassVar[str] = "lost"

@@ -32,7 +32,7 @@ class MassState:
 
 
 @dataclass(frozen=True)
-class Mass:
+class MassCheck:
     """Score: relative change of the mean line integral. None without light, or where the field cuts the sample."""
 
     name: ClassVar[str] = "mass"

@@ -1,8 +1,8 @@
 """Model: does a view show what a reconstruction of the scan lets expect?
 
-The view's line integrals less those of a volume, in units of the view's noise, less what they have in common (light),
-averaged over 3 x 3 cells. A volume never fits its views fully: at each place the difference is divided by what it
-usually is there.
+The view's line integrals less those of a volume, in units of the view's noise. What they have in common (light) is
+taken off, and they are averaged over 3 x 3 cells. A volume never fits its views fully: at each place the difference is
+divided by what it usually is there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import Cells, cell_noise
+from beamline.monitor.view import CellValues, cell_noise
 from drivers.frame import Frame
 
 BROAD = 3  # cells a side, over which a difference is averaged
@@ -32,15 +32,15 @@ class ModelState:
     """Views so far, and the usual square of the difference at each cell, None before the first."""
 
     views: int = 0
-    usual: Cells | None = None
+    usual: CellValues | None = None
 
 
 @dataclass(frozen=True)
-class Model:
+class ModelCheck:
     """Score: largest difference from the volume, in standard deviations of what it usually is at its place.
 
-    The default: a frame has up to 18,000 cells, of which noise takes one beyond 5 standard deviations in 100 views;
-    edges that the volume blurs move from cell to cell and have longer tails.
+    The default: a frame has up to 18,000 cells; noise takes one of them beyond 5 standard deviations in 100 views.
+    Edges that the volume blurs move from cell to cell and have longer tails.
     """
 
     name: ClassVar[str] = "model"

@@ -11,7 +11,7 @@ from pydantic import Field
 from beamline.monitor.change import SPAN
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import Scatter
+from beamline.monitor.scatter import FrameScatter
 from drivers.frame import Frame
 
 SIGMAS = 8.0
@@ -22,14 +22,14 @@ CONFIRMED = 0.5  # of a figure; where less of it differs from row to row, that c
 class MotionState:
     """Usual shifts across and down in pixels and turns in steps; `quiet`: views in which a jump echoes."""
 
-    across: Scatter = field(default_factory=Scatter)
-    down: Scatter = field(default_factory=Scatter)
-    turn: Scatter = field(default_factory=Scatter)
+    across: FrameScatter = field(default_factory=FrameScatter)
+    down: FrameScatter = field(default_factory=FrameScatter)
+    turn: FrameScatter = field(default_factory=FrameScatter)
     quiet: int = 0
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionCheck:
     """Score: pixels by which the sample is elsewhere than its turning explains; steps of the stage where it is a slip.
 
     Flagged is the view of the jump: the views from there on are as good as those before, but show another position.

@@ -1,8 +1,8 @@
 """Opposite: does the view from the other side, or the same view taken again, show the same sample in the same place?
 
 Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
-degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. Where it fits best gives the axis,
-and a shift since; what is left is stated as the shift of the whole sample that would leave as much.
+degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a
+shift since. The remainder is stated as the shift of the whole sample that would leave as much.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import Grid, View, cell_noise
+from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.frame import Frame
 
 EVERY = math.radians(5)  # between the views that are kept
@@ -49,8 +49,8 @@ class Kept:
         turned, again: it was compared with the view from the other side, and with the one taken again.
     """
 
-    view: View
-    after: View | None = None
+    view: CellView
+    after: CellView | None = None
     turned: bool = False
     again: bool = False
 
@@ -76,11 +76,11 @@ class OppositeState:
 
 
 @dataclass(frozen=True)
-class Opposite:
+class OppositeCheck:
     """Score: pixels by which the sample moved, or by which all of it would have to move to change the view as much.
 
-    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution; where it is more, a
-    twentieth of a cell, up to which a shift is known. Flat faces and coarse steps leave a remainder of 0.3 cells.
+    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution. Or a twentieth of a cell
+    where that is more, since a shift is known no better. Flat faces and coarse steps leave a remainder of 0.3 cells.
     """
 
     name: ClassVar[str] = "opposite"
@@ -133,7 +133,7 @@ class Opposite:
         return Look(state)
 
     def _mirrored(
-        self, state: OppositeState, one: Kept, steps: float, view: View, context: ScanContext
+        self, state: OppositeState, one: Kept, steps: float, view: CellView, context: ScanContext
     ) -> Look[OppositeState]:
         assert context.grid is not None
         fit = lay_on(one, steps, view, context.grid, mirrored=True)
@@ -155,7 +155,7 @@ class Opposite:
         )
         return Look(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
-    def _moved(self, fit: Fit, row: int, other: str, grid: Grid) -> Flag | None:
+    def _moved(self, fit: Fit, row: int, other: str, grid: CellGrid) -> Flag | None:
         moved = math.hypot(fit.across, fit.down)
         limits = max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma), max(self.changed, CELLS[1] * grid.cell)
         if moved <= limits[0] and fit.remainder <= limits[1]:
@@ -178,7 +178,7 @@ def _folded(angle: float) -> float:
     return math.remainder(angle, 2 * math.pi)
 
 
-def lay_on(one: Kept, steps: float, view: View, grid: Grid, *, mirrored: bool) -> Fit | None:
+def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> Fit | None:
     """Where the kept view, so many steps later, fits the view best; None where it has nothing that tells.
 
     Least squares over light, shift across and shift down, from the best whole number of cells on.

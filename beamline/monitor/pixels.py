@@ -23,7 +23,7 @@ NAMED = 5  # pixels that are named
 HOLES = 1e-4  # of the pixels, that may hold no number: a column of 4096 is more
 HALF = 0.5  # of the pixels, without which a view is lost
 
-Places = NDArray[np.int64]
+PixelPlaces = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,17 +33,17 @@ class PixelsState:
     `holes`: largest fraction of pixels without a number in a dark or flat: a mask of the detector.
     """
 
-    dead: Places | None = None
+    dead: PixelPlaces | None = None
     in_flats: bool = False
     said: bool = False
     holes: float = 0.0
 
 
 @dataclass(frozen=True)
-class Pixels:
-    """Score: fraction of the pixels that are dead: in all flats of the group at the scan's begin they have less than a
-    fifth of the light around them. It is said at the first view, as a fact where they are few. In a view also the
-    fraction that holds no number (NaN, infinite) but does in the darks and flats.
+class PixelsCheck:
+    """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
+    of the light around them. It is said at the first view, as a fact where they are few. In a view also the fraction
+    that holds no number (NaN, infinite) but does in the darks and flats.
 
     The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
     """
@@ -84,7 +84,7 @@ class Pixels:
         )
         return Flag(self.name, Level.ALARM if score > HALF else Level.WARN, row, score, HOLES, advice)
 
-    def _flag(self, frame: Frame, dead: Places) -> Flag:
+    def _flag(self, frame: Frame, dead: PixelPlaces) -> Flag:
         rows, cols = np.unravel_index(dead, frame.counts.shape)
         score = dead.size / frame.counts.size
         level = Level.WARN if score > self.warn else Level.INFO
@@ -98,7 +98,7 @@ class Pixels:
         return Flag(self.name, level, frame.index, score, self.warn, advice, region)
 
 
-def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> Places:
+def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlaces:
     """Places of the pixels of a flat that are dark within a lit block."""
     above = light(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])

@@ -1,6 +1,6 @@
 """Darks and flats judged as groups: saturated, without light, uneven, or lit though they should be dark.
 
-A volume is lost by bad references as surely as by bad views, so they are judged before the first projection is taken,
+Bad references spoil a volume as surely as bad views. So they are judged before the first projection is taken,
 and once more before a file is reconstructed. All functions are pure: values of frames in, faults with figures out.
 """
 
@@ -44,7 +44,7 @@ class ReferenceLimits:
     uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
     unlit: a beam may be narrower than the detector, but not so that most of it is dark.
     light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their
-        variance; an offset has the first alone and readout noise the second. A fifth of both is neither.
+        variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
     """
 
     saturated: Annotated[float, Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")] = 1e-3
@@ -60,7 +60,7 @@ class ReferenceLimits:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceFrame:
     """What is kept of a dark or a flat.
 
     Attributes:
@@ -80,7 +80,7 @@ class Reference:
     block: int
 
     @classmethod
-    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> Reference:
+    def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
         blocks = np.array(digest.preview[thinned(digest.preview)])
         return cls(row, kind, exposure, digest.saturated_fraction, blocks, block)
 
@@ -98,7 +98,7 @@ class FaultKind(StrEnum):
 
 
 @dataclass(frozen=True)
-class Fault:
+class ReferenceFault:
     """What is wrong with a group.
 
     Attributes:
@@ -125,7 +125,7 @@ class JudgedGroup:
 
     kind: FrameKind
     rows: tuple[int, ...]
-    faults: tuple[Fault, ...]
+    faults: tuple[ReferenceFault, ...]
 
     @property
     def name(self) -> str:
@@ -136,7 +136,7 @@ class JudgedGroup:
         return f"The {self.name}: {' '.join(fault.message for fault in self.faults)}"
 
 
-Group = Sequence[Reference]
+Group = Sequence[ReferenceFrame]
 
 
 def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()) -> tuple[JudgedGroup, ...]:
@@ -191,7 +191,7 @@ def full_scale(largest: float) -> float:
     return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if 2**bits > largest), np.inf)
 
 
-def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
+def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
     hot = 0.0 if darks is None else float(np.median([dark.saturated for dark in darks]))
     score = float(np.median([flat.saturated for flat in flats])) - hot
     if score <= limits.saturated:
@@ -200,10 +200,10 @@ def _saturated(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fa
         f"{score:.2%} of their pixels are saturated (limit {limits.saturated:.2%}), so that their light is not known. "
         "Shorten the exposure or add a filter."
     )
-    return Fault(FaultKind.SATURATED, score, limits.saturated, said)
+    return ReferenceFault(FaultKind.SATURATED, score, limits.saturated, said)
 
 
-def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: ReferenceLimits) -> Fault | None:
+def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: ReferenceLimits) -> ReferenceFault | None:
     if darks is None:
         return None
     if not _has_light(flats, darks, limits):
@@ -213,17 +213,17 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
             f"{_level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
             "Was the shutter open for them, and closed for the darks?"
         )
-        return Fault(FaultKind.NO_BEAM, light / noise, limits.light_over_noise, said)
+        return ReferenceFault(FaultKind.NO_BEAM, light / noise, limits.light_over_noise, said)
     most = _light(bright, darks)
     gone = 1 - _light(flats, darks) / most
     if gone <= limits.light_gone:
         return None
     where = spans([reference.row for reference in bright])
     said = f"{gone:.0%} of the light of the flats {where} is gone (limit {limits.light_gone:.0%}): the beam was lost."
-    return Fault(FaultKind.BEAM_LOST, gone, limits.light_gone, said)
+    return ReferenceFault(FaultKind.BEAM_LOST, gone, limits.light_gone, said)
 
 
-def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> Fault | None:
+def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> ReferenceFault | None:
     """Views that are brighter than flats, where the exposures of both are known: a sample only takes light."""
     views = [view for view in views if view.saturated <= limits.saturated and np.isfinite(view.blocks).any()]
     if not views or not all(frame.exposure > 0 for frame in (*flats, *views)):
@@ -234,12 +234,12 @@ def _outshone(flats: Group, darks: Group | None, views: Group, limits: Reference
     share = there / most
     said = (
         f"they have {share:.2%} of the light of the views (limit {1 - limits.light_gone:.0%}), though a sample only "
-        "takes light: the beam was lost or a filter was in for them, or their exposure is not the one stated."
+        f"takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
     )
-    return Fault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, said)
+    return ReferenceFault(FaultKind.DIMMER_THAN_VIEWS, share, 1 - limits.light_gone, said)
 
 
-def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
+def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
     """The light of each flat against the group's mean, as a whole and place by place."""
     if len(flats) < 2:
         return None
@@ -258,17 +258,17 @@ def _uneven(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault
         said = (
             f"their light changes by {level:.0%} from flat to flat (limit {limits.uneven:.0%}): the beam was unstable."
         )
-        return Fault(FaultKind.UNEVEN, level, limits.uneven, said)
+        return ReferenceFault(FaultKind.UNEVEN, level, limits.uneven, said)
     if place > max(limits.uneven, CHANGE_SIGMAS * noise):
         said = (
             f"in places their light changes by {place:.0%} from flat to flat (limit {limits.uneven:.0%}): something "
             "moved in the beam. Is the sample out?"
         )
-        return Fault(FaultKind.UNEVEN, place, limits.uneven, said)
+        return ReferenceFault(FaultKind.UNEVEN, place, limits.uneven, said)
     return None
 
 
-def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault | None:
+def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> ReferenceFault | None:
     light = np.mean([flat.blocks - _offset(darks) for flat in flats], axis=0)
     score = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean())
     if score <= limits.unlit:
@@ -277,10 +277,10 @@ def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Fault 
         f"{score:.0%} of the frame has no light in them (limit {limits.unlit:.0%}): move beam and detector onto one "
         "another, or read fewer pixels."
     )
-    return Fault(FaultKind.MOSTLY_UNLIT, score, limits.unlit, said)
+    return ReferenceFault(FaultKind.MOSTLY_UNLIT, score, limits.unlit, said)
 
 
-def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fault | None:
+def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> ReferenceFault | None:
     if not _has_light(flats, base, limits):
         return None  # both have the same light: which of them is wrong cannot be told, and the flats' fault says it
     level = _level(darks) / _level(flats) if _level(flats) > 0 else np.inf
@@ -298,7 +298,7 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Fa
         + (f" and their variance {variance:.0%}" if known else "")
         + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
     )
-    return Fault(FaultKind.LIGHT_IN_DARKS, score, limit, said)
+    return ReferenceFault(FaultKind.LIGHT_IN_DARKS, score, limit, said)
 
 
 def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
@@ -314,7 +314,7 @@ def _offset(darks: Group | None) -> NDArray[np.float32] | float:
     return 0.0 if darks is None else np.asarray(np.mean([dark.blocks for dark in darks], axis=0))
 
 
-def _seconds(reference: Reference) -> float:
+def _seconds(reference: ReferenceFrame) -> float:
     return reference.exposure if reference.exposure > 0 else 1.0
 
 

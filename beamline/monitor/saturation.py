@@ -22,7 +22,7 @@ class SaturationState:
 
 
 @dataclass(frozen=True)
-class Saturation:
+class SaturationCheck:
     """Score: fraction of saturated pixels beyond those that are saturated in the darks."""
 
     name: ClassVar[str] = "saturation"

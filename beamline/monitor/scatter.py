@@ -11,7 +11,7 @@ OUTLIER = 4.0  # mean absolute deviations that a single figure may add
 
 
 @dataclass(frozen=True)
-class Scatter:
+class FrameScatter:
     """Running mean and mean absolute deviation; a single outlier moves them by no more than four deviations' worth."""
 
     n: int = 0
@@ -26,9 +26,11 @@ class Scatter:
     def sigma(self) -> float:
         return NORMAL * self.deviation
 
-    def with_figure(self, figure: float) -> Scatter:
+    def with_figure(self, figure: float) -> FrameScatter:
         weight = max(MEMORY, 1 / (self.n + 1))
         away = figure - self.mean
         if self.ready and abs(away) > OUTLIER * self.deviation:
             away = OUTLIER * self.deviation if away > 0 else -OUTLIER * self.deviation
-        return Scatter(self.n + 1, self.mean + weight * away, self.deviation + weight * (abs(away) - self.deviation))
+        return FrameScatter(
+            self.n + 1, self.mean + weight * away, self.deviation + weight * (abs(away) - self.deviation)
+        )

@@ -19,7 +19,7 @@ class StuckState:
 
 
 @dataclass(frozen=True)
-class Stuck:
+class StuckCheck:
     """No limits: one repetition is one too many. Score: repetitions in a row."""
 
     name: ClassVar[str] = "stuck"

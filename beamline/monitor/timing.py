@@ -22,7 +22,7 @@ class TimingState:
 
 
 @dataclass(frozen=True)
-class Timing:
+class TimingCheck:
     """Score: periods by which the frame came late (negative: early).
 
     Triggers without a frame before it are an INFO: the frame after the gap is as good as any.

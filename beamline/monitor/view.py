@@ -23,13 +23,13 @@ EDGE = 2  # cells at either edge that say whether the sample ends within the fie
 SEEN = 0.02  # transmission from which a place shows whether the beam is there
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
 
-Cells = NDArray[np.float32]
-Region = tuple[int, int, int, int]
+CellValues = NDArray[np.float32]
+PixelBox = tuple[int, int, int, int]
 """Pixels of a frame: (first row, row after the last, first column, column after the last)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class CellGrid:
     """The cells of a frame, and the light in them without a sample.
 
     Attributes:
@@ -40,17 +40,17 @@ class Grid:
         lit: float32 [row, col], 1 where a cell has light enough to say something, else 0.
         flats: there were flats; otherwise `full` is 1 and line integrals are relative.
         row_dark, col_dark: dark counts of each preview row and column, means.
-        left, right: first and last column of cells of which most are lit.
+        left, right: first and last column of cells with most of them lit.
     """
 
     cell: int
     blocks: int
-    dark: Cells
-    full: Cells
-    lit: Cells
+    dark: CellValues
+    full: CellValues
+    lit: CellValues
     flats: bool
-    row_dark: Cells
-    col_dark: Cells
+    row_dark: CellValues
+    col_dark: CellValues
     left: int
     right: int
 
@@ -58,7 +58,7 @@ class Grid:
     def shape(self) -> tuple[int, int]:
         return self.full.shape
 
-    def region(self, row: float, col: float, height: float, width: float) -> Region:
+    def region(self, row: float, col: float, height: float, width: float) -> PixelBox:
         """Pixels of a box of cells around a place, within the grid."""
         rows, cols = self.shape
         top, left = max(0, math.floor(row + 0.5 - height / 2)), max(0, math.floor(col + 0.5 - width / 2))
@@ -67,7 +67,7 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CellView:
     """A projection on the grid.
 
     Attributes:
@@ -83,17 +83,17 @@ class View:
 
     index: int
     angle: float
-    depth: Cells
-    weight: Cells
-    rows: Cells
-    cols: Cells
+    depth: CellValues
+    weight: CellValues
+    rows: CellValues
+    cols: CellValues
     edges: tuple[float, float]
     brighter: float = 0.0
 
 
 def grid_of(
     preview: tuple[int, int], block: int, dark: NDArray[np.float32] | None, flat: NDArray[np.float32] | None
-) -> Grid:
+) -> CellGrid:
     """The grid of frames whose preview has this shape, with blocks of `block` pixels a side."""
     blocks = max(1, preview[1] // COLS)
     blocks = min(blocks, preview[0])
@@ -110,10 +110,10 @@ def grid_of(
         full = np.where(lit > 0, full, np.float32(1))
     wide = np.flatnonzero(lit.mean(axis=0) > 0.5)
     left, right = (int(wide[0]), int(wide[-1])) if wide.size else (0, lit.shape[1] - 1)
-    return Grid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
+    return CellGrid(blocks * block, blocks, low, full, lit, flat is not None, rows, cols, left, right)
 
 
-def view_of(preview: NDArray[np.float32], grid: Grid, index: int, angle: float, more_light: float) -> View:
+def view_of(preview: NDArray[np.float32], grid: CellGrid, index: int, angle: float, more_light: float) -> CellView:
     """A projection on the grid; `more_light`: its exposure over that of the flats."""
     counts, rows, cols = _binned(preview, grid.blocks)
     depth, weight = np.empty_like(counts), np.empty_like(counts)
@@ -123,10 +123,10 @@ def view_of(preview: NDArray[np.float32], grid: Grid, index: int, angle: float, 
     )
     left, right = depth[:, grid.left : grid.left + EDGE], depth[:, grid.right + 1 - EDGE : grid.right + 1]
     edges = float(np.median(left)), float(np.median(right))
-    return View(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
+    return CellView(index, angle, depth, weight, rows - grid.row_dark, cols - grid.col_dark, edges)
 
 
-def light_left(view: View, last: View | None, grid: Grid) -> float:
+def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
     """Light in nine tenths of the places at most, over that of the last good view; before any, over the flats.
 
     A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.
@@ -147,13 +147,13 @@ def light_left(view: View, last: View | None, grid: Grid) -> float:
     return math.exp(float(np.percentile((last.depth - view.depth)[seen][::3], BRIGHT)))
 
 
-def cell_noise(depth: Cells, weight: Cells) -> float:
+def cell_noise(depth: CellValues, weight: CellValues) -> float:
     """Standard deviation of a cell of weight 1: from third differences along the columns, which edges move little."""
     third = np.diff(depth, 3, axis=1) * np.sqrt(weight[:, 1:-2])
     return 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
 
 
-def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[Cells, Cells, Cells]:
+def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, CellValues, CellValues]:
     """Means of the cells, and of each preview row and column."""
     rows, cols = preview.shape
     cells = np.zeros((rows // blocks, cols // blocks), np.float32)

@@ -16,7 +16,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.preview import more_light
 from beamline.monitor.spots import spots_of
-from beamline.monitor.view import View, grid_of, light_left, view_of
+from beamline.monitor.view import CellView, grid_of, light_left, view_of
 from drivers.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
@@ -48,14 +48,14 @@ class Monitor:
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
     before: FrameDigest | None = None
-    recent: tuple[View, ...] = ()
-    kept: tuple[View, ...] = ()
+    recent: tuple[CellView, ...] = ()
+    kept: tuple[CellView, ...] = ()
     cut: float = 0.0
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
-    """Median step from one of these angles, in the order of their views, to the next; NaN where they do not turn one
-    way (golden or random angles), so that no view has its neighbour beside it."""
+    """Median step from one of these angles, in the order of their views, to the next. NaN where they do not turn one
+    way (golden or random angles): no view then has its neighbour beside it."""
     steps = np.diff(angles)
     steps = steps[np.isfinite(steps) & (steps != 0)]
     share = float((steps > 0).mean()) if steps.size else 0.5
@@ -139,7 +139,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     return replace(monitor, context=context, recent=recent, kept=kept, cut=cut)
 
 
-def _nearest(angle: float, kept: Sequence[View]) -> View | None:
+def _nearest(angle: float, kept: Sequence[CellView]) -> CellView | None:
     """The view that is nearest in angle, within EVERY; None where none is."""
     apart = [abs(math.remainder(angle - view.angle, 2 * math.pi)) for view in kept]
     return kept[int(np.argmin(apart))] if apart and min(apart) < EVERY else None

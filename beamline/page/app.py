@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import BeamlineError, user_message
 from beamline.page.run_files import PICTURE, Reader
-from beamline.page.tiles import Region, pack
+from beamline.page.tiles import TileRegion, pack
 from beamline.scan.control import Verb, tell
 
 COOKIE = "splatline_look"
@@ -257,9 +257,9 @@ def _number(request: Request, name: str) -> int:
     return int(given) if given.isdecimal() and len(given) < 10 else 0
 
 
-def _region(request: Request) -> Region:
+def _region(request: Request) -> TileRegion:
     """`region=first_row,last_row,first_col,last_col`; the whole picture where it is not that."""
     edges = request.query_params.get("region", "").split(",")
     if len(edges) == 4 and all(edge.isdecimal() and len(edge) < 10 for edge in edges):
-        return Region(*map(int, edges))
-    return Region(0, 10**9, 0, 10**9)
+        return TileRegion(*map(int, edges))
+    return TileRegion(0, 10**9, 0, 10**9)

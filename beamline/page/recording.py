@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import MOST, Region, bin_mean
+from beamline.page.tiles import MOST, TileRegion, bin_mean
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
 from beamline.storage.writers import layout
@@ -20,7 +20,7 @@ from drivers.frame import FrameKind
 
 
 @dataclass(frozen=True)
-class Progress:
+class ScanProgress:
     """How far a scan file is.
 
     Attributes:
@@ -60,14 +60,14 @@ class Recording:
         with suppress(RuntimeError, OSError, ValueError):
             self._file.close()
 
-    def progress(self) -> Progress:
+    def progress(self) -> ScanProgress:
         committed = self._file[layout.COMMITTED]
-        committed.refresh()
+        hdf5.look_again(committed)
         finished = self._file[layout.FINISHED]
-        finished.refresh()
+        hdf5.look_again(finished)
         status = self._file[layout.STATUS]
-        status.refresh()
-        return Progress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
+        hdf5.look_again(status)
+        return ScanProgress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
 
     def facts(self) -> dict[str, Any]:
         """What does not change: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
@@ -111,7 +111,9 @@ class Recording:
                 )
         return listed
 
-    def picture(self, frame: int, region: Region, *, corrected: bool) -> tuple[NDArray[np.float32], Region, int]:
+    def picture(
+        self, frame: int, region: TileRegion, *, corrected: bool
+    ) -> tuple[NDArray[np.float32], TileRegion, int]:
         """Part of a frame, binned to a tile: counts, or the share of the light that the sample lets through.
 
         Returns:
@@ -126,7 +128,7 @@ class Recording:
         region = region.inside(self.shape)
         rows, cols = slice(region.first_row, region.last_row), slice(region.first_col, region.last_col)
         factor = region.binning()
-        self._data.refresh()
+        hdf5.look_again(self._data)
         pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
         if corrected and (found := self._references(frames)) is not None:
             dark, flat = (bin_mean(mean[rows, cols], (factor, factor)) for mean in found)
@@ -146,7 +148,7 @@ class Recording:
         packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost a whole frame
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
         at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
-        source.refresh()
+        hdf5.look_again(source)
         factor = max(1, -(-source.shape[2] // MOST))
         lines = [bin_mean(source[int(view), at : at + 1], (1, factor)) for view in views]
         return (
@@ -155,13 +157,13 @@ class Recording:
             bin_of_source * factor,
         )
 
-    def trace(self, region: Region, first: int) -> list[float]:
+    def trace(self, region: TileRegion, first: int) -> list[float]:
         """Mean counts of a region, to whole blocks of the preview, in the frames from `first` on."""
-        block = Region(*(edge // self.preview_bin for edge in (region.first_row, region.last_row,
+        block = TileRegion(*(edge // self.preview_bin for edge in (region.first_row, region.last_row,
                                                              region.first_col, region.last_col)))  # fmt: skip
         block = block.inside((self._preview.shape[1], self._preview.shape[2]))
         rows, cols = slice(block.first_row, block.last_row), slice(block.first_col, block.last_col)
-        self._preview.refresh()
+        hdf5.look_again(self._preview)
         return [float(self._preview[frame, rows, cols].mean()) for frame in range(first, self.progress().frames)]
 
     def _legend(self) -> Any:
@@ -169,7 +171,7 @@ class Recording:
 
     def _column(self, path: str, first: int, frames: int) -> list[Any]:
         column = self._file[path]
-        column.refresh()
+        hdf5.look_again(column)
         values = column[first:frames]
         return [None if value != value else value.item() for value in values]  # NaN has no place in JSON
 

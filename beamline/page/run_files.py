@@ -58,7 +58,7 @@ def watched(path: Path) -> Watched:
 
 
 class EventLog:
-    """The events of a run as lines of JSON, numbered from 0 in the order of the file; those of a line half written
+    """The events of a run as lines of JSON, numbered from 0 in the order of the file. Those of a line half written
     come with the next look."""
 
     def __init__(self, folder: Path | None) -> None:

@@ -14,7 +14,7 @@ _GREATEST = 65535
 
 
 @dataclass(frozen=True)
-class Region:
+class TileRegion:
     """Half-open rows and columns of a picture."""
 
     first_row: int
@@ -22,12 +22,12 @@ class Region:
     first_col: int
     last_col: int
 
-    def inside(self, shape: tuple[int, int]) -> Region:
+    def inside(self, shape: tuple[int, int]) -> TileRegion:
         """The part of it that a picture of this shape has; at least one pixel."""
         rows, cols = shape
         first_row, first_col = min(max(self.first_row, 0), rows - 1), min(max(self.first_col, 0), cols - 1)
         last_row, last_col = min(max(self.last_row, first_row + 1), rows), min(max(self.last_col, first_col + 1), cols)
-        return Region(first_row, last_row, first_col, last_col)
+        return TileRegion(first_row, last_row, first_col, last_col)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -49,7 +49,7 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
 
 
 @dataclass(frozen=True, eq=False)
-class Packed:
+class PackedValues:
     """Values as u2 [row, col]: a value is offset + scale * number; 65535 stands for one that is not finite."""
 
     numbers: NDArray[np.uint16]
@@ -57,10 +57,10 @@ class Packed:
     scale: float
 
 
-def pack(values: NDArray[np.float32]) -> Packed:
+def pack(values: NDArray[np.float32]) -> PackedValues:
     """Values with 65534 steps from their least to their greatest."""
     finite = np.isfinite(values)
     low, high = (float(values[finite].min()), float(values[finite].max())) if finite.any() else (0.0, 0.0)
     scale = (high - low) / (_GREATEST - 1) or 1.0
     numbers = np.rint((np.where(finite, values, low) - np.float32(low)) / np.float32(scale))
-    return Packed(np.where(finite, np.clip(numbers, 0, _GREATEST - 1), _GREATEST).astype("<u2"), low, scale)
+    return PackedValues(np.where(finite, np.clip(numbers, 0, _GREATEST - 1), _GREATEST).astype("<u2"), low, scale)

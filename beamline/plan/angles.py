@@ -40,8 +40,8 @@ def random(views: int, start: float = 0.0, span: float = math.pi, *, rng: np.ran
 def pass_order(passes: int) -> NDArray[np.intp]:
     """The order in which the gaps of the first pass are filled: a permutation of 0 ... passes - 1.
 
-    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, without the values that `passes` does not
-    reach; so each pass falls near the middle of the largest gap that is left, for any number of passes.
+    Bit reversal (Mohan et al. 2015, TIMBIR) of the next power of two, without the values that `passes` does not reach.
+    So each pass falls near the middle of the largest gap that is left, for any number of passes.
     """
     _require(passes)
     bits = (passes - 1).bit_length()

@@ -19,7 +19,7 @@ MARGIN = 1.01
 
 
 @dataclass(frozen=True, eq=False)
-class Facts:
+class PlanFacts:
     """A plan with its computed speeds, times and sizes, which the checks look at."""
 
     plan: ScanPlan
@@ -37,7 +37,7 @@ class Facts:
     free_bytes: int | None
 
 
-def violations(facts: Facts) -> Iterator[str]:
+def violations(facts: PlanFacts) -> Iterator[str]:
     """One sentence for each broken limit."""
     plan = facts.plan
     if plan.mode is Mode.FLY:
@@ -65,7 +65,7 @@ def violations(facts: Facts) -> Iterator[str]:
         )
 
 
-def remarks(facts: Facts) -> Iterator[str]:
+def remarks(facts: PlanFacts) -> Iterator[str]:
     """One sentence for each thing worth knowing."""
     plan, camera = facts.plan, facts.camera
     yield from _rounding(facts)
@@ -106,7 +106,7 @@ def remarks(facts: Facts) -> Iterator[str]:
     yield from _reference("darks", plan.darks, plan.exposure, "their hot pixels and dark current are not the views'")
 
 
-def _timing(facts: Facts) -> Iterator[str]:
+def _timing(facts: PlanFacts) -> Iterator[str]:
     plan, camera, period = facts.plan, facts.camera, facts.views.period
     if plan.exposure > period:
         yield (
@@ -122,7 +122,7 @@ def _timing(facts: Facts) -> Iterator[str]:
         )
 
 
-def _speed(facts: Facts) -> Iterator[str]:
+def _speed(facts: PlanFacts) -> Iterator[str]:
     if facts.flight and facts.flight.interval / facts.plan.period < 0.5:
         slowest = facts.flight.interval
         yield (
@@ -143,19 +143,19 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
     if interval % unit:
         yield (
             f"views are {interval} counts of the stage apart, and a trigger output that is toggled needs a multiple of "
-            f"{unit}; take another number of views, devices.stage.toggle: false where the firmware can, or "
+            f"{unit}. Take another number of views, devices.stage.toggle: false where the firmware can, or "
             "scan.mode: step"
         )
     elif interval < least:
         fastest = interval / stage.pulse_spacing * 360 / stage.counts_per_turn
         yield (
             f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
-            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s; take fewer views, a shorter "
+            f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer views, a shorter "
             f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {_down(fastest):g}"
         )
 
 
-def _limits(facts: Facts) -> Iterator[str]:
+def _limits(facts: PlanFacts) -> Iterator[str]:
     low, high = facts.reach
     slack = math.pi / facts.stage.counts_per_turn
     if low < facts.stage.low - slack or high > facts.stage.high + slack:
@@ -167,15 +167,15 @@ def _limits(facts: Facts) -> Iterator[str]:
         )
 
 
-def _rounding(facts: Facts) -> Iterator[str]:
+def _rounding(facts: PlanFacts) -> Iterator[str]:
     flight, stage = facts.flight, facts.stage
     if flight is None or flight.drift <= 1.01 * math.pi / stage.counts_per_turn:
         return
     count = 2 * math.pi / stage.counts_per_turn
     yield (
         f"the step of {degrees(flight.exact * count)} is {flight.exact:.6g} counts; triggers fall on whole counts, so "
-        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, which moves views by up to "
-        f"{degrees(flight.drift)}; the file holds the angles that were triggered"
+        f"it becomes {flight.step} counts = {degrees(flight.step * count)}, and views move by up to "
+        f"{degrees(flight.drift)}. The file holds the angles that were triggered"
     )
 
 

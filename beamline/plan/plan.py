@@ -49,7 +49,7 @@ class ScanPlan:
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
         retake_share: of the views, how many with an alarm of the monitor are taken again at most; 0: none.
         stored: views that need not be taken: earlier files of the same scan have them.
-        end_references: kinds of references that are still to be taken after the views, where all else is stored; None:
+        end_references: kinds of references that are still to be taken after the views, where all else is stored. None:
             all that are planned, before and after the views.
     """
 
@@ -79,8 +79,8 @@ class Block:
         kind: what the frames show.
         mode: how they are triggered.
         first_trigger: of the block's first frame, within the whole plan.
-        angles: float64 [frame] radians at whole counts, the angles that each row will carry (NaN in darks and flats
-            until acquisition fills in where the stage stands).
+        angles: float64 [frame] radians at whole counts, the angles of the rows. NaN in darks and flats until
+            acquisition fills in where the stage stands.
         exposure, period: s.
         trains: for FLY, one pulse train a pass (interlaced plans need several); their n add up to the block's.
         speed: rad/s during the pulses (FLY).

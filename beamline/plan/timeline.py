@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
-from beamline.plan.limits import Facts, remarks, violations
+from beamline.plan.limits import PlanFacts, remarks, violations
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.retake import Retake, retake_block, spread
 from beamline.plan.triggers import Flight, Scale, plan_flight
@@ -35,7 +35,7 @@ def work_out(
     """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
 
     Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, rounded to whole
-    counts a second (the views' block has the period that comes of it); it starts far enough before the first pulse to
+    counts a second (the views' block has the resulting period). It starts far enough before the first pulse to
     reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return
     at full speed between them. The duration is that of a stage that stands at its zero and goes back there at the end,
     without shutter and sample moves.
@@ -62,7 +62,7 @@ def work_out(
     preview_bytes = math.prod(preview_shape(camera.shape, preview_bin)) * BYTES_PER_BLOCK
     retake_seconds = _retake_seconds(plan, views, stage, camera)
     row_bytes = frame_bytes + preview_bytes
-    facts = Facts(
+    facts = PlanFacts(
         plan=plan,
         views=views,
         flight=flight,
@@ -110,7 +110,7 @@ def move_seconds(distance: float, speed: float, acceleration: float) -> float:
 
 
 @dataclass(frozen=True)
-class Pass:
+class FlyPass:
     """A pass of a fly block: its first trigger within the block, its pulses, and where the stage starts and stops."""
 
     first: int
@@ -119,7 +119,7 @@ class Pass:
     end: float
 
 
-def passes(block: Block) -> list[Pass]:
+def passes(block: Block) -> list[FlyPass]:
     """The passes of a fly block: each train, in several pieces where frames in it are stored.
 
     The stage starts and stops `taxi` beyond the first and the last angle.
@@ -134,7 +134,7 @@ def _firsts(trains: Iterable[TriggerTrain]) -> Iterator[tuple[int, TriggerTrain]
         first += train.n
 
 
-def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[Pass]:
+def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[FlyPass]:
     end = first + train.n
     out = math.copysign(block.taxi, float(block.angles[end - 1] - block.angles[first]))
     stored = sorted(i for i in block.stored if first <= i < end)
@@ -142,7 +142,7 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[Pass]:
         if (n := after - before - 1) > 0:
             pulses = TriggerTrain(train.start + (before + 1 - first) * train.interval, train.interval, n)
             angles = block.angles[before + 1 : after]
-            yield Pass(before + 1, pulses, float(angles[0]) - out, float(angles[-1]) + out)
+            yield FlyPass(before + 1, pulses, float(angles[0]) - out, float(angles[-1]) + out)
 
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float) -> float:

@@ -80,8 +80,8 @@ def plan_flight(angles: NDArray[np.float64], to_counts: Callable[[float], int]) 
     spacing = {abs(train.interval) for train in runs}
     if len(spacing) > 1 or min(train.n for train in runs) < 2:
         raise ValueError(
-            "the views do not come in passes of equal steps, so a turning stage cannot trigger them in this order; "
-            "use scan.mode: step, or a fixed, sector or interlaced plan"
+            "the views do not come in passes of equal steps, so a turning stage cannot trigger them in this order. "
+            "Use scan.mode: step, or a fixed, sector or interlaced plan"
         )
     drift = float(np.abs(scale.angles(counts) - angles).max())
     return Flight(tuple(runs), spacing.pop(), whole, exact, drift)

@@ -44,7 +44,7 @@ class ScanCorrection:
     """Reads frames of one scan as line integrals, in the rows and with the binning of a selection.
 
     `at_once` corrects frames that are all there. `feed` takes them in batches as they come and gives the same line
-    integrals to the bit, as long as the references and the air columns stay what they were; `outdated` says when they
+    integrals to the bit, as long as the references and the air columns stay the same. `outdated` says when they
     did not. Then `renewed` corrects by what is known now.
     """
 
@@ -287,8 +287,8 @@ class ScanCorrection:
             has_views = (self._source.image_key[start:end] == FrameKind.PROJECTION).any()
             if has_views and not any(start <= position < end for position in flats):
                 self._warn(
-                    f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used: their "
-                    "views are corrected by the nearest flats of another part, though the beam may have changed."
+                    f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used. The "
+                    f"nearest flats of another part correct their views, though the beam may have changed."
                 )
 
     def _no_view(self) -> DataError:
@@ -309,8 +309,8 @@ class ScanCorrection:
             raise self._refusal(error) from error
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
-        """Detector rows to read for some binned rows (None: all), with those that a filter or new pixels take from; and
-        which of what is read are wanted, in binned rows."""
+        """Detector rows to read for some binned rows (None: all), with the rows around that a filter or new pixels
+        need. Then which of the rows read are wanted, in binned rows."""
         first, end = self.rows.start, self.rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // self.binning)

@@ -32,7 +32,7 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
             curve, explained = fitted(views, geometry)
         except NoCurveError as error:
             return None, f"Hardening: not determined by the views ({error}); none corrected."
-        how = f"fitted on the views, of which one material explains {explained:.1%}"
+        how = f"fitted on the views; one material explains {explained:.1%} of them"
     corrected = float(np.interp(highest, curve.measured, curve.corrected))
     if corrected < (1 + _LEAST_SEEN) * highest:
         return None, f"Hardening: none seen ({how}); none corrected."
@@ -42,15 +42,15 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
 def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     """The curve by the paths through the sample as its own reconstruction shows it, taken as one material.
 
-    The paths are those through what is brighter than the middle between matter and air; the next round's volume is of
+    The paths are those through voxels brighter than the middle between matter and air. The next round's volume is of
     views corrected by the last curve, until it stays (after Krumm, Kasperl & Franz 2008, NDT & E Int. 41, 242).
 
     A sample that is denser outside than inside looks the same in any one view. But all views of a row hold the same
-    mass (the first of the Helgason-Ludwig conditions), and a curve that is none of the beam's spoils that.
+    mass (the first of the Helgason-Ludwig conditions), and a wrong curve spoils that.
 
     Raises:
-        NoCurveError: the sample is not of one material, the curve does not settle or makes masses differ more, or the
-            beam is a cone, of which views need not hold the same mass.
+        NoCurveError: the sample is of several materials, the curve does not settle, or it makes masses differ more. Or
+            the beam is a cone, whose views need not hold the same mass.
     """
     if geometry.is_cone:
         raise NoCurveError("that takes a parallel beam, whose views all hold the same mass: state material and beam")

@@ -64,7 +64,7 @@ def find_jumps(source: ScanSource, selection: Selection, frames: I64, jumps: I64
 
     A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
     A part stays where views held out of the longest part are predicted with it as well as without, and its own views
-    about as well; otherwise it is left out. A jump below half a pixel is none.
+    about as well. Otherwise it is left out. A jump below half a pixel is none.
 
     Args:
         frames: rows of the file that are to be used.

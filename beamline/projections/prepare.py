@@ -124,7 +124,7 @@ class PreparedProjections:
         return None if factors is None else factors[...]
 
     def ray_factors(self, others: int = 0) -> RayWeights | None:
-        """Weights [view, row, col], of which no more is made than is asked for; None: one for all rays.
+        """Weights [view, row, col], computed only where they are asked for; None: one for all rays.
 
         Args:
             others: views after these, which weigh 1, as a usual ray of these does.

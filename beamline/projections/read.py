@@ -181,11 +181,11 @@ def photons_of(
 ) -> Photons | None:
     """How the pixels of a scan count photons, as they are read (binned); None: their logarithms are to be taken.
 
-    The gain is that of the selection, or the photon transfer of the largest group of flats, the readout noise that of
-    the largest group of darks.
+    The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
+    of the largest group of darks.
 
     Raises:
-        ConfigError: counts are asked for, and the flats do not tell the gain; or the gain given makes the photons of
+        ConfigError: counts are asked for, and the flats do not tell the gain. Or the gain given makes the photons of
             the open beam too many or too few for any detector.
     """
     wanted = selection.step(CountModel)

@@ -66,7 +66,7 @@ class Kind:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ScanVerdict:
     """What the monitor says of a scan as a whole.
 
     Attributes:
@@ -158,7 +158,7 @@ def frames_of(
         follow.sleep(POLL)
 
 
-def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimits | None = None) -> Verdict:
+def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimits | None = None) -> ScanVerdict:
     """What the checks said of the frames, together with what is wrong with darks, flats and the file.
 
     Args:
@@ -167,7 +167,7 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(rows_replaced(source).tolist())
     groups = reference_groups(source, limits).judged if source.quantity == "counts" else ()
-    return Verdict(
+    return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),

@@ -47,8 +47,8 @@ def try_axes(
 ) -> None:
     """Reconstruct the middle row chosen by FBP with each axis and write the sheet; the event `done` says the scores.
 
-    The score is the share of a slice below 0 within the circle that all views see: a wrong axis takes away beside
-    edges what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
+    The score is the share of a slice below 0 within the circle that all views see. A wrong axis takes away beside edges
+    what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
 
     Args:
         listen: is told the number of axes done, and of all.

@@ -33,7 +33,7 @@ _OURS = ("done", "failed")  # events of a scan that become its row
 
 
 @dataclass(frozen=True)
-class Row:
+class BatchRow:
     """A scan of a batch.
 
     Attributes:
@@ -75,7 +75,7 @@ class BatchOptions:
     folder: Path
 
 
-def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[Row]:
+def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]:
     """Reconstruct the scans that have no volume in the folder yet; the table is written after each.
 
     A folder of results comes into place when it is whole. A scan that fails leaves none, and the next one follows; it
@@ -171,7 +171,7 @@ class Worker:
             self._on_line(line)
 
 
-def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> list[Row]:
+def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> list[BatchRow]:
     folder = options.folder
     rows = _rows(options.scans, _read(folder))
     _write(folder, rows)
@@ -224,17 +224,17 @@ def _begin(folder: Path, recipe: bytes) -> None:
         )
 
 
-def _rows(scans: Sequence[Path], known: Sequence[Row]) -> list[Row]:
+def _rows(scans: Sequence[Path], known: Sequence[BatchRow]) -> list[BatchRow]:
     """The rows known, and one for each scan that is new."""
     old = {row.scan for row in known}
     new = [path for path in scans if str(path.resolve()) not in old]
     names = names_of([*(Path(row.scan) for row in known), *new])[len(known) :]
     taken = {row.name.casefold() for row in known}
     free = [f"{name}_{len(known) + n}" if name.casefold() in taken else name for n, name in enumerate(names)]
-    return [*known, *(Row(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
+    return [*known, *(BatchRow(name, str(path.resolve())) for name, path in zip(free, new, strict=True))]
 
 
-def _one(row: Row, options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> Row:
+def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) -> BatchRow:
     """Reconstruct a scan."""
     began, last = clock.now(), dict[str, Any]()
 
@@ -278,7 +278,7 @@ def _arguments(options: BatchOptions, scan: str, work: Path) -> list[str]:
     return ["recon", scan, *recipe, "--output", str(work / VOLUME), "--log", str(work / "log.txt"), "--json"]
 
 
-def _read(folder: Path) -> list[Row]:
+def _read(folder: Path) -> list[BatchRow]:
     """The table of an earlier call.
 
     Raises:
@@ -292,18 +292,18 @@ def _read(folder: Path) -> list[Row]:
         raise DataError(f"{path} is no table of a batch ({error}). Nothing was touched.") from error
 
 
-def _row(record: Mapping[str, str]) -> Row:
+def _row(record: Mapping[str, str]) -> BatchRow:
     results: Mapping[str, RowState] = {result: result for result in get_args(RowState)}
     numbers = {name: float(record[name]) if record[name] else None for name in ("seconds", "residual")}
-    return Row(
+    return BatchRow(
         record["name"], record["scan"], results[record["state"]], method=record["method"], message=record["message"],
         **numbers,
     )  # fmt: skip
 
 
-def _write(folder: Path, rows: Sequence[Row]) -> None:
+def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
     path = folder / TABLE
     with whole_file(path, replace=True) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, [column.name for column in fields(Row)])
+        table = csv.DictWriter(file, [column.name for column in fields(BatchRow)])
         table.writeheader()
         table.writerows(asdict(row) for row in rows)

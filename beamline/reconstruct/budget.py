@@ -14,17 +14,16 @@ import recon
 from beamline.projections.correction import Warn
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
-from recon.assess.plans import Choice, Speeds, best_steps, plans
+from recon.assess.plans import Choice, Speeds, plans
 from recon.assess.time_model import duration_text
 from recon.auto import is_wider
 from recon.base.binning import bin_views
-from recon.base.method import DataUse, Method, ReconProblem, RunControl
+from recon.base.method import DataUse, Method, ReconProblem, RunControl, TimedMethod
 from recon.base.volume import Grid
 from recon.calibrate import calibrate
 from recon.methods import with_settings
 from recon.reconstruction import Reconstruction
-from recon.splatting.initialise import default_count, place
-from recon.splatting.r2 import R2
+from recon.splatting.initialise import default_count
 from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 
@@ -110,7 +109,7 @@ class _Budget:
         return plans(left, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
     def preferred(self, found: Sequence[Choice]) -> Choice:
-        """The first of the methods that is level with the one of which most is expected."""
+        """The first of the methods that is level with the one expected to gain most."""
         level = [c for c in found if c.gain >= found[0].gain - _LEVEL]
         order = list(self.methods)
         return min(level, key=lambda c: order.index(c.method))
@@ -131,11 +130,11 @@ def within(
 ) -> Budgeted:
     """Reconstruct within `budget` seconds by the clock of `control`, the measuring included.
 
-    For each method the settings that the time suffices for follow from its measured curves. Where there are several,
-    they are tried on some rows, and the one that predicts views held out best gets what is left; where a trial would
-    take more than 0.375 of the time, it is the first one of which as much is expected as of any. Placing of Gaussians
-    is run and timed before the fit gets what is left, and filling is timed on a slab. Where even the cheapest choice
-    will be late, `warn` gets a warning before the work.
+    For each method the settings that the time suffices for follow from its measured curves. Several methods are tried
+    on some rows, and the one that predicts views held out best gets the time that is left. Where trials would take more
+    than 0.375 of the time, the first method with the highest expectation is taken. Placing of Gaussians is run and
+    timed before the fit gets what is left, and filling is timed on a slab. Where even the cheapest choice will be late,
+    `warn` gets a warning before the work.
 
     Args:
         methods: to choose from, with measured curves, by preference; the choice sets their steps and Gaussians.
@@ -172,10 +171,7 @@ def within(
     end = begin + budget * (1 - _RESERVE)
     if over and math.isfinite(choice.gain):
         end = now() + choice.seconds
-    if isinstance(method, R2):
-        result = _fitted(method, prepared, seed, end, control)
-    else:
-        result = _run(method, prepared, seed, end, control)
+    result = _run(method, prepared, seed, end, control)
     return Budgeted(result, prepared, choice, speeds, because, now() - begin)
 
 
@@ -217,23 +213,16 @@ def _problem_of(prepared: PreparedProjections, seed: int) -> ReconProblem:
 
 
 def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
-    """The volume of a method on voxels by `end`."""
-    use, control = DataUse(prepared.ray_weights()), replace(control, should_stop=_until(control, end))
-    data, geometry = prepared.projections.data, prepared.geometry
-    return recon.reconstruct(data, geometry, method, seed=seed, use=use, control=control)
-
-
-def _fitted(method: R2, prepared: PreparedProjections, seed: int, end: float, control: RunControl) -> Reconstruction:
-    """A fit from as many Gaussians as the method says, which ends, finished and filled, by `end`."""
+    """The volume of a method by `end`."""
     data, geometry, now = prepared.projections.data, prepared.geometry, control.now
-    grid, field = Grid.matching(geometry), Grid.of_field(geometry, geometry.sample_pitch)
-    assert isinstance(method.gaussians, int)
-    placed = place(data, geometry, field, method.gaussians, np.random.default_rng(seed), kernel=method.fit.kernel)
-    data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    fit = replace(method, steps=best_steps(method.name), seconds=max(0.0, end - now()), gaussians=placed)
+    grid, held_out = Grid.matching(geometry), list[int]()
+    if isinstance(method, TimedMethod):
+        method = method.in_time(data, geometry, seed, lambda: end - now())
+    if method.traits.held_out:
+        data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
     control = replace(control, should_stop=_until(control, end))
-    return recon.reconstruct(data, geometry, fit, grid=grid, seed=seed, use=use, control=control)
+    return recon.reconstruct(data, geometry, method, grid=grid, seed=seed, use=use, control=control)
 
 
 def _until(control: RunControl, end: float) -> Callable[[], bool]:

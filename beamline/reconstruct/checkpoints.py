@@ -18,12 +18,10 @@ from beamline.projections.prepare import PreparedProjections
 from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.writers.recon_file import Value
 from recon.base.geometry import Geometry
-from recon.base.kernel import Kernel
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 
 _SHOWN = 40  # characters of a value that is told
-_BEFORE_KERNELS = {"setting kernel": Kernel.GAUSSIAN.value}  # of checkpoints that do not say
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
@@ -110,8 +108,7 @@ class CheckpointOptions:
         if self.resume is None:
             return None
         kept, reached = _whole(self.resume)
-        older = {name: value for name, value in _BEFORE_KERNELS.items() if name in origin}
-        refuse_other(self.resume, origin, {**older, **kept.made_from}, "fit")
+        refuse_other(self.resume, origin, kept.made_from, "fit")
         if 0 < steps < reached.step:
             raise ConfigError(
                 f"--resume {self.resume} has {reached.step} steps behind it, more than the {steps} wanted: give at "
@@ -123,14 +120,16 @@ class CheckpointOptions:
             warn(f"The checkpoint is of a fit {plans}: its learning rates go on where the new plan has them.")
         return kept.state
 
-    def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> None:
-        """Keep the state; where the disk refuses, that is told and the fit goes on."""
+    def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
+        """Keep the state; where the disk refuses, that is told and returned, and the fit goes on. "": it did not."""
         if self.path is None:
-            return
+            return ""
         try:
             write_checkpoint(self.path, Checkpoint(state, origin, steps))
         except DataError as error:
             warn(f"A checkpoint was left out: {error}")
+            return str(error)
+        return ""
 
 
 def _whole(path: Path) -> tuple[Checkpoint, FitState]:

@@ -52,7 +52,7 @@ def planned_views(
 class EnoughViews:
     """Looks at the views each time they have grown by a quarter.
 
-    A prediction scatters by about half a decibel, so that one is of the samples of two looks; the earlier ones, which
+    A prediction scatters by about half a decibel, so that one uses the samples of two looks. The earlier ones, which
     are larger, err on the side of more views.
 
     Args:

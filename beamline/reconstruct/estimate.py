@@ -67,8 +67,8 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     """What a reconstruction of a finished scan of a parallel beam will take; of a partial volume, what is left of it.
 
     Raises:
-        DataError: it does not fit into the memory or on the disk, with the option that would make it fit; for a cone; a
-            partial volume is of another number of slices.
+        DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
+            cone, and for a partial volume with another number of slices.
         ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
     """
     with options.source.open() as source:

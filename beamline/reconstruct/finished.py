@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
+from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
@@ -28,14 +30,13 @@ from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
 from drivers.clock import Clock
-from recon.auto import Auto
-from recon.base.method import DataUse, Method, Progress, RunControl
+from recon.base.method import CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.methods import with_trait
 from recon.reconstruction import Reconstruction
 from recon.splatting.backend import backend_for
-from recon.splatting.r2 import R2
+from recon.splatting.fit_method import FitMethod
 from recon.warm_up import warm_up
 
 _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
@@ -53,7 +54,7 @@ def reconstruct_file(
         ConfigError, DataError: with nothing written.
         ScanStopped: interrupted, with slabs to go on from.
     """
-    started, phases = clock.now(), Phases(sink, clock)
+    started, worked, phases = clock.now(), time.process_time(), Phases(sink, clock)
     phases.enter("opening the scan")
     options.target.refuse_existing()
     options.checkpoints.refuse_existing()
@@ -77,7 +78,7 @@ def reconstruct_file(
     selection = options.selection
     if options.cluster is not None and not slabs:
         warn("The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs.")
-    if isinstance(options.method, R2) and options.method.early_stop and prepared.held_out is None:
+    if options.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
@@ -92,8 +93,15 @@ def reconstruct_file(
         phases.enter("compiling kernels")
         _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region).compile_kernels()
         phases.enter("reconstruction")
+        deadline = Deadline()
+        if isinstance(options.method, FitMethod) and options.method.seconds is not None:
+            method, deadline = fit_within(
+                options.method, prepared, options.target, (started, worked), clock, warn
+            )  # fmt: skip
+            options = replace(options, method=method)
         # A direct method and a slab have no volume so far: a signal interrupts them.
-        with (never_stopped if options.method.traits.direct or slabs else stop_scope)() as stopped:
+        stopping = never_stopped if options.method.traits.direct or slabs else stop_scope
+        with stopping() as stopped, warnings_told(warn):
             job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
             if options.budget is not None:
                 outcome, prepared, factor = _within_budget(job, options.budget)
@@ -115,6 +123,7 @@ def reconstruct_file(
             recipe=options.recipe,
             region=region,
             phases=phases,
+            leaves=deadline.leaves,
         )
         partial_volume = options.partial_path if slabs and options.becomes_output else None
         metrics = write_result(outcome, prepared, truth, options.target, context, sink, clock, partial_volume)
@@ -195,7 +204,7 @@ class _Job:
         It must not count in the time of the run, nor in its estimate of the time left.
         """
         method, budget = self.options.method, self.options.budget
-        methods = method.candidates if budget is not None and isinstance(method, Auto) else (method,)
+        methods = candidates_of(method) if budget is not None else (method,)
         for one in methods if self.options.cluster is None else ():
             with self.refused(f" by {one.name}"):
                 warm_up(
@@ -242,13 +251,42 @@ class _Job:
             settings={**result.settings, **settings, **({"ended_early": True} if early else {})},
             filter=self.options.filter,
             chosen=chosen,
+            gaussians=result.gaussians,
         )
 
 
 def _at_once(job: _Job) -> ReconOutcome:
-    """Run a method on the whole volume."""
-    method = job.options.method_for(job.prepared.geometry)
-    return _by_fit(job, method) if isinstance(method, R2) else _by_method(job, method)
+    """Run a method on the whole volume; save checkpoints and continue from one if asked to."""
+    options, prepared, checkpoints = job.options, job.prepared, job.options.checkpoints
+    method = options.method_for(prepared.geometry)
+    origin, resume, steps = {}, None, 0
+    if checkpoints.wanted:
+        assert isinstance(method, CheckpointedMethod)  # others are refused before
+        settings, others = method.made_by
+        origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
+        resume = checkpoints.begin(origin, steps, job.warn)
+    keep = partial(checkpoints.write, origin, steps, job.warn)
+    control = RunControl(
+        on_progress=job.listener(getattr(method, "seconds", None)),
+        on_checkpoint=None if checkpoints.path is None else keep,
+        resume=resume,
+    )
+    result = job.run(method, control)
+    lost = "" if result.checkpoint is None else keep(result.checkpoint)
+    chosen, started_from = _chosen(result), int(result.settings.get("gaussians_at_start", 0))
+    asked = getattr(method, "gaussians", None) if options.quality is None else None
+    if options.quality is not None:
+        chosen = f"{options.quality}: {getattr(method, 'steps', None)} steps from {started_from} Gaussians"
+    if isinstance(asked, int) and resume is None and started_from < asked:
+        job.warn(f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more.")
+    if method.traits.held_out:
+        result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
+    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
+    # The sweeps of a finish follow the last step, and can be stopped as well.
+    finishes = isinstance(method, FitMethod) and method.finish_sweeps(prepared.geometry)
+    early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
+    said = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
+    return job.outcome(result, early, chosen, **said, **({"checkpoint_lost": lost} if lost else {}))
 
 
 def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
@@ -273,57 +311,11 @@ def _chosen(result: Reconstruction) -> str:
     return "" if because is None else f"{result.method}: {because}"
 
 
-def _by_method(job: _Job, method: Method) -> ReconOutcome:
-    """Run a method that has no presets and no checkpoints."""
-    result = job.run(method, RunControl(on_progress=job.listener()))
-    reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
-    return job.outcome(result, job.stop_latch.cut(reached, planned), _chosen(result))
-
-
-def _by_fit(job: _Job, method: R2) -> ReconOutcome:
-    """Fit Gaussians; save checkpoints and continue from one if asked to."""
-    options, prepared = job.options, job.prepared
-    asked, chosen = method.gaussians if options.quality is None else None, ""
-    steps, checkpoints = method.planned_steps or 0, options.checkpoints
-    origin, resume = {}, None
-    if checkpoints.wanted:
-        assert method.gaussians is None or isinstance(method.gaussians, int)
-        others = {"seed": options.seed, "start": method.start, "gaussians": method.gaussians or 0}
-        origin = origin_of(prepared, method.fit, others)
-        resume = checkpoints.begin(origin, steps, job.warn)
-    keep = partial(checkpoints.write, origin, steps, job.warn)
-    control = RunControl(
-        on_progress=job.listener(method.seconds),
-        on_checkpoint=None if checkpoints.path is None else keep,
-        resume=resume,
-    )
-    result = job.run(method, control)
-    if result.checkpoint is not None:
-        keep(result.checkpoint)
-    started_from = int(result.settings["gaussians_at_start"])
-    if options.quality is not None:
-        chosen = f"{options.quality}: {method.steps} steps from {started_from} Gaussians"
-    if isinstance(asked, int) and resume is None and started_from < asked:
-        job.warn(f"The fit started from {started_from} Gaussians, not from {asked}: the sample has no room for more.")
-    result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
-    # The sweeps follow the last step, and can be stopped as well.
-    early = (
-        job.stop_latch.stopped
-        if method.finish_sweeps(prepared.geometry)
-        else job.stop_latch.cut(result.history[-1].step, steps)
-    )
-    resumed = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
-    return job.outcome(result, early, chosen, **resumed)
-
-
 def _within_budget(job: _Job, budget: float) -> tuple[ReconOutcome, PreparedProjections, int]:
     """Reconstruct within `budget` s. Returns the outcome, the views it is of, and the binning of their pixels."""
-    method = job.options.method
-    methods = method.candidates if isinstance(method, Auto) else (method,)
+    methods, largest = candidates_of(job.options.method), None if job.region is None else 1
     control = RunControl(job.stop_latch, job.listener(budget), now=job.clock.now)
     with job.refused():
-        done = within(
-            budget, job.prepared, methods, job.options.seed, control, job.warn, None if job.region is None else 1
-        )
+        done = within(budget, job.prepared, methods, job.options.seed, control, job.warn, largest)
     outcome = job.outcome(done.result, job.stop_latch.stopped, done.summary(budget), **done.settings(budget))
     return replace(outcome, seconds=done.seconds), done.prepared, done.choice.binning

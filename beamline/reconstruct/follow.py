@@ -86,7 +86,7 @@ def follow(
                 n = growing.n_views_taken
                 warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
             made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
-    # Opened again: when it closed the file, the writer wrote some texts anew, of which HDF5 knows the old places.
+    # Opened again: when it closed the file, the writer wrote some texts anew; HDF5 knows their old places.
     with _open(options, sink, clock, rhythm) as source:
         facts = facts_of(source)
     truth = None if wanted is None else fit_truth(wanted, made.volume.grid, options.selection.binning)

@@ -211,8 +211,8 @@ class ScanFollower:
         Does nothing where the views are of one part, and these are what they were. `why` is said, unless views are
         unlearned.
 
-        Where views of these are not usable any longer, the model goes on without them, at the first rates: a check
-        found them bad when it had seen later ones, or they were taken again.
+        Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
+        again. Then the model goes on without them, at the first rates.
         """
         assert self._correction is not None and self._fit is not None
         fed = np.concatenate([batch.view_ids for batch in self._batches])
@@ -333,7 +333,7 @@ class ScanFollower:
             **({"ended_early": True} if stop_latch.stopped else {}),
         }
         method, seconds = self._options.method.name, self._clock.now() - self._begin
-        made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter)
+        made = ReconOutcome(volume, method, seconds, self._history, settings, self._options.filter, gaussians=gaussians)
         return made, prepared
 
     def _joined(self) -> Projections:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -92,14 +93,26 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
     return found if all(any((part == kind).any() for part in found) for kind in (0, 1)) else None
 
 
+def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.float32], Geometry] | None) -> float:
+    """About which share of all rays the residual of `measure` looks at."""
+    views = min(geometry.n_views, _RESIDUAL_VIEWS) + (0 if held_out is None else held_out[1].n_views)
+    rows, cols = geometry.detector_shape
+    in_bands = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
+    return views / geometry.n_views * (min(1.0, _RESIDUAL_RAYS / (rows * cols)) if in_bands else 1.0)
+
+
 def measure(
-    volume: Volume, prepared: PreparedProjections | None, truth: Volume | None, mask: NDArray[np.int8] | None
+    volume: Volume,
+    prepared: PreparedProjections | None,
+    truth: Volume | None,
+    mask: NDArray[np.int8] | None,
+    told: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
     With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. With views: the
-    residual in up to 16 of the views used, and in the views held out where there are any; of a detector with more than
-    2^17 pixels in bands of rows that have so many.
+    residual in up to 16 of the views used, and in the views held out where there are any. Of a detector with more than
+    2^17 pixels only bands of rows with so many pixels are used. `told` hears how many of these views were compared.
     """
     values: dict[str, float] = {}
     if truth is not None:
@@ -113,23 +126,29 @@ def measure(
     n = prepared.geometry.n_views
     some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
     weights = prepared.ray_factors()
-    values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights)
+    values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights, told)
     if prepared.held_out is not None:
         data, unseen = prepared.held_out
         weights = prepared.ray_factors(unseen.n_views)
         later = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
-        values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later)
+        values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later, told)
     return {name: float(value) for name, value in values.items()}
 
 
 def _residual(
-    volume: Volume, data: NDArray[np.float32], geometry: Geometry, views: NDArray[np.int64], weights: RayWeights | None
+    volume: Volume,
+    data: NDArray[np.float32],
+    geometry: Geometry,
+    views: NDArray[np.int64],
+    weights: RayWeights | None,
+    told: Callable[[int, int], None],
 ) -> float:
     """Of these views, rays that were not measured left out: what the volume does not explain of them."""
     left = total = 0.0
     some = geometry.select(views)
     matter = np.maximum(sum(data[view].sum(axis=1, dtype=np.float64) for view in views), 0)
-    for rows in residual_bands(volume.grid, some, matter):
+    bands = residual_bands(volume.grid, some, matter)
+    for n, rows in enumerate(bands):
         part = some if rows == slice(0, some.detector_shape[0]) else some.rows(rows.start, rows.stop)
         lines = volume
         if part is not some:
@@ -139,6 +158,7 @@ def _residual(
         known = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
         found, scale = residual_norms(lines, data[views, rows], part, known)
         left, total = left + found**2, total + scale**2
+        told((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:
         raise ValueError("projections are all zero, so there is nothing to explain")
     return float(np.sqrt(left / total))

@@ -13,14 +13,14 @@ from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.partial_volume import can_become
-from recon.assess.plans import Quality
+from recon.base.choices import Quality
 from recon.base.geometry import Geometry
-from recon.base.method import Method
+from recon.base.method import Method, PresetMethod
 from recon.base.volume import Grid
 from recon.methods import names, streams
+from recon.splatting.fit_method import StreamingMethod
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
-from recon.splatting.streaming_method import StreamingMethod
 from recon.voxels.enough_views import Goal
 from recon.voxels.fbp import Filter
 
@@ -33,7 +33,7 @@ class ReconOptions:
         source: the scan.
         target: where results go.
         selection: which part of the scan, and its correction.
-        method: with its settings; `R2.seconds` of a followed scan count from its end.
+        method: with its settings; `R2.seconds` are those of the whole call, of a followed scan from its end.
         budget: s for everything from line integrals to volume; chooses the method and all settings.
         quality: a preset instead of the fit's steps, Gaussians.
         device: to compute on.
@@ -46,7 +46,7 @@ class ReconOptions:
         memory: bytes that the reconstruction may use; None: 70 % of what is free.
         region: of the volume that is wanted; None: all of it.
         cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
-        partial: volume of which the missing slabs are reconstructed; None begins anew.
+        partial: volume whose missing slabs are reconstructed; None begins anew.
         command: that repeats this, for the record.
         recipe: its options that hold for any scan, as YAML, for the record.
     """
@@ -103,9 +103,14 @@ class ReconOptions:
 
     def method_for(self, geometry: Geometry) -> Method:
         """The method for these views, with the steps and Gaussians of the preset, if there is one."""
-        if self.quality is None or not isinstance(self.method, R2):
+        if self.quality is None or not isinstance(self.method, PresetMethod):
             return self.method
         return self.method.with_quality(self.quality, default_count(Grid.of_field(geometry, geometry.sample_pitch)))
+
+    @property
+    def stops_early(self) -> bool:
+        """The method ends where views held out say so."""
+        return getattr(self.method, "early_stop", False)
 
     @property
     def streaming(self) -> StreamingMethod:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from recon.assess.time_model import NextDecibel, duration_text, next_decibel, ne
 from recon.base.method import Progress
 from recon.base.volume import Volume
 from recon.methods import BASELINE, by_name
+from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import Filter
 from recon.voxels.unexplained import LIMIT, Unexplained
@@ -74,6 +75,7 @@ class ReconOutcome:
         filter: of the FBP (also of the one it is compared with).
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
         chosen: what a budget or a preset chose, in a line; empty where the settings were given.
+        gaussians: the model behind the volume, before its finish on voxels; None where there is none.
     """
 
     volume: Volume
@@ -84,13 +86,14 @@ class ReconOutcome:
     filter: Filter = "hann"
     psnr: Sequence[tuple[float, float]] = ()
     chosen: str = ""
+    gaussians: Gaussians | None = None
 
     @property
     def next_decibel(self) -> NextDecibel | None:
         """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
 
-        None for a direct method, while views still came, for a resumed fit, whose whole time is not known, and for one
-        with other rates than the fits that were measured, such as one that followed a scan.
+        None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
+        also for other rates than those of the fits that were measured, as after following a scan.
         """
         judged = residual_curve(history_arrays(self.history))
         if judged is None or _grew(self) or "resumed_from" in self.settings:
@@ -135,6 +138,7 @@ class ReportContext:
     region: RegionOfRows | None = None
     live_picture: str = ""  # file name of the last picture of a volume that grew with its scan
     phases: Phases = field(default_factory=Phases)
+    leaves: Callable[[float], bool] = lambda seconds: True  # whether there is time for so much before the report
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
@@ -279,8 +283,8 @@ def _pictures(
     pictures = [
         Picture(
             "Slices",
-            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as image "
-            "viewers show them, all in one grey window (1st to 99.5th percentile of these slices).",
+            "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
+            "viewers. All share one grey window (1st to 99.5th percentile).",
             figures.orthogonal_slices(shown, unit),
         ),
         Picture(
@@ -291,7 +295,7 @@ def _pictures(
         Picture(
             "Sharpest edge, and values",
             "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
-            "artefacts. Values: narrower peaks are better, if what lies between them is none of the sample's.",
+            "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
             figures.profile_and_values(shown, unit),
         ),
     ]

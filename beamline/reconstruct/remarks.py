@@ -3,6 +3,8 @@ fit."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from beamline.core.text import count
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.selection import Selection
@@ -21,8 +23,8 @@ def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
     z, y, x = (f"{first}:{end}" for first, end in beside_fbp.lost)
     return (
         f"The {label_of(made.method)} volume keeps {beside_fbp.kept:.0%} of the mass that FBP shows above its own air "
-        f"in a region of {z},{y},{x} [z, y, x]: weak matter was lost, as where air is below zero. See --air in "
-        "docs/commands.md, give --allow-negative, or use --method fbp."
+        f"in a region of {z},{y},{x} [z, y, x]. Weak matter was lost, as where air is below zero. See --air in "
+        "docs/corrections.md, give --allow-negative, or use --method fbp."
     )
 
 
@@ -37,14 +39,16 @@ def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
     )
 
 
-def odd_views_warning(made: ReconOutcome, prepared: PreparedProjections, selection: Selection) -> str:
-    """The warning that parts of views are not in the volume; empty where there are none, and of direct methods.
+def odd_views_warning(
+    made: ReconOutcome, prepared: PreparedProjections, selection: Selection, told: Callable[[int, int], None]
+) -> str:
+    """The warning that parts of views are not in the volume; empty where there are none.
 
-    So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
+    Args:
+        told: how many of how many views were compared.
     """
-    if by_name(made.method).traits.direct or made.settings.get("ended_early"):
-        return ""
-    found = odd_views.odd_views(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
+    views = prepared.projections.data
+    found = odd_views.odd_views(made.volume, views, prepared.geometry, prepared.ray_factors(), told=told)
     if not found:
         return ""
     first, side = (selection.rows or (0, 0))[0], selection.binning

@@ -18,11 +18,11 @@ from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
 from beamline.projections.steps.registry import recorded
-from beamline.reconstruct.measure import measure, regions
+from beamline.reconstruct.measure import measure, regions, residual_share
+from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
 from beamline.reconstruct.remarks import hiding_warning, lost_mass_warning, odd_views_warning
 from beamline.report.html import write_report
-from beamline.report.logbook import write_logbook
 from beamline.report.record import history_arrays
 from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
@@ -36,6 +36,9 @@ from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
+# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+_ODD_VIEWS, _DIRECT = 1.5, 2.5
+
 
 def report_beside(output: Path) -> Path:
     """The page of an output: report.html beside a run's recon.h5, else the output's own name with .html."""
@@ -44,14 +47,12 @@ def report_beside(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class OutputPaths:
-    """Where results go. `report` and `pdf` (a logbook page) are None where none is wanted; `replace` takes the place of
-    older results. `take` gets the result before the file `output` is written. Where that is not to be `written`, its
-    folder is only worked in."""
+    """Where results go. `report` is None where none is wanted; `replace` takes the place of older results. `take` gets
+    the result before the file `output` is written. Where that is not to be `written`, its folder is only worked in."""
 
     output: Path
     report: Path | None
     replace: bool = False
-    pdf: Path | None = None
     take: Callable[[ReconRecord], None] = lambda record: None
     written: bool = True
 
@@ -76,7 +77,7 @@ class OutputPaths:
     def refuse_existing(self) -> None:
         """Raise DataError before any work where a result is in the way, or its folder cannot be written to."""
         if not self.replace:
-            for path in (self.output, self.report, self.pdf):
+            for path in (self.output, self.report):
                 if path is not None:
                     refuse_existing(path)
         try:
@@ -123,14 +124,20 @@ def write_result(
     region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
 
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
-        return {**measure(volume, None if region_only else prepared, truth, mask), "seconds": seconds}
+        found = measure(volume, None if region_only else prepared, truth, mask, phases.told)
+        return {**found, "seconds": seconds}
 
     left = unexplained(
         made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed),
         prepared.ray_factors(),
     )  # fmt: skip
     mask = regions(truth or made.volume, context.seed)  # after what takes most memory
+    before = clock.now()
     metrics = {made.method: judged(made.volume, made.seconds)}
+    all_rays = (clock.now() - before) / residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
+    # Who stopped it waits for it, and a volume that was stopped differs from its views in many places.
+    waited_for, direct_method = "ended_early" in made.settings, by_name(made.method).traits.direct
+    left_out = []
     hiding = ""
     if left is not None:
         metrics[made.method]["unexplained"] = left.share
@@ -138,17 +145,23 @@ def write_result(
         if hiding:
             sink(Event("warning", clock.now(), {"message": hiding}))
             context = replace(context, warnings=[*context.warnings, hiding])
-    if odd := odd_views_warning(made, prepared, context.selection):
-        sink(Event("warning", clock.now(), {"message": odd}))
-        context = replace(context, warnings=[*context.warnings, odd])
+    if not (direct_method or waited_for):
+        if not context.leaves(_ODD_VIEWS * all_rays):
+            left_out.append("the look for views that do not fit the volume")
+        elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
+            sink(Event("warning", clock.now(), {"message": odd}))
+            context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
-    if not by_name(made.method).traits.direct and target.report is not None and has_direct_method(prepared.geometry):
+    compared = not direct_method and target.report is not None and has_direct_method(prepared.geometry)
+    if compared and (waited_for or not context.leaves(_DIRECT * all_rays)):
+        left_out.append("FBP for comparison")
+    elif compared:
         phases.enter("FBP for comparison")
         before = clock.now()
         grid, out = made.volume.grid, None
         if isinstance(made.volume.data, np.memmap):
             out = scratch_array(target.output.parent, grid.shape)
-        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, out=out)
+        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.told, out)
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     if BASELINE in volumes:  # it is the first
@@ -160,6 +173,11 @@ def write_result(
             if lost := lost_mass_warning(made, beside_fbp):
                 sink(Event("warning", clock.now(), {"message": lost}))
                 context = replace(context, warnings=[*context.warnings, lost])
+    if left_out:
+        why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
+        remark = f"Left out, as {why}: {', '.join(left_out)}."
+        sink(Event("state", clock.now(), {"state": "left_out", "message": remark}))
+        context = replace(context, warnings=[*context.warnings, remark])
     own = metrics[made.method]
     phases.enter("report")
     parameters = parameters_of(made, prepared, context)
@@ -175,17 +193,14 @@ def write_result(
         parameters=parameters,
         metrics=own,
         history=history_arrays(made.history),
+        model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
     )
-    pages: list[Path] = []
+    page: Path | None = None
     try:
-        if target.report is not None or target.pdf is not None:
-            page = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
         if target.report is not None:
-            write_report(target.report, page, replace=target.replace)
-            pages.append(target.report)
-        if target.pdf is not None:
-            write_logbook(target.pdf, page, record.volume, prepared.length_unit, clock.now(), replace=target.replace)
-            pages.append(target.pdf)
+            report = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
+            write_report(target.report, report, replace=target.replace)
+            page = target.report
         phases.enter("writing the volume")
         target.take(record)
         if partial_volume is not None:
@@ -193,14 +208,13 @@ def write_result(
         elif target.written:
             write_volume(target.output, record, replace=target.replace)
     except BaseException:
-        for written in pages:
-            remove(written)
+        if page is not None:
+            remove(page)
         raise
     phases.end()
     summary: dict[str, Any] = {
         "output": target.output,
         "report": target.report,
-        **({} if target.pdf is None else {"pdf": target.pdf}),
         "method": made.method,
         "axis_col": prepared.axis_col,
         "n_views": prepared.geometry.n_views,
@@ -210,7 +224,8 @@ def write_result(
         "times": phases.seconds,
         **own,
     }
-    summary |= {name: made.settings[name] for name in ("ended_early", "resumed_from") if name in made.settings}
+    said = ("ended_early", "resumed_from", "checkpoint_lost")
+    summary |= {name: made.settings[name] for name in said if name in made.settings}
     if hiding:
         summary["hiding"] = hiding
     if made.chosen:

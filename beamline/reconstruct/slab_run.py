@@ -23,22 +23,20 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import for_part
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
 from beamline.storage.writers.recon_file import ReconRecord, Value
-from recon.auto import Auto
 from recon.base.decisions import Decisions
 from recon.base.method import Method, Progress, RunControl
 from recon.base.slabs import Slab, part_of
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
-from recon.splatting.r2 import R2
 from recon.voxels.methods.fista_tv import FistaTv
 
 _LOOKED_AT = 8  # views by which the rows with most matter are found
-_WEIGHED = 16  # rows of which weights are made at a time
+_WEIGHED = 16  # rows whose weights are made at a time
 
 _LOOK = 0.5  # s between two looks at slabs under way
 
 T = TypeVar("T")
-Run = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
+RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
 """Reconstructs views on a grid."""
 
 
@@ -47,11 +45,11 @@ class SlabWorkers:
     """Reconstructs `count` slabs at a time, each by `run` in a thread of its own."""
 
     count: int
-    run: Run
+    run: RunMethod
 
 
 def in_slabs(
-    run: Run,
+    run: RunMethod,
     prepared: PreparedProjections,
     options: ReconOptions,
     slabs: Sequence[Slab],
@@ -84,7 +82,7 @@ def in_slabs(
         said(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
     in_all = sum(slab.slices.stop - slab.slices.start for slab in slabs)
 
-    def made(n: int, by: Run, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
+    def made(n: int, by: RunMethod, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
         """The slab, and what is to be said of it; None of views that are zero."""
         slab, follows = slabs[n], partial is not None
         one = replace(control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0]))
@@ -97,7 +95,7 @@ def in_slabs(
             return by(method, part, box, one), ""
         except DataError as error:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
-            if not follows or not isinstance(options.method, R2 | Auto):
+            if not follows or not options.method.traits.needs_matter:
                 raise
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
             return by(FistaTv(), part, box, one), remark

@@ -29,10 +29,9 @@ from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.clock import Clock
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
-from recon.base.method import Method
+from recon.base.method import DividedMethod, Method
 from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
-from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
 from recon.voxels.odd_views import odd_views_memory
 from recon.voxels.unexplained import unexplained_memory
@@ -128,16 +127,8 @@ class Needs:
 
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
-    """The method for so many slices: as many Gaussians as belong to them `of` a volume, and their part of the seconds
-    for all slabs, which with what they share have so many `in_all`."""
-    if not isinstance(method, R2):
-        return method
-    count = method.gaussians
-    if isinstance(count, int):
-        count = max(1, round(slices / of * count))
-    return replace(
-        method, gaussians=count, seconds=None if method.seconds is None else slices / in_all * method.seconds
-    )
+    """The method for so many slices `of` a volume; slabs, with the slices that they share, have so many `in_all`."""
+    return method.for_part(slices / of, slices / in_all) if isinstance(method, DividedMethod) else method
 
 
 def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
@@ -210,7 +201,7 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory
     whole = {
         "--budget": options.budget is not None,
         "--checkpoint and --resume": options.checkpoints.wanted,
-        "--early-stop": isinstance(options.method, R2) and options.method.early_stop,
+        "--early-stop": options.stops_early,
     }
     for option, given in whole.items():
         if given:

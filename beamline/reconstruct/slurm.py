@@ -83,7 +83,7 @@ def slurm_jobs(spec: str) -> SlurmJobs:
 
 
 def _cluster(jobs: SlurmJobs) -> Any:
-    """The cluster of these jobs, of which none is submitted."""
+    """The cluster of these jobs; no job is submitted."""
     from dask_jobqueue import SLURMCluster
 
     return SLURMCluster(

@@ -18,7 +18,7 @@ from scipy import ndimage
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
-Window = tuple[float, float]
+GreyWindow = tuple[float, float]
 DPI = 110
 _FINEST = 300  # pixels an inch, of slices, which have a pixel a voxel as far as that goes
 WIDTH = 8.6  # inches; the report's column
@@ -27,7 +27,7 @@ _LOOKED_AT = 256  # slices along each axis, at least, of a volume that has more
 _THIN = 0.06  # an image with a smaller ratio of height to width is stretched
 
 
-def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> Window:
+def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: float = 99.5) -> GreyWindow:
     """One range of grey values for all `arrays`: percentiles of their values together."""
     finite = np.concatenate([a[np.isfinite(a)].ravel() for a in arrays])
     if finite.size == 0:
@@ -82,7 +82,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     return png(figure)
 
 
-def planes(grid: Grid) -> list[tuple[str, str, Window, Window]]:
+def planes(grid: Grid) -> list[tuple[str, str, GreyWindow, GreyWindow]]:
     """Of slices at one z, y and x: the axes to the right and down, and their edges: left and right, bottom and top."""
     z, y, x = (_edges(grid.centre[i], grid.shape[i], grid.voxel_size) for i in range(3))
     return [("x", "y", x, y[::-1]), ("x", "z", x, z[::-1]), ("y", "z", y, z[::-1])]
@@ -93,7 +93,7 @@ def downwards(axis: str, unit: str) -> str:
     return f"← {axis} ({unit})"
 
 
-def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Window = (1.0, 99.5)) -> bytes:
+def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: GreyWindow = (1.0, 99.5)) -> bytes:
     """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
 
     They intersect at the centre of mass of the bright voxels of the last volume.
@@ -170,7 +170,7 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
     """Each volume along a line through the sharpest edge of the last one, and how often its values occur.
 
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
-    voxel, so that single noisy voxels are no edges.
+    voxel. So single noisy voxels are no edges.
     """
     last = list(volumes.values())[-1].data
     z = bright_centre(last)[0]

@@ -14,7 +14,7 @@ from beamline.core.files import write_whole
 from beamline.core.version import version
 from beamline.report.metrics import METRICS, formatted
 
-Facts = Mapping[str, str]
+FactTable = Mapping[str, str]
 """Values for people, by name; a table of two columns on the page."""
 
 
@@ -48,8 +48,8 @@ class Report:
 
     title: str
     summary: str
-    scan: Facts
-    settings: Facts
+    scan: FactTable
+    settings: FactTable
     metrics: Mapping[str, Mapping[str, float]]
     frames: str
     flags: Sequence[str]

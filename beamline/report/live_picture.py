@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from beamline.report.figures import Window, bright_centre, grey_window, png
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, png
 from recon.base.noise import noise_level
 from recon.base.volume import Volume
 
@@ -103,7 +103,7 @@ class _Panel:
 
     pixels: F32
     colours: str | LinearSegmentedColormap
-    limits: Window
+    limits: GreyWindow
     label: str
     note: str
     bar: tuple[float, str] | None = None
@@ -133,7 +133,7 @@ class _Panel:
 
 def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:
     """The images with pixels repeated, or means of several, so that the longest side is _SIDE pixels or more, less than
-    twice as many; how many pixels one became."""
+    twice as many. Then how many pixels one became."""
     longest = max(max(image.shape) for image in images)
     if longest < _SIDE:
         factor = math.ceil(_SIDE / longest)

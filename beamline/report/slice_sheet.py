@@ -14,7 +14,7 @@ F32 = NDArray[np.float32]
 _COLUMNS = 4
 
 
-class Slices:
+class SliceSheet:
     """The slice [y, x] of each volume through the bright parts of the first one, by label."""
 
     def __init__(self) -> None:

@@ -82,8 +82,8 @@ class Acquisition:
     def frames(self) -> Generator[Frame, None, None]:
         """Frames, each with its own memory, its row in the file, its trigger and its angle.
 
-        In any case (also when the caller closes the iterator), at the end the stage is stopped, camera and trigger
-        output are disarmed and the shutter is closed; sample and stage return to where they were unless the scan was
+        At the end, also when the caller closes the iterator, the stage is stopped, camera and trigger
+        output are disarmed and the shutter is closed. Sample and stage return to where they were unless the scan was
         aborted or a device failed. A lost frame does not end the scan; the error is raised after the last frame.
 
         Raises:
@@ -323,8 +323,8 @@ def _describe(done: TakenBlock) -> str:
     if taken.unconfirmed:
         text += (
             f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
-            "where it stands confirm: noise on the trigger line, or another deceleration than the stage's. They are "
-            "kept as invalid rows."
+            "where it stands confirm. The cause is noise on the trigger line, or another deceleration than the "
+            "stage's. They are kept as invalid rows."
         )
     if taken.shift:
         text += (

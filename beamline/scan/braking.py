@@ -1,8 +1,8 @@
 """Braking: which triggers exposed the frames that came after a stage was told to stop within a train.
 
 Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
-frames: from its speed u it stands u²/2a further on (constant deceleration a), so the place where it stands tells when
-it began to brake, and where it was at the time of each frame. Of a stage that brakes otherwise, by jerk-limited ramps,
+frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands tells when
+it began to brake, and where it was at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
 the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
 Frames that neither confirms belong to no trigger. All functions are pure.
 """
@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from beamline.scan.ledger import Exposed, Ledger, enter, start_known
+from beamline.scan.ledger import DeliveredFrame, Ledger, enter, start_known
 
 EARLY, LATE = 0.02, 0.5  # s by which a stage may seem to brake before it was told to, and may brake after that
 MOST = 0.75  # of the triggers that must have a frame by their times; by chance 0.4 have
@@ -38,11 +38,11 @@ class Braking:
     deceleration: float
 
 
-Placing = Callable[[Ledger, Braking, Exposed], Exposed]
+Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
 """Gives a frame the time at which its trigger would have come at constant speed; nan where that is not known."""
 
 
-def placing(ledger: Ledger, braking: Braking, frames: Sequence[Exposed]) -> Placing:
+def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
     """What confirms the frames that a stage gave until it stood: its motion, their number, or nothing."""
     steady, moved, counted = (booked(ledger, braking, frames, way) for way in (by_nothing, by_motion, by_number))
     fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
@@ -53,7 +53,7 @@ def placing(ledger: Ledger, braking: Braking, frames: Sequence[Exposed]) -> Plac
     return by_number if due >= FEW and all_counted and _ever_slower(ledger, braking, frames) else by_nothing
 
 
-def booked(ledger: Ledger, braking: Braking, frames: Sequence[Exposed], way: Placing) -> Ledger:
+def booked(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame], way: Placing) -> Ledger:
     """The ledger with all frames."""
     for i in range(len(frames)):
         entered = enter(ledger, [way(ledger, braking, frame) for frame in frames[i:]], last=True)
@@ -61,7 +61,7 @@ def booked(ledger: Ledger, braking: Braking, frames: Sequence[Exposed], way: Pla
     return ledger
 
 
-def by_motion(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
+def by_motion(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     train = ledger.train
     if ledger.last >= 0:
         last, phase, period = ledger.last, ledger.phase, ledger.period
@@ -76,17 +76,17 @@ def by_motion(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
     if frame.time <= began:
         return frame
     braked = min(frame.time - began, seconds)
-    return Exposed(frame.framestamp, began + braked - braked**2 / (2 * seconds), steady=False)
+    return DeliveredFrame(frame.framestamp, began + braked - braked**2 / (2 * seconds), steady=False)
 
 
-def by_number(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
+def by_number(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     if frame.time < braking.told or ledger.last < 0:
         return by_nothing(ledger, braking, frame)
     exposures = ledger.unmatched + frame.framestamp - ledger.exposed
-    return Exposed(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
+    return DeliveredFrame(frame.framestamp, ledger.phase + exposures * ledger.period, steady=False)
 
 
-def by_nothing(ledger: Ledger, braking: Braking, frame: Exposed) -> Exposed:
+def by_nothing(ledger: Ledger, braking: Braking, frame: DeliveredFrame) -> DeliveredFrame:
     return frame if frame.time < braking.told else replace(frame, time=math.nan, steady=False)
 
 
@@ -94,9 +94,9 @@ def _matched(ledger: Ledger) -> int:
     return ledger.last + 1 - len(ledger.missing)
 
 
-def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[Exposed]) -> bool:
+def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
     """The intervals between exposures grow from the last steady one on."""
-    steady = [Exposed(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
+    steady = [DeliveredFrame(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
     came = [steady[-1], *(frame for frame in frames if frame.time >= braking.told)]
     intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]
     period = ledger.train.period

@@ -1,6 +1,6 @@
 """Control: verbs to a running scan from another terminal.
 
-A verb is an empty file of that name in the folder `control` of the run, which only its owner can write to; the scan
+A verb is an empty file of that name in the folder `control` of the run, which only its owner can write to. The scan
 takes it away and does it. So it works on every system and file system, no port is open, and nothing is parsed. Where
 there are owners and modes, they are looked at on every use, and a folder put in its place is not looked into.
 """

@@ -15,7 +15,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, booked, by_nothing, placing
-from beamline.scan.ledger import EXTRA, Account, Exposed, Ledger, Train, enter, settle
+from beamline.scan.ledger import EXTRA, Account, DeliveredFrame, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
 from drivers.clock import Clock
@@ -122,8 +122,8 @@ class _Pass:
             yield self.waiting.pop(0), trigger, entry.angle
 
     @property
-    def _exposed(self) -> list[Exposed]:
-        return [Exposed(frame.framestamp, frame.time) for frame in self.waiting]
+    def _exposed(self) -> list[DeliveredFrame]:
+        return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]
 
     @property
     def _braking(self) -> Braking:
@@ -212,8 +212,8 @@ class Exposures:
             i += yield from self._pass(block, taken, left, i, (begin, flown.end))
 
     def _after_pause(self, i: int, block: Block, taken: Taken) -> int:
-        """Wait while the scan is paused. Returns the trigger to go on with: `i` or the next one that is not stored, or
-        the first one since there may have been no beam; its frame and those after it are taken again."""
+        """Wait while the scan is paused. Returns the trigger to go on with: `i` or the next one that is not stored. Or
+        the first one since there may have been no beam. Its frame and those after it are taken again."""
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
         if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
             self._supervision.wait_for_beam_reading()

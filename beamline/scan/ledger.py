@@ -2,12 +2,12 @@
 
 A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost in transfer. The
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
-While a stage turns at constant speed, trigger times are linear in the trigger's index, so the index of a frame is the
-nearest whole number of periods since the frame before; slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too: where the first trigger's time is not known well, the
-first frames are those that make a regular train, and of two frames that could be a trigger's the nearer one is. That
-takes a look at the frames that follow: see `enter`. Frames exposed while the stage brakes come with the times at which
-their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
+While a stage turns at constant speed, trigger times are linear in the trigger's index. So the index of a frame is the
+nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
+Bordner 1962). Noise on the trigger line exposes frames, too. Where the first trigger's time is not known well, the
+first frames are those that make a regular train. Of two frames that could belong to a trigger, the nearer one does.
+That takes a look at the frames that follow: see `enter`. Frames exposed while the stage brakes come with the times at
+which their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Train:
 
 
 @dataclass(frozen=True)
-class Entry:
+class LedgerEntry:
     """The trigger of a frame (EXTRA: no trigger exposed it) and the angle in radians at its time."""
 
     trigger: int
@@ -128,8 +128,8 @@ class Account:
         extra: framestamps of the frames that no trigger exposed.
         unconfirmed: how many of them were exposed while the stage braked.
         shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
-            missing at the other, or a frame too many at the end could be one at the beginning; 0 where there is none
-            or the time of the first trigger was known.
+            missing at the other. Likewise a frame too many at the end could be one at the beginning. 0 where there is
+            none or the time of the first trigger was known.
         off: steps by which the angle of a frame may be wrong, because it came so much off its trigger.
     """
 
@@ -143,7 +143,7 @@ class Account:
 
 
 @dataclass(frozen=True)
-class Exposed:
+class DeliveredFrame:
     """A frame as it comes from the camera: see `assign`."""
 
     framestamp: int
@@ -151,7 +151,7 @@ class Exposed:
     steady: bool = True
 
 
-def enter(ledger: Ledger, frames: Sequence[Exposed], last: bool) -> tuple[Ledger, Entry] | None:
+def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple[Ledger, LedgerEntry] | None:
     """Enter the first of the frames that wait, by what those after it show; None: it must wait for further frames.
 
     Args:
@@ -180,7 +180,7 @@ def enter(ledger: Ledger, frames: Sequence[Exposed], last: bool) -> tuple[Ledger
     return after, entry
 
 
-def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, Entry]:
+def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) -> tuple[Ledger, LedgerEntry]:
     """Enter a received frame: the ledger after it, and the frame's trigger and angle.
 
     Frames come in the order in which they were exposed.
@@ -189,7 +189,7 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
         time: the frame's trigger time in s; nan: no trigger is known to have exposed it.
         steady: the stage turned at constant speed; else the time is as if it had, and must fit better.
     """
-    train, frame = ledger.train, Exposed(framestamp, time, steady)
+    train, frame = ledger.train, DeliveredFrame(framestamp, time, steady)
     if math.isnan(time):
         return _extra(ledger, frame, max(ledger.last, 0))
     new_exposures = framestamp - ledger.exposed
@@ -221,10 +221,10 @@ def assign(ledger: Ledger, framestamp: int, time: float, steady: bool = True) ->
         matched = _follow(ledger, matched, time, steps, residual)
     else:
         matched = replace(matched, phase=ledger.phase + steps * ledger.period)
-    return matched, Entry(trigger, float(train.angles[trigger]))
+    return matched, LedgerEntry(trigger, float(train.angles[trigger]))
 
 
-def _extra(ledger: Ledger, frame: Exposed, position: float, beyond: bool = False) -> tuple[Ledger, Entry]:
+def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool = False) -> tuple[Ledger, LedgerEntry]:
     """Enter a frame that no trigger exposed, at a position in periods."""
     train, new_exposures = ledger.train, frame.framestamp - ledger.exposed
     after = replace(
@@ -236,7 +236,7 @@ def _extra(ledger: Ledger, frame: Exposed, position: float, beyond: bool = False
         beyond=ledger.beyond + beyond,
         unconfirmed=ledger.unconfirmed + (not frame.steady),
     )
-    return after, Entry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
+    return after, LedgerEntry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
 
 
 def settle(ledger: Ledger, cut_short: bool = False) -> Account:
@@ -292,8 +292,8 @@ def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int
     Args:
         framestamp: exposures before it, without those that no trigger made.
 
-    Where the expected time is not precise enough, framestamps decide: no trigger was ignored before the first frame,
-    because a camera that is armed and idle ignores none.
+    Where the expected time is not precise enough, framestamps decide. No trigger was ignored before the first frame,
+    because an armed, idle camera takes every trigger.
     """
     if train.first is None:
         return float(framestamp), framestamp, 0.0

@@ -18,7 +18,7 @@ from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.machine import free_memory
 from beamline.instrument import connect
-from beamline.instrument.connect import Instrument, camera_settings
+from beamline.instrument.connect import ConnectedDevices, camera_settings
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.watch import Monitor, usual_step
@@ -158,7 +158,7 @@ class ReadyScan:
     info: ScanInfo
 
 
-def preflight(config: Config, instrument: Instrument, runs: Path, remaining: Remaining = all_of) -> ReadyScan:
+def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remaining: Remaining = all_of) -> ReadyScan:
     """Ask the devices what they can do, and work the plan out for them. Nothing moves.
 
     Args:
@@ -208,7 +208,7 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
     )
 
 
-def _info(config: Config, instrument: Instrument, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
+def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:

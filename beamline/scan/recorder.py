@@ -73,8 +73,8 @@ class Recorder:
 
     What was appended is flushed when no frame waits; while some do, the writer decides how often.
 
-    No frame is dropped: while the disk is behind, `put` waits. So that it need not in a fly scan, whose frames come
-    whether there is room or not, the scan pauses before; and any scan before the disk is full.
+    No frame is dropped: while the disk is behind, `put` waits. In a fly scan frames come whether there is room or not,
+    so the scan pauses before that. Any scan pauses before the disk is full.
 
     Args:
         react: told the flags of each frame.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.references import Reference, ReferenceLimits, judge, photons
+from beamline.monitor.references import ReferenceFrame, ReferenceLimits, judge, photons
 from beamline.plan.plan import Block
 from drivers.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
@@ -24,8 +24,8 @@ class ReferenceLog:
 
     def __init__(self, preview_bin: int) -> None:
         self._preview_bin = preview_bin
-        self._groups: list[list[Reference]] = []
-        self._views: list[Reference] = []
+        self._groups: list[list[ReferenceFrame]] = []
+        self._views: list[ReferenceFrame] = []
         self._before = FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
@@ -33,10 +33,10 @@ class ReferenceLog:
         if frame.kind in REFERENCES:
             if frame.kind is not self._before:
                 self._groups.append([])
-            found = Reference.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin)
+            found = ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin)
             self._groups[-1].append(found)
         elif frame.kind is FrameKind.PROJECTION and len(self._views) < VIEWS:
-            self._views.append(Reference.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin))
+            self._views.append(ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin))
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
         if frame.replaces >= 0:
             for known in (*self._groups, self._views):
@@ -46,7 +46,7 @@ class ReferenceLog:
         """What is wrong with the groups so far, by the name of the group; a sentence or more each.
 
         Args:
-            planned: blocks that are over by now; references of which no frame came are missing.
+            planned: blocks that are over by now; references without any frame are missing.
         """
         missing = {
             block.kind.name: f"None of the {block.n} {block.kind.name.lower()}s planned before the views came."

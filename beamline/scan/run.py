@@ -30,7 +30,7 @@ from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
-from beamline.instrument.connect import Instrument, connect
+from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
 from beamline.monitor.rehearsal import rehearse
@@ -110,7 +110,7 @@ def run_scan(
     stop: StopRequest | None = None,
     *,
     live: LiveCommand | None = None,
-    instrument: Instrument | None = None,
+    instrument: ConnectedDevices | None = None,
     ask: Ask | None = None,
     afterwards: LiveCommand | None = None,
 ) -> RunResult:
@@ -176,9 +176,9 @@ def _refuse_stop(stop: StopRequest) -> None:
 
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
-    """Whether the live reconstruction of a scan that has ended should end with the volume that it has: after an abort,
-    a stop that comes now, ASK_LIVE_AFTER after that of the scan (not where its views were enough), or with a `useless`
-    file, which is broken or has no projections."""
+    """Whether the live reconstruction of a scan that has ended should end with the volume that it has. It should after
+    an abort, a stop that comes now, or ASK_LIVE_AFTER after that of the scan (not where its views were enough). Also
+    with a `useless` file, which is broken or has no projections."""
     last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
 
     def ends() -> bool:
@@ -190,7 +190,7 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
 @dataclass(frozen=True, eq=False)
 class _Run:
     config: Config
-    instrument: Instrument
+    instrument: ConnectedDevices
     ready: ReadyScan
     folder: Path
     stop: StopRequest
@@ -247,8 +247,8 @@ class _Run:
             follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
 
     def _prepare_memory(self) -> None:
-        """Memory for the frames that may wait for the disk, before the first comes: at most a quarter of what is
-        free, as a live volume takes half."""
+        """Memory for the frames that may wait for the disk, before the first comes. At most a quarter of the free
+        memory, as a live volume takes half."""
         memory, timeline = self.instrument.frame_memory, self.ready.timeline
         n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
         if memory is None or n == 0:

@@ -25,7 +25,7 @@ _HEAD, _TAIL = 2**16, 2**17  # bytes of a log that are read: the sample stands a
 _ENDING = 600.0  # real s since the last line of a log, within which a scan that is complete may still be ending
 _OF_STATUS = {"complete": State.DONE, "stopped": State.STOPPED, "failed": State.FAILED}
 
-Flags = Mapping[str, Mapping[str, int]]
+FlagCounts = Mapping[str, Mapping[str, int]]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Run:
     time: float
     frames: int | None
     planned: int | None
-    flags: Flags
+    flags: FlagCounts
     state: str
     bytes: int
     parts: int
@@ -116,7 +116,7 @@ def _numbered(run: Path) -> tuple[int, str]:
     return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name
 
 
-def _part(part: Path) -> tuple[str, int | None, bool, Flags]:
+def _part(part: Path) -> tuple[str, int | None, bool, FlagCounts]:
     """State, frames, whether these are of all parts so far, and flags."""
     said = _said(part)
     done = said.get("done") or said.get("scan_done") or {}
@@ -151,7 +151,7 @@ def _unended(part: Path, done: Mapping[str, Any]) -> str:
     return _OF_STATUS.get(str(done.get("status")), State.FAILED)
 
 
-def _of_file(scan: Path) -> tuple[int | None, Flags]:
+def _of_file(scan: Path) -> tuple[int | None, FlagCounts]:
     """Frames and flags by the head of a scan file; None where it does not open."""
     from beamline.storage import hdf5
     from beamline.storage.flag_legend import read_flags
@@ -200,7 +200,7 @@ def _whole(value: object) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) else None
 
 
-def _flags(value: object) -> Flags:
+def _flags(value: object) -> FlagCounts:
     found = value if isinstance(value, dict) else {}
     return {
         str(check): {str(level): n for level, n in levels.items() if isinstance(n, int)}

@@ -33,8 +33,8 @@ class Supervision:
         refusal: asked once, before the first projection, when all frames before it were taken over: why no projection
             should be taken; None: they may be.
         pause: looked at before each frame of a stage that stands, and all the time while it turns.
-        wait_in_pause: called again and again while the scan is paused: waits a moment, and says whether the operator at
-            the terminal let it go on since the last call.
+        wait_in_pause: called again and again while the scan is paused. It waits a moment, and says whether the operator
+            at the terminal let the scan go on since.
         states: told what the scan is doing.
         wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there
             was beam.
@@ -124,8 +124,8 @@ class SpaceGuard:
 class Workload:
     """Seconds that a recorder's threads have spent, by the clock and of the processor.
 
-    Checking a frame waits for nothing but the processor; so what writing took beyond the same multiple of its own
-    processor time, it waited for the disk.
+    Checking a frame waits for the processor alone. What writing took beyond the same multiple of its own processor
+    time, it waited for the disk.
     """
 
     checking: float = 0.0

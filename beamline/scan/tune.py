@@ -1,7 +1,7 @@
 """Tune: a few darks, flats and views at some exposures, and what they say about counts, noise and the exposure to take.
 
-Noise is told from structure by pairs of frames; the gain by photon transfer (Janesick 2007, Photon Transfer, ch. 5):
-variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
+Noise is told from structure by pairs of frames. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
+ch. 5): variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
 sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
 """
 
@@ -19,9 +19,9 @@ from beamline.config.references import reference_limits
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Emit
 from beamline.core.stop import StopRequest
-from beamline.instrument.connect import Instrument, camera_settings
+from beamline.instrument.connect import ConnectedDevices, camera_settings
 from beamline.monitor.digest import digest
-from beamline.monitor.references import FaultKind, Reference, ReferenceLimits, judge
+from beamline.monitor.references import FaultKind, ReferenceFrame, ReferenceLimits, judge
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
@@ -53,7 +53,7 @@ class Tuning:
         saturated: fraction of its pixels that are saturated at the configured exposure.
         gain: counts of a photon; NaN where the frames have no noise.
         transmission: of the view, at its darkest hundredth and in the median.
-        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow; NaN
+        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
             where darks have light or flats none.
         noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median.
         longest: exposure that the period and the camera allow.
@@ -112,7 +112,9 @@ class Tuning:
         return [f"{name:<11}{text}" for name, text in words] + [f"{'FAULT':<11}{fault}" for fault in self.faults]
 
 
-def tune(config: Config, instrument: Instrument, stop: StopRequest, emit: Emit, angle: float | None = None) -> Tuning:
+def tune(
+    config: Config, instrument: ConnectedDevices, stop: StopRequest, emit: Emit, angle: float | None = None
+) -> Tuning:
     """Take darks, flats and views at a few exposures and evaluate them. Nothing is written.
 
     At the end the shutter is closed and stage and sample are where they were, as after a scan.
@@ -166,7 +168,7 @@ def evaluate(
     brightest = float(np.percentile(digest(flat, preview_bin=BLOCK).preview, BRIGHTEST))
     room = (saturation * TARGET - np.median(dark)) / max(brightest - np.median(dark), 1e-9)
     references = [
-        Reference.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
+        ReferenceFrame.of(i, frame.kind, frame.exposure, digest(frame.counts, saturation, BLOCK), BLOCK)
         for i, frame in enumerate([*darks, *(frame for frame in flats if frame.exposure == first)])
     ]
     judged = judge([references[: len(darks)], references[len(darks) :]], limits)
@@ -210,7 +212,7 @@ def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: in
 
 
 def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:
-    """The longest exposure of the flats of which few pixels are saturated; the shortest where there is none."""
+    """The longest exposure among flats with few saturated pixels; else the shortest."""
     exposures = sorted({frame.exposure for frame in flats}, reverse=True)
     for exposure in exposures:
         each = [(frame.counts >= saturation).mean() for frame in flats if frame.exposure == exposure]
@@ -228,7 +230,7 @@ def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
     return float(squares[squares <= ZINGER**2 * np.median(squares)].mean()) / 2
 
 
-def _accepted(instrument: Instrument, config: Config, exposure: float) -> list[float]:
+def _accepted(instrument: ConnectedDevices, config: Config, exposure: float) -> list[float]:
     """The exposures that the camera takes, the longest first.
 
     Raises:

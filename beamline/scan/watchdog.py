@@ -147,15 +147,14 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
         say: takes a sentence on each step.
     """
     stage, shutter = config.devices.stage, config.devices.shutter
-    settings, port = stage.settings, stage.port
     closed = "its shutter is closed" if isinstance(shutter, StageOutputShutter) else "the shutter is moved by hand"
 
     def disarm() -> None:
-        with closing(settings.connect(port, clock)) as connected:
+        with closing(stage.connect(clock)) as connected:
             connected.disarm()
             shutter_of(config, connected, clock, say).close()
 
-    stopped = _insist(lambda: settings.halt(port, clock), clock, say, "The stage was told to stop.")
+    stopped = _insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")
     return _insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}.") and stopped
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import binary_dilation
 from beamline.config.tree import read
 from beamline.core.errors import ConfigError
 from beamline.simulate.scene_file import open_scene, volumes_beside
-from beamline.xafs.contrast import Regions
+from beamline.xafs.contrast import ContrastRegions
 from beamline.xafs.depth import line_integrals
 from beamline.xafs.series import Series
 from simulators.frame.mapping import SceneError
@@ -53,7 +53,7 @@ class EnergyScan:
     energies: Reals
     angle: float
     material: str
-    regions: Regions
+    regions: ContrastRegions
 
     def series(self) -> Series:
         """Its radiographs, computed lazily."""
@@ -61,8 +61,8 @@ class EnergyScan:
         return Series(title, self.energies.size, self.frames(self.energies), self.regions)
 
     def frames(self, energies: Reals) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene: first a dark level, then
-        flats and a radiograph for each energy, in the scene's period. A pixel without light is +inf."""
+        """(keV, line integrals [row, col]) of each energy, with all the effects of the scene. First comes a dark level,
+        then flats and a radiograph for each energy, in the scene's period. A pixel without light is +inf."""
         n_darks = max(self.scan.scene.scan.darks, 1)
         dark = np.mean([self._counts(n, beam=False, sample=False) for n in range(n_darks)], axis=0)
         number = n_darks
@@ -164,7 +164,7 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
     return wanted
 
 
-def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Regions:
+def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> ContrastRegions:
     """Pixels with much of the material, and those near it without it, in the sample if possible, else in air."""
     thickness = sample.thickness(angle, scan.detector)
     mine = np.array([_is(c, material) for c in sample.constituents])
@@ -174,7 +174,7 @@ def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Region
     inside = own >= THICK * own.max()
     near = binary_dilation(own > 0, iterations=min(NEAR, max(own.shape))) & (own == 0)
     matter = near & (thickness != 0).any(axis=0)
-    return Regions(inside, matter if matter.any() else near, float(own[inside].mean()))
+    return ContrastRegions(inside, matter if matter.any() else near, float(own[inside].mean()))
 
 
 def _is(constituent: Constituent, material: str) -> bool:

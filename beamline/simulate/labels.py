@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beamline.core.files import write_whole
+from beamline.monitor.view import PixelBox
 
 if TYPE_CHECKING:
     from simulators.effects.anomaly import Label
-
-Region = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class LabelledRun:
 
     kind: str
     first: int
-    regions: tuple[Region, ...]
+    regions: tuple[PixelBox, ...]
 
     @property
     def last(self) -> int:

@@ -32,7 +32,7 @@ REPORT_EVERY = 0.1  # s of real time between `frame` events
 
 
 @dataclass(frozen=True)
-class Simulated:
+class SimulatedScan:
     """The written files; `stopped` where the scan ended before its last frame."""
 
     path: Path
@@ -60,7 +60,7 @@ def check_output(scan: Scan, out: Path) -> None:
 
 def write_scan(
     scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, check_stop: Callable[[], bool]
-) -> Simulated:
+) -> SimulatedScan:
     """Compute every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
 
     Args:
@@ -94,7 +94,7 @@ def write_scan(
         raise
     runs = log.runs()
     write_labels(labels, runs, n)
-    return Simulated(out, labels, n, runs, time.monotonic() - start, n < len(scan))
+    return SimulatedScan(out, labels, n, runs, time.monotonic() - start, n < len(scan))
 
 
 def _write(scan: Scan, planned: PlannedFrame, row: int, writer: NXtomoWriter) -> tuple[Label, ...]:

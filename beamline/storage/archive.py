@@ -8,38 +8,47 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
-from beamline.core.text import count, size, spans
-from beamline.monitor.digest import checksum_of
+from beamline.core.text import count, spans
+from beamline.monitor.digest import checksum_of, has_checksum
 from beamline.storage import hdf5
 from beamline.storage.codecs import filter_of
-from beamline.storage.compressed_copy import (
-    CompressedCopy,
-    ImageCounter,
-    Progress,
-    drawn_from,
-    image_datasets,
-    images,
-    is_image_dataset,
-)
 from beamline.storage.parts import joined_file_of, other_parts
 from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.validate import altered_said
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 
-_SAMPLES = 4  # images that say how far a dataset can be compressed
-_ROOM = 1.1  # free space over the size expected
+_IMAGE = 4096  # bytes from which a row of a dataset [frame, row, col] is an image
 _BLOCK = 2**24  # bytes that are compared at once
+
+
+Progress = Callable[[int, int], None]
+"""Is told how many of how many MB are done."""
+CountImage = Callable[[NDArray[Any]], None]
+
+
+def _counter(progress: Progress | None, total: int) -> CountImage:
+    """Counts the bytes of images, and tells `progress` how many of how many MB are done."""
+    done = 0
+
+    def count_image(image: NDArray[Any]) -> None:
+        nonlocal done
+        done += image.nbytes
+        if progress is not None:
+            progress(math.ceil(done / 1e6), math.ceil(total / 1e6))
+
+    return count_image
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,7 @@ class Archived:
         frames: in the file.
         sources: the raw file, then those that it draws frames from; raw_bytes: of all of them.
         damaged: rows whose pixels differ from the checksum that was written with them, in the raw file already.
+        altered: rows of which the file says something else than was written, by that checksum; likewise.
     """
 
     path: Path
@@ -58,6 +68,7 @@ class Archived:
     raw_bytes: int
     bytes: int
     damaged: tuple[int, ...]
+    altered: tuple[int, ...]
 
 
 def archive(
@@ -69,21 +80,23 @@ def archive(
 
     Args:
         codec: a name in `codecs.CODECS`.
-        keep_damaged: frames that differ from their stored checksum are copied as they are, and so is the checksum.
+        keep_damaged: frames that differ from their stored checksum, or of which the file says something else than was
+            written, are copied as they are, and so are the checksums.
         progress: counts the MB of images twice, when they are written and when they are compared.
 
     Raises:
-        DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan; the disk
-            is too small; what was read back differs. Nothing is left of `out`, and the scan is untouched.
+        DataError: `out` exists; the scan is being written, a part of a joined scan, damaged or no HDF5 scan. The disk
+            is full, or what was read back differs. Nothing is left of `out`, and the scan is untouched.
     """
-    frames = _frames_of_archivable(scan)
+    frames, altered, said = _frames_of_archivable(scan)
+    if altered and not keep_damaged:
+        raise DataError(f"{said} To archive what there is: --keep-damaged. Nothing was written.")
     with whole_file(out) as partial, hdf5.open_hdf5(scan) as raw, hdf5.readable(scan):
-        datasets = image_datasets(raw)
-        _require_room(datasets, out, codec)
-        counter = ImageCounter(progress, 2 * sum(dataset.nbytes for dataset in datasets))
+        datasets = _image_datasets(raw)
+        count_image = _counter(progress, 2 * sum(dataset.nbytes for dataset in datasets))
         try:
             with hdf5.created(partial, layout.LIBVER) as file:
-                copy = CompressedCopy(codec, counter, file.require_taken)
+                copy = _CompressedCopy(codec, count_image, file.require_taken)
                 copy.group(raw["/"], file["/"])
                 if copy.damaged and not keep_damaged:
                     raise _damaged(scan, copy.damaged)
@@ -91,25 +104,26 @@ def archive(
             raise DataError(f"{out} could not be written ({hdf5.reason(error)}). Nothing is left of it.") from error
         _drop_from_cache(partial)
         with hdf5.open_hdf5(partial) as file:
-            differs = next(_differences(raw, file, copy.checksums, counter), "")
+            differs = next(_differences(raw, file, copy.checksums, count_image), "")
         if differs:
             raise DataError(
                 f"{out} does not give back what was written: {differs} differs. The disk, or the memory, is faulty. "
                 f"Nothing is left of it, and {scan} is untouched."
             )
-        parts = (scan.parent / name for dataset in datasets for name in drawn_from(dataset))
+        parts = (scan.parent / name for dataset in datasets for name in _drawn_from(dataset))
         sources = tuple(dict.fromkeys((scan, *parts)))
         raw_bytes = sum(path.stat().st_size for path in sources)
-    return Archived(out, frames, sources, raw_bytes, out.stat().st_size, tuple(sorted(copy.damaged)))
+    return Archived(out, frames, sources, raw_bytes, out.stat().st_size, tuple(sorted(copy.damaged)), altered)
 
 
-def _frames_of_archivable(scan: Path) -> int:
-    """How many frames the scan has; DataError where it is not one to archive."""
+def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
+    """How many frames the scan has, and which are altered, in words, too; DataError where it is not one to archive."""
     if scan.exists() and not (scan.is_file() and hdf5.is_hdf5(scan)):
         raise DataError(f"{scan} is no HDF5 scan. `beamline ingest` makes one of it. Nothing was written.")
     head = superblock(scan) if scan.is_file() else None
     with open_scan(scan) as source:
-        frames, finished = int(source.image_key.size), source.finished
+        frames, finished, altered = int(source.image_key.size), source.finished, tuple(sorted(source.altered))
+        said = altered_said(source) if altered else ""
     if not finished or (head is not None and head.open_for_writing):
         raise DataError(
             f"{scan} is being written, or its writer died. Let the scan end, or run `beamline recover` first. Nothing "
@@ -123,7 +137,7 @@ def _frames_of_archivable(scan: Path) -> int:
             f"{scan} is a part of a run that was resumed, as {others[0]} is, and its parts are not joined. "
             "`beamline recover RUN` joins them; then archive joined.h5. Nothing was written."
         )
-    return frames
+    return frames, altered, said
 
 
 def _damaged(scan: Path, rows: set[int]) -> DataError:
@@ -134,30 +148,6 @@ def _damaged(scan: Path, rows: set[int]) -> DataError:
     )
 
 
-def _require_room(datasets: list[h5py.Dataset], out: Path, codec: str) -> None:
-    """DataError where the disk has less than the images are expected to take, going by some of each."""
-    wanted = 0.0
-    with h5py.File.in_memory() as tried:
-        for i, dataset in enumerate(datasets):
-            rows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), _SAMPLES)).astype(int))
-            kept = tried.create_dataset(
-                str(i),
-                (rows.size, *dataset.shape[1:]),
-                dataset.dtype,
-                chunks=(1, *dataset.shape[1:]),
-                **filter_of(codec),
-            )  # fmt: skip
-            for k, row in enumerate(rows):
-                kept[k] = dataset[row]
-            wanted += len(dataset) * kept.id.get_storage_size() / max(rows.size, 1)
-    free = shutil.disk_usage(out.parent).free
-    if free < _ROOM * wanted:
-        raise DataError(
-            f"{out.parent} has {size(free)} free, and about {size(_ROOM * wanted)} are needed. Name a file on another "
-            "disk. Nothing was written."
-        )
-
-
 def _drop_from_cache(path: Path) -> None:
     """Have the system read the file from the disk from now on, not from its memory, where it can be told so."""
     if hasattr(os, "posix_fadvise"):
@@ -166,12 +156,12 @@ def _drop_from_cache(path: Path) -> None:
 
 
 def _differences(
-    raw: h5py.File, file: h5py.File, checksums: Mapping[str, list[int]], counter: ImageCounter
+    raw: h5py.File, file: h5py.File, checksums: Mapping[str, list[int]], count_image: CountImage
 ) -> Iterator[str]:
     """What the two files do not have in common: images by their checksums, other datasets by their values."""
     for path, expected in checksums.items():
-        for row, (image, checksum) in enumerate(zip(images(file[path]), expected, strict=True)):
-            counter.add(image)
+        for row, (image, checksum) in enumerate(zip(_images(file[path]), expected, strict=True)):
+            count_image(image)
             if checksum_of(image) != checksum:
                 yield f"image {row} of {path}"
     names: list[str] = []
@@ -180,7 +170,7 @@ def _differences(
         item, copied = raw[name], file.get(name)
         if type(item) is not type(copied) or not _same_attributes(item, copied):
             yield name
-        elif isinstance(item, h5py.Dataset) and not is_image_dataset(item) and not item.is_virtual:
+        elif isinstance(item, h5py.Dataset) and not _is_image_dataset(item) and not item.is_virtual:
             alike = item.shape == copied.shape and item.dtype == copied.dtype
             if not (alike and _same_values(item, copied)):
                 yield name
@@ -209,3 +199,148 @@ def _same(one: Any, other: Any) -> bool:
     if a.ndim:
         return a.shape == b.shape and all(_same(x, y) for x, y in zip(a.ravel(), b.ravel(), strict=True))
     return bool(a == b)
+
+
+class _CompressedCopy:
+    """Copies a file group by group.
+
+    Args:
+        require_taken: is asked after each image; it raises where the disk refuses.
+
+    Attributes:
+        checksums: CRC-32 of each image, by the path of its dataset.
+        damaged: rows of our frames that differ from the checksum that the raw file has of them.
+    """
+
+    def __init__(self, codec: str, count_image: CountImage, require_taken: Callable[[], None]) -> None:
+        self._codec, self._count, self._require_taken = filter_of(codec), count_image, require_taken
+        self._paths: dict[_Place, str] = {}
+        self.checksums: dict[str, list[int]] = {}
+        self.damaged = set[int]()
+
+    def group(self, source: h5py.Group, target: h5py.Group) -> None:
+        """All that is in a group; what has several names in the raw file has them in the copy."""
+        self._paths[_place(source)] = target.name
+        hdf5.copy_attributes(source, target)
+        for name in source:
+            link = source.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                target[name] = link
+                continue
+            item = source[name]
+            if (known := self._paths.get(_place(item))) is not None:
+                target[name] = target.file[known]
+                continue
+            self._paths[_place(item)] = f"{target.name.rstrip('/')}/{name}"
+            if isinstance(item, h5py.Group):
+                self.group(item, target.create_group(name))
+            elif _is_image_dataset(item):
+                self._images(item, target, name)
+            else:
+                source.copy(name, target)
+
+    def _images(self, source: h5py.Dataset, target: h5py.Group, name: str) -> None:
+        made = target.create_dataset(
+            name, source.shape, source.dtype, chunks=(1, *source.shape[1:]), maxshape=source.maxshape,
+            fillvalue=source.fillvalue, **self._codec,
+        )  # fmt: skip
+        hdf5.copy_attributes(source, made)
+        said = _stored_checksums(source)
+        checksums = self.checksums[source.name] = []
+        for row, image in enumerate(_images(source)):
+            made[row] = image
+            self._require_taken()
+            checksums.append(checksum_of(image))
+            if said is not None and not has_checksum(image, int(said[row])):
+                self.damaged.add(row)
+            self._count(image)
+
+
+def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
+    """Every dataset of images, once.
+
+    DataError where something would not be in a copy: values in another file, other than frames, and references between
+    objects, which are places in this one.
+    """
+    names: list[str] = []
+    raw.visit_links(names.append)  # an error within a visit would end h5py
+    found: dict[_Place, h5py.Dataset] = {}
+    for name in ("/", *names):
+        link = raw.get(name, getlink=True) if name != "/" else None
+        item = raw[name] if link is None or isinstance(link, h5py.HardLink) else None
+        if item is not None and _refers(item):
+            raise DataError(
+                f"{raw.filename}: {name} holds references to other objects of the file, which a copy would not keep. "
+                "Keep the raw file. Nothing was written."
+            )
+        if item is not None and _is_image_dataset(item):
+            if lost := hdf5.missing_links(item):
+                raise DataError(f"{raw.filename} draws its frames from {lost[0]}, which is not there or differs.")
+            found[_place(item)] = item
+        elif others := [link.filename] if isinstance(link, h5py.ExternalLink) else _kept_in(item):
+            raise DataError(
+                f"{raw.filename} draws {name} from {others[0]} by a link; an archive would still need that file. "
+                "`beamline ingest` makes one file of both. Nothing was written."
+            )
+    return [*found.values()]
+
+
+def _is_image_dataset(item: h5py.HLObject) -> bool:
+    """It holds images, and not those of another dataset of its file."""
+    if not isinstance(item, h5py.Dataset) or item.shape is None or item.ndim != 3 or item.dtype.kind not in "iuf":
+        return False
+    if item.is_virtual:
+        return bool(_drawn_from(item))
+    wide = math.prod(item.shape[1:]) * item.dtype.itemsize >= _IMAGE
+    return wide and len(item) > 0 and item.dtype.itemsize <= 8 and not item.external
+
+
+def _drawn_from(item: h5py.HLObject) -> list[str]:
+    """The other files whose values it shows as its own."""
+    if not (isinstance(item, h5py.Dataset) and item.is_virtual):
+        return []
+    return [source.file_name for source in item.virtual_sources() if source.file_name != "."]
+
+
+def _kept_in(item: h5py.HLObject | None) -> list[str]:
+    """The other files that hold the values of a dataset."""
+    raw_files = [str(name) for name, *_ in item.external or ()] if isinstance(item, h5py.Dataset) else []
+    return raw_files or ([] if item is None else _drawn_from(item))
+
+
+def _refers(item: h5py.HLObject) -> bool:
+    """An object, or one of its attributes, holds references."""
+    dtypes = [item.attrs.get_id(name).dtype for name in item.attrs]
+    return any(map(_is_reference, dtypes)) or (isinstance(item, h5py.Dataset) and _is_reference(item.dtype))
+
+
+def _is_reference(dtype: np.dtype[Any]) -> bool:
+    parts = [field[0] for field in dtype.fields.values()] if dtype.fields else []
+    parts += [part for part in (h5py.check_vlen_dtype(dtype), dtype.base) if isinstance(part, np.dtype)]
+    return h5py.check_ref_dtype(dtype) is not None or any(_is_reference(part) for part in parts if part is not dtype)
+
+
+def _images(dataset: h5py.Dataset) -> Iterator[NDArray[Any]]:
+    """Each image, in memory that the next one takes."""
+    image = np.empty((1, *dataset.shape[1:]), dataset.dtype)
+    for row in range(len(dataset)):
+        hdf5.read_frames(dataset, np.array([row]), slice(None), image)
+        yield image[0]
+
+
+def _stored_checksums(dataset: h5py.Dataset) -> NDArray[Any] | None:
+    """Those that were written with our frames; None of other images."""
+    ours = layout.COMMITTED in dataset.file and _place(dataset) == _place(dataset.file[layout.DATA])
+    return dataset.file["/entry/digest/checksum"][()] if ours else None
+
+
+class _Place(NamedTuple):
+    """Of an object in its file."""
+
+    file: int
+    address: int
+
+
+def _place(item: h5py.HLObject) -> _Place:
+    info = h5py.h5o.get_info(item.id)
+    return _Place(info.fileno, info.addr)

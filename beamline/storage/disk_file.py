@@ -1,4 +1,4 @@
-"""DiskFile: the file under HDF5. It keeps what failed, which HDF5 may lose, and checksums of what was written."""
+"""Files under HDF5, for its driver `fileobj`: DiskFile, to write; GrowingFile, to read beside who writes it."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from typing import Any, Literal
 from zlib_ng import zlib_ng
 
 from beamline.core.files import to_disk
+from beamline.storage.superblock import Superblock
 
 _KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
 _BLOCK = 2**24  # bytes that are read back at once
+_ENDLESS = 2**60  # bytes, more than any file grows to
 
 
-class DiskFile:
-    """A file that h5py writes to by its driver `fileobj`.
+class UnderHdf5:
+    """What HDF5 asks of a file that it reads: where it is in it, how long it is, and its bytes.
 
-    HDF5 holds chunks and metadata back and writes them when an object goes, where h5py cannot raise; and it may crash
-    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, nothing more
-    is written, and HDF5 reads what it wrote since then from memory, until it has closed the file.
+    HDF5 shares nothing between two of these, whatever file they are of.
     """
 
-    def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:
-        self._path, self._file = path, FileIO(path, "x+" if mode == "x" else "r+")
-        self._at, self._size = 0, os.fstat(self._file.fileno()).st_size
-        self._error: BaseException | None = None
-        self._since: list[tuple[int, bytes]] = []
-        self._sums: list[tuple[int, int, int]] = []  # first byte, bytes, CRC-32 of each write
+    def __init__(self, path: Path, mode: str, length: int = 0) -> None:
+        self.path, self._file = path, FileIO(path, mode)
+        self._at, self._size = 0, max(length, os.fstat(self._file.fileno()).st_size)
 
-    def __repr__(self) -> str:  # which is the name of the file for HDF5
-        return str(self._path)
+    def __del__(self) -> None:
+        if file := vars(self).get("_file"):
+            file.close()
+
+    def __repr__(self) -> str:
+        return str(self.path)  # which is the name of the file for HDF5
 
     def seek(self, offset: int, whence: int = SEEK_SET) -> int:
         self._at = offset + {SEEK_SET: 0, SEEK_CUR: self._at, SEEK_END: self._size}[whence]
@@ -45,21 +46,72 @@ class DiskFile:
 
     def readinto(self, buffer: Any) -> int:
         """Zeros where nothing was written yet."""
-        view, got = memoryview(buffer).cast("B"), 0
+        out = memoryview(buffer).cast("B")
+        self._read(self._at, out)
+        return len(out)
+
+    def read(self, n: int) -> bytes:
+        """h5py asks whether it is there, and calls the other."""
+        out = bytearray(n)
+        self.readinto(out)
+        return bytes(out)
+
+    def flush(self) -> None:
+        """Nothing is held back here."""
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _read(self, at: int, out: memoryview) -> None:
+        """Fill `out` with what is there from `at` on."""
+        self._from_disk(at, out)
+
+    def _from_disk(self, at: int, out: memoryview) -> None:
+        got = 0
         try:
-            self._file.seek(self._at)
-            while got < len(view) and (n := self._file.readinto(view[got:])):
+            self._file.seek(at)
+            while got < len(out) and (n := self._file.readinto(out[got:])):
                 got += n
+        finally:
+            out[got:] = bytes(len(out) - got)
+
+
+class GrowingFile(UnderHdf5):
+    """A file of ours that a program writes, as if it were closed: what HDF5 refreshes, it finds as it is by then."""
+
+    def __init__(self, path: Path, head: Superblock) -> None:
+        super().__init__(path, "r", _ENDLESS)
+        self._head = head.closed(_ENDLESS).head
+
+    def _read(self, at: int, out: memoryview) -> None:
+        super()._read(at, out)
+        head = self._head[at : at + len(out)]
+        out[: len(head)] = head
+
+
+class DiskFile(UnderHdf5):
+    """A file that h5py writes to.
+
+    HDF5 holds chunks and metadata back and writes them when an object goes, where h5py cannot raise; and it may crash
+    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, nothing more
+    is written, and HDF5 reads what it wrote since then from memory, until it has closed the file.
+    """
+
+    def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:
+        super().__init__(path, "x+" if mode == "x" else "r+")
+        self._error: BaseException | None = None
+        self._since: list[tuple[int, bytes]] = []
+        self._sums: list[tuple[int, int, int]] = []  # first byte, bytes, CRC-32 of each write
+
+    def _read(self, at: int, out: memoryview) -> None:
+        try:
+            self._from_disk(at, out)
         except BaseException as error:
             self.keep(error)
-        view[got:] = bytes(len(view) - got)
-        for at, data in self._since:
-            first, end = max(at, self._at), min(at + len(data), self._at + len(view))
+        for first_byte, data in self._since:
+            first, end = max(first_byte, at), min(first_byte + len(data), at + len(out))
             if first < end:
-                view[first - self._at : end - self._at] = data[first - at : end - at]
-        return len(view)
-
-    read = readinto  # h5py asks whether it is there, and calls the other
+                out[first - at : end - at] = data[first - first_byte : end - first_byte]
 
     def write(self, buffer: Any) -> int:
         data, put = memoryview(buffer).cast("B"), 0
@@ -86,9 +138,6 @@ class DiskFile:
             self.keep(error)
         return size
 
-    def flush(self) -> None:
-        """Nothing is held back here."""
-
     def keep(self, error: BaseException) -> None:
         """Have it raised by `require_taken`, unless there was one before it."""
         self._error = self._error or error
@@ -97,7 +146,7 @@ class DiskFile:
         """Raise what went wrong so far: OSError where the disk refused."""
         error = self._error
         if isinstance(error, OSError):  # HDF5's own have no number
-            raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self._path)) from error
+            raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self.path)) from error
         if error is not None:
             raise error
 
@@ -112,16 +161,13 @@ class DiskFile:
         self.require_taken()
         to_disk(self._file.fileno())
         if (size := os.fstat(self._file.fileno()).st_size) != self._size:
-            raise OSError(errno.EIO, f"it has {size} bytes of {self._size}", str(self._path))
+            raise OSError(errno.EIO, f"it has {size} bytes of {self._size}", str(self.path))
         for at, n, checksum in self._unchanged():
             if self._checksum(at, n) != checksum:
-                raise OSError(errno.EIO, f"{n} bytes at {at} are not those that were written", str(self._path))
-
-    def close(self) -> None:
-        self._file.close()
+                raise OSError(errno.EIO, f"{n} bytes at {at} are not those that were written", str(self.path))
 
     def _unchanged(self) -> Iterator[tuple[int, int, int]]:
-        """Writes of which nothing was written again."""
+        """Writes that no later write changed."""
         begins, ends = list[int](), list[int]()  # of what later writes cover: apart, in order
         for at, n, checksum in reversed(self._sums):
             first, end = bisect_left(ends, at), bisect_right(begins, at + n)  # those that it overlaps or touches

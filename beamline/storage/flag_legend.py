@@ -231,7 +231,7 @@ def read_flags(file: h5py.File, n: int) -> FrameFlags:
 
 def _read(file: h5py.File, path: str, shape: tuple[int, ...]) -> NDArray[Any]:
     column = file[path]
-    column.refresh()
+    hdf5.look_again(column)
     values = np.asarray(column[: shape[0]])
     if values.shape != shape:
         raise ValueError(f"{path} has shape {values.shape}, expected {shape}")

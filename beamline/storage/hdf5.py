@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.text import printable
-from beamline.storage.disk_file import DiskFile
+from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.journal import pending
 from beamline.storage.overlay import Overlay
 from beamline.storage.structure import require_harmless
@@ -53,6 +53,9 @@ class NotReadyError(DataError):
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
+    HDF5 shares a file within a program: who reads the one that is written there would see half of it and write to it at
+    the end, and where two follow one, both read wrong values. So such a file is opened apart from HDF5's own.
+
     Raises DataError where it is no readable HDF5 file, or draws on what is no file (see storage.structure),
     NotReadyError where it may become one (`follow`).
     """
@@ -61,11 +64,12 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     if (changes := pending(path)) is not None:
         return h5py.File(Overlay(path, changes.ranges), "r")
     problems = []
+    if grows_here(path):
+        return _apart(path, follow)
     head = superblock(path)
     missing = 0 if head is None else head.missing
     being_written = head is not None and head.open_for_writing and head.intact
-    # A follower takes no lock, so as not to be taken for a writer; but a writer in this same process shares its file
-    # with us, and then HDF5 wants the same locking of both.
+    # A follower takes no lock, so as not to be taken for a writer.
     growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
     for swmr, locking in (growing, whole, shared) if follow else (whole, growing, shared):
         if swmr and (missing or not (follow or being_written)):
@@ -95,6 +99,37 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             "writer died, `beamline recover` clears the mark; nothing was read."
         )
     raise DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
+
+
+def grows_here(path: Path) -> bool:
+    """Whether this program has the file open by HDF5's own driver, to write it or to follow it."""
+    here = path.stat()
+    for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
+        with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
+            own = file.get_access_plist().get_driver() != h5py.h5fd.fileobj_driver
+            if own and file.get_intent() != h5py.h5f.ACC_RDONLY:
+                if os.path.samestat(here, Path(os.fsdecode(file.name)).stat()):
+                    return True
+    return False
+
+
+def _apart(path: Path, follow: bool) -> h5py.File:
+    """The file by a driver that HDF5 shares with no other."""
+    head = superblock(path)
+    if head is None or not head.intact or (head.open_for_writing and not head.grows):
+        raise (NotReadyError if follow else DataError)(f"{path} is just being made by this program. Try again.")
+    with readable(path):
+        return h5py.File(GrowingFile(path, head), "r")
+
+
+def look_again(item: h5py.Dataset) -> None:
+    """Have a dataset read as it is by now, where its file grows.
+
+    HDF5 2.0 reads wrong values where a dataset is refreshed that is open twice, as one of a file that has ended may be.
+    """
+    plist = item.file.id.get_access_plist()
+    if item.file.id.get_intent() != h5py.h5f.ACC_RDONLY or plist.get_driver() == h5py.h5fd.fileobj_driver:
+        item.refresh()
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:
@@ -140,9 +175,9 @@ def reason(error: Exception) -> str:
 def never_close(file: h5py.File) -> None:
     """Keep a file open until the process ends, so that HDF5 changes nothing more on the disk.
 
-    For a file that the disk did not take: to close it would be to write that once more, with a traceback for each
-    object, and may leave it marked as one that nobody can open. HDF5 closes it all the same when the process ends, and
-    crashes where the disk still fails: its handle leads to memory then.
+    For a file that the disk did not take: to close it would write that once more, with a traceback for each object. It
+    may leave the file marked so that nobody can open it. HDF5 closes it all the same when the process ends, and crashes
+    where the disk still fails: its handle leads to memory then.
     """
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back

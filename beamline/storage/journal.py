@@ -1,8 +1,8 @@
 """A journal: changes to a file in its place happen whole, whatever is killed or fails meanwhile.
 
 They are written beside the file first, then to it. Where a journal lies beside a file, its changes were begun: `finish`
-ends them, and readers see the file as it shall be. What makes the file longer is written before what changes in it, so
-that a disk without room is found out while the file is as it was; to write on bytes that are there takes no room.
+ends them, and readers see the file as it shall be. First comes what makes the file longer, then what changes in it. So
+a disk without room is found out while the file is as it was; overwriting bytes takes no room.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _BLOCK = 4096  # bytes, in which disks give room
 
 
 @dataclass(frozen=True)
-class Change:
+class FileChange:
     """Bytes of a file from `at` on, old and new; where the file had less, `old` is shorter."""
 
     at: int
@@ -38,12 +38,12 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Changes:
+class FileChanges:
     """All changes of a file, which has `length` bytes afterwards."""
 
     path: Path
     length: int
-    ranges: tuple[Change, ...]
+    ranges: tuple[FileChange, ...]
 
     @property
     def room(self) -> int:
@@ -84,7 +84,7 @@ def journal_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.journal")
 
 
-def pending(path: Path) -> Changes | None:
+def pending(path: Path) -> FileChanges | None:
     """The changes of a file that were begun and not ended; None: there are none.
 
     Raises:
@@ -120,7 +120,7 @@ def finish(path: Path) -> bool:
     return changes is not None
 
 
-def _apply(changes: Changes, journal: Path) -> None:
+def _apply(changes: FileChanges, journal: Path) -> None:
     path, longer = changes.path, False
     before = path.stat().st_size
     try:
@@ -150,29 +150,29 @@ def _apply(changes: Changes, journal: Path) -> None:
         journal.unlink()
 
 
-def _now(changes: Changes) -> list[tuple[Change, bytes]]:
+def _now(changes: FileChanges) -> list[tuple[FileChange, bytes]]:
     """What the file has in place of the old bytes."""
     with changes.path.open("rb", buffering=0) as file:
         return [(change, _get(file, change.at, len(change.old))) for change in changes.ranges]
 
 
-def _journal(changes: Changes) -> bytes:
+def _journal(changes: FileChanges) -> bytes:
     ranges = [(change.at, len(change.old), len(change.new)) for change in changes.ranges]
     head = json.dumps({"length": changes.length, "ranges": ranges}).encode()
     content = b"".join((head, b"\n", *(change.old + change.new for change in changes.ranges)))
     return f"{_FORMAT} {hashlib.sha256(content).hexdigest()}\n".encode() + content
 
 
-def _changes(path: Path, journal: bytes) -> Changes | None:
+def _changes(path: Path, journal: bytes) -> FileChanges | None:
     first, _, content = journal.partition(b"\n")
     if first != f"{_FORMAT} {hashlib.sha256(content).hexdigest()}".encode():
         return None
     head, _, data = content.partition(b"\n")
     said, ranges = json.loads(head), []
     for at, n_old, n_new in said["ranges"]:
-        ranges.append(Change(at, data[:n_old], data[n_old : n_old + n_new]))
+        ranges.append(FileChange(at, data[:n_old], data[n_old : n_old + n_new]))
         data = data[n_old + n_new :]
-    return Changes(path, said["length"], tuple(ranges))
+    return FileChanges(path, said["length"], tuple(ranges))
 
 
 def _get(file: Any, at: int, n: int) -> bytes:

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from beamline.storage.journal import Change, Changes
+from beamline.storage.disk_file import UnderHdf5
+from beamline.storage.journal import FileChange, FileChanges
 
 _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piece, as far as any does
 
 
-class Overlay:
+class Overlay(UnderHdf5):
     """Bytes of a file under those that were written since, for h5py.File(overlay).
 
     Args:
@@ -20,50 +21,25 @@ class Overlay:
         length: bytes of the file, where this is more than there are: the rest is zero.
     """
 
-    def __init__(self, path: Path, changes: Sequence[Change] = (), length: int = 0) -> None:
-        self.path = path
-        self._file = path.open("rb", buffering=0)
+    def __init__(self, path: Path, changes: Sequence[FileChange] = (), length: int = 0) -> None:
+        super().__init__(path, "r", length)
         self._there = os.fstat(self._file.fileno()).st_size
-        self._size, self._at = max(self._there, length), 0
         self._pages: dict[int, bytearray] = {}
         for change in changes:
             self.put(change.at, change.new)
 
-    def __repr__(self) -> str:
-        return str(self.path)  # which h5py takes for the name of the file
-
-    def __del__(self) -> None:
-        if file := vars(self).get("_file"):
-            file.close()
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._at = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: self._size}[whence]
-        return self._at
-
-    def tell(self) -> int:
-        return self._at
-
-    def read(self, n: int) -> bytes:
-        out = bytearray(n)
-        self.readinto(out)
-        return bytes(out)
-
-    def readinto(self, buffer: Any) -> int:
-        out = memoryview(buffer).cast("B")
-        self._from_disk(self._at, out)
-        end = self._at + len(out)
-        for page in _pages(self._at, end) if self._pages else ():
+    def _read(self, at: int, out: memoryview) -> None:
+        self._from_disk(at, out)
+        end = at + len(out)
+        for page in _pages(at, end) if self._pages else ():
             if page in self._pages:
                 begin = page * _PAGE
-                first, last = max(self._at, begin), min(end, begin + _PAGE)
-                out[first - self._at : last - self._at] = self._pages[page][first - begin : last - begin]
-        self._at = end
-        return len(out)
+                first, last = max(at, begin), min(end, begin + _PAGE)
+                out[first - at : last - at] = self._pages[page][first - begin : last - begin]
 
     def write(self, data: Any) -> int:
         given = bytes(data)
         self.put(self._at, given)
-        self._at += len(given)
         return len(given)
 
     def put(self, at: int, data: bytes) -> None:
@@ -81,10 +57,7 @@ class Overlay:
         self._size = self._at if length is None else length
         return self._size
 
-    def flush(self) -> None:
-        """Nothing goes to the disk."""
-
-    def changes(self) -> Changes:
+    def changes(self) -> FileChanges:
         """What was written and differs from what the disk has; never less than there is."""
         ranges = []
         for page in sorted(self._pages):
@@ -94,20 +67,13 @@ class Overlay:
             differ = [i for i in range(stop) if i >= there or old[i] != new[i]]
             if differ:
                 first, last = differ[0], differ[-1] + 1
-                ranges.append(Change(begin + first, bytes(old[first : min(last, there)]), bytes(new[first:last])))
-        return Changes(self.path, max(self._there, self._size), tuple(ranges))
+                ranges.append(FileChange(begin + first, bytes(old[first : min(last, there)]), bytes(new[first:last])))
+        return FileChanges(self.path, max(self._there, self._size), tuple(ranges))
 
     def _on_disk(self, page: int) -> bytearray:
         out = bytearray(_PAGE)
         self._from_disk(page * _PAGE, memoryview(out))
         return out
-
-    def _from_disk(self, at: int, out: memoryview) -> None:
-        self._file.seek(at)
-        done = 0
-        while done < len(out) and (n := self._file.readinto(out[done:])):
-            done += n
-        out[done:] = bytes(len(out) - done)
 
 
 def _pages(begin: int, end: int) -> range:

@@ -1,9 +1,9 @@
 """Parts: a scan that was resumed lies in several files; the views that each holds, and one file that joins them.
 
-The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view): it
-holds no frame itself, so that it can be made again at any time, and the files that do are never written again. It
-records name, number of frames and digest of each part, so that a reader finds out whether these are its parts still,
-and all of them.
+The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
+holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
+records name, number of frames and digest of each part, so that a reader finds out whether these still are all of its
+parts.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def views_planned(file: h5py.File) -> int | None:
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references of which files of a scan lack some that the plan has after the views.
+    """Kinds of references that the plan has after the views and that files of a scan lack in part.
 
     Args:
         files: all of the scan, in the order that they were taken in.

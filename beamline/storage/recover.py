@@ -1,7 +1,7 @@
 """recover: an ordinary scan file of one whose writer died, in its place; every frame that was committed is kept.
 
-HDF5 mends the file in memory, the result is read, and only then the few bytes that differ are written, by a journal:
-whatever stops it, it can be run again.
+HDF5 mends the file in memory, and the result is read. Only then the few bytes that differ are written, by a journal.
+Whatever stops it, it can be run again.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from beamline.core.errors import DataError
 from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
-from beamline.storage.journal import Changes
+from beamline.storage.journal import FileChanges
 from beamline.storage.overlay import Overlay
-from beamline.storage.parts import views_in, views_planned
+from beamline.storage.parts import require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import WriterLock, held
@@ -46,6 +46,7 @@ class Recovered:
         missing: views that were planned and not taken; None where the file does not hold its plan.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames, of the last 2 GB, that differ from their checksum; they are kept.
+        altered: frames of which the file says something else than was written, by that checksum; likewise kept.
         remark: what could not be done though the frames are in order; "" where all was done.
     """
 
@@ -56,18 +57,23 @@ class Recovered:
     missing: int | None
     lost: tuple[int, ...] = ()
     damaged: tuple[int, ...] = ()
+    altered: tuple[int, ...] = ()
     remark: str = ""
 
     def said(self) -> str:
         """A line for people."""
+        wrong = f"what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
-            said = f"{self.path} is in order, with {count(self.frames, 'frame')}; nothing was changed."
+            order = "cannot be mended" if wrong else "is in order"
+            said = (
+                f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong and ': ' + wrong}; nothing was changed."
+            )
         else:
             gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
             lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""
             damaged = f"; frames {spans(self.damaged)} differ from their checksum" if self.damaged else ""
             views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
-            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{views}."
+            said = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong and '; ' + wrong}{views}."
         return f"{said} {self.remark}".strip()
 
 
@@ -97,7 +103,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         if head.open_for_writing or head.missing or not _finished(path):
             done, mended = _mended(path, head)
         else:
-            done, mended = _as_it_is(path, begun), Changes(path, head.size, ())
+            done, mended = _as_it_is(path, begun), FileChanges(path, head.size, ())
         return _with_view(done, mended, say)
     finally:
         if lock is not None:
@@ -124,10 +130,12 @@ def _finished(path: Path) -> bool:
 
 def _as_it_is(path: Path, changed: bool) -> Recovered:
     with hdf5.readable(path), h5py.File(Overlay(path), "r") as file:
-        return Recovered(path, changed, int(file[layout.COMMITTED][()]), 0, _views_missing(file) if changed else None)
+        require_joined(file)
+        frames, missing = int(file[layout.COMMITTED][()]), _views_missing(file) if changed else None
+        return Recovered(path, changed, frames, 0, missing, altered=_altered(file, frames))
 
 
-def _with_view(done: Recovered, mended: Changes, say: Callable[[str], None]) -> Recovered:
+def _with_view(done: Recovered, mended: FileChanges, say: Callable[[str], None]) -> Recovered:
     """Carry it out with the /exchange view; without it where the disk takes only that."""
     with hdf5.readable(done.path), h5py.File(Overlay(done.path, mended.ranges), "r") as file:
         if has_exchange_view(file):
@@ -146,7 +154,7 @@ def _with_view(done: Recovered, mended: Changes, say: Callable[[str], None]) -> 
     return replace(done, changed=True)
 
 
-def _announce(changes: Changes, say: Callable[[str], None]) -> None:
+def _announce(changes: FileChanges, say: Callable[[str], None]) -> None:
     if changes.ranges:
         free = shutil.disk_usage(changes.path.parent).free
         say(f"{changes.path}: to recover it takes {size(changes.room)} on its disk, {size(free)} are free.")
@@ -164,7 +172,7 @@ def _require_ours(path: Path, file: h5py.File) -> None:
         raise DataError(f"{path} is no scan of this program: it has no {layout.COMMITTED}. Nothing was changed.")
 
 
-def _mended(path: Path, head: Superblock) -> tuple[Recovered, Changes]:
+def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
     """What becomes of it, and what has to change for that."""
     end = max(head.end, head.size) if head.open_for_writing else head.end
     overlay = Overlay(path, length=end)
@@ -185,7 +193,9 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, Changes]:
         with h5py.File(overlay, "r") as file:
             _read(file)
             lost, dropped = tuple(range(frames, committed)), max(0, written - committed)
-            done = Recovered(path, True, frames, dropped, _views_missing(file), lost, _damaged(file))
+            done = Recovered(
+                path, True, frames, dropped, _views_missing(file), lost, _damaged(file), _altered(file, frames)
+            )
     except hdf5.ALTERED as error:
         raise DataError(
             f"{path} is damaged, or its writer died before the first frame ({hdf5.reason(error)}). Nothing was changed."
@@ -250,6 +260,10 @@ def _damaged(file: h5py.File) -> tuple[int, ...]:
         if not whole:
             found.append(row)
     return tuple(found)
+
+
+def _altered(file: h5py.File, frames: int) -> tuple[int, ...]:
+    return tuple(layout.altered_rows(file, 0, frames).tolist())
 
 
 def _views_missing(file: h5py.File) -> int | None:

@@ -27,8 +27,8 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def reserve(descriptor: int, wanted: int, folder: Path) -> None:
-    """Take so many bytes for an open file in the folder where the system can: space that is not there is missed now,
-    not in the middle of the work.
+    """Take so many bytes for an open file in the folder where the system can. Missing space is then found now, not in
+    the middle of the work.
 
     Raises:
         DataError: the disk has not so much space.

@@ -23,8 +23,8 @@ _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5p
 
 
 def require_harmless(file: h5py.File) -> None:
-    """DataError for a file with more objects or deeper groups than any scan, that draws on what is no file, or that
-    claims what it has not.
+    """DataError for a file with more objects or deeper groups than any scan. Also for one that draws on a path without
+    a file, or that claims more data than it has.
 
     Files that it draws on are looked at, too, and those that they draw on.
     """
@@ -104,7 +104,7 @@ def _refuse_empty_claim(dataset: Any, what: str) -> None:
     if n < CLAIMED or dataset.get_create_plist().get_layout() == h5py.h5d.VIRTUAL:
         return
     if n > PACKED * (stored := dataset.get_storage_size()):
-        raise DataError(f"{what} claims {n / 1e9:.3g} GB, of which {stored} bytes are there. Nothing was read.")
+        raise DataError(f"{what} claims {n / 1e9:.3g} GB, but only {stored} bytes are there. Nothing was read.")
 
 
 def _drawn_on(dataset: Any) -> Iterator[str]:

@@ -1,7 +1,8 @@
 """The first 48 bytes of an HDF5 file: whether it is being written, what it lacks, and how it would be if closed.
 
-Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A): signature 8,
-version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes, little-endian.
+Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A). Fields:
+signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes,
+little-endian.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 SIZE = 48
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FLAGS, _END, _CHECKSUM = 11, slice(28, 36), slice(44, 48)
+_GROWS = 4
 _WORD = 0xFFFFFFFF
 
 
@@ -31,6 +33,11 @@ class Superblock:
     def open_for_writing(self) -> bool:
         """A program is writing the file, or died while it did."""
         return self.head[_FLAGS] != 0
+
+    @property
+    def grows(self) -> bool:
+        """It is being written so that others may read it meanwhile (SWMR)."""
+        return bool(self.head[_FLAGS] & _GROWS)
 
     @property
     def missing(self) -> int:

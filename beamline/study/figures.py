@@ -12,8 +12,9 @@ from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.study.table import HEADINGS, StudyTable, formatted, write_text
+from beamline.tradeoff.varied import colour_of
 from recon.methods import by_name
 
 
@@ -30,7 +31,7 @@ def figures_of_rows(table: StudyTable) -> bytes:
             cells = [c for c in table.done if c.method == method and math.isfinite(c.figures[name])]
             places = [rows.index(cell.row.label) for cell in cells]
             values = [cell.figures[name] for cell in cells]
-            axes.plot(places, values, marker="o", ms=4, lw=0.8, color=by_name(method).colour, label=method)
+            axes.plot(places, values, marker="o", ms=4, lw=0.8, color=colour_of(method), label=method)
         axes.set_ylabel(HEADINGS[name] + ("" if name.startswith("ssim") else " (dB)"), fontsize=8)
         axes.set_xticks(range(len(rows)), rows, rotation=90, fontsize=6.5)
         axes.tick_params(axis="y", labelsize=7)
@@ -39,7 +40,7 @@ def figures_of_rows(table: StudyTable) -> bytes:
     return png(figure)
 
 
-def write_page(folder: Path, table: StudyTable, slices: Slices) -> None:
+def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
     """Write the pictures and report.html."""
     pictures = []
     if table.done:

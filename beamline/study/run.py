@@ -21,10 +21,10 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth, regions
 from beamline.reconstruct.recon_report import facts_of
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from beamline.study.figures import write_page
-from beamline.study.studies import Row, Study, ViewSet, averaged
+from beamline.study.studies import Study, StudyRow, ViewSet, averaged
 from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
@@ -127,14 +127,14 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     for cell in table.cells:
         if cell.row.groups is None and cell.method == options.methods[0]:
             warn(f"{cell.row.label} is left out: {cell.message}")
-    slices = Slices()
+    slices = SliceSheet()
     with result_folder(folder) as work:
         try:
             with named_on_failure(work / "views.npy"):
                 np.save(work / "views.npy", prepared.projections.data)
             del prepared  # from here on the views are in the file alone
             rig = _Rig(work, geometry, options.seed, options.settings)
-            whole = Row(REFERENCE, np.arange(geometry.n_views)[:, None])
+            whole = StudyRow(REFERENCE, np.arange(geometry.n_views)[:, None])
             reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
             if reference is None:
                 raise DataError(
@@ -200,7 +200,7 @@ class _Rig:
     settings: Mapping[str, Mapping[str, Plain]]
 
     def reconstructed(
-        self, row: Row, method: str, settings: Mapping[str, Plain] | None = None
+        self, row: StudyRow, method: str, settings: Mapping[str, Plain] | None = None
     ) -> tuple[F32 | None, Outcome]:
         """The volume of a row, by `settings` instead of those of the method; None where the method failed."""
         assert row.groups is not None
@@ -229,7 +229,7 @@ class _Rig:
 
 
 def _each(
-    table: StudyTable, rig: _Rig, judge: _Judge, slices: Slices, say: Emit, now: Callable[[], float]
+    table: StudyTable, rig: _Rig, judge: _Judge, slices: SliceSheet, say: Emit, now: Callable[[], float]
 ) -> Iterator[StudyTable]:
     """The table after each cell, and after one that Ctrl-C interrupted."""
     timed: list[Timed] = []

@@ -23,7 +23,7 @@ OVERLAPPING = 180
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class StudyRow:
     """One selection of views.
 
     Attributes:
@@ -79,36 +79,36 @@ class Study:
     name: str
     title: str
     question: str
-    rows: Callable[[ViewSet], Sequence[Row]]
+    rows: Callable[[ViewSet], Sequence[StudyRow]]
 
 
-def fixed_views(views: ViewSet) -> list[Row]:
+def fixed_views(views: ViewSet) -> list[StudyRow]:
     """Falling numbers of views, evenly spread."""
     return [_fixed(views, n) for n in COUNTS]
 
 
-def sector(views: ViewSet) -> list[Row]:
+def sector(views: ViewSet) -> list[StudyRow]:
     """Narrowing sectors with as many views less, then with equal counts; the whole range with these for comparison."""
     falling = [_sector(views, low, high, n) for low, high, n in SECTORS]
     equal = [_sector(views, low, high, n) for n in EQUAL_COUNTS for low, high, own in SECTORS if n != own]
     return [*(_fixed(views, n) for n in EQUAL_COUNTS), *falling, *equal]
 
 
-def random(views: ViewSet) -> list[Row]:
+def random(views: ViewSet) -> list[StudyRow]:
     """Falling numbers of views, evenly spread and drawn at random."""
     rows = []
     for n in COUNTS:
         rows.append(_fixed(views, n))
         family = f"random, {n} views"
         if n == views.angles.size:
-            rows.append(Row(family, None, family, "these are all views of the scan: nothing to draw"))
+            rows.append(StudyRow(family, None, family, "these are all views of the scan: nothing to draw"))
             continue
         for k in range(views.draws if n < views.angles.size else 1):
             rows.append(_chosen(f"{family}, draw {k + 1}", f"random:{n}:{views.seed + k}", views, family=family))
     return rows
 
 
-def window_average(views: ViewSet) -> list[Row]:
+def window_average(views: ViewSet) -> list[StudyRow]:
     """Means of neighbouring views, in windows that do not overlap, then in overlapping ones; single views first."""
     single = [_fixed(views, n) for n in (OVERLAPPING, 90, 60)]
     disjoint = [_windows(views, width, None) for width in DISJOINT_DEG]
@@ -147,26 +147,26 @@ def averaged(
     return out, angles[groups].mean(axis=1)
 
 
-def _fixed(views: ViewSet, n: int) -> Row:
+def _fixed(views: ViewSet, n: int) -> StudyRow:
     return _chosen(f"fixed, {n} views", f"fixed:{n}", views)
 
 
-def _sector(views: ViewSet, low: int, high: int, n: int) -> Row:
+def _sector(views: ViewSet, low: int, high: int, n: int) -> StudyRow:
     # A view and its mirror image half a turn apart see the same rays: a scan that begins at -90 degrees has them all.
     return _chosen(f"sector {low}-{high}°, {n} views", f"sector:{low}-{high}:{n}", views, within=True)
 
 
-def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, family: str = "") -> Row:
+def _chosen(label: str, spec: str, views: ViewSet, *, within: bool = False, family: str = "") -> StudyRow:
     """The row of a selection in the words of `parse_views`; `within`: its angles are those within a period."""
     angles = np.mod(views.angles, views.period) if within else views.angles
     try:
         found = parse_views(spec, angles, period=views.period)
     except ValueError as error:
-        return Row(label, None, family, str(error))
-    return Row(label, found[:, None], family)
+        return StudyRow(label, None, family, str(error))
+    return StudyRow(label, found[:, None], family)
 
 
-def _windows(views: ViewSet, width: float, count: int | None) -> Row:
+def _windows(views: ViewSet, width: float, count: int | None) -> StudyRow:
     """Means over `width` degrees: `count` windows evenly spread, or as many as do not overlap (None)."""
     turn = 2 * np.pi
     angles = views.angles if np.ptp(views.angles) < turn else np.mod(views.angles, turn)
@@ -176,16 +176,16 @@ def _windows(views: ViewSet, width: float, count: int | None) -> Row:
     kind = "side by side" if count is None else f"overlapping, {count} views"
     label = f"mean of {w} ({width:g}°), {kind}"
     if w < 2:
-        return Row(label, None, reason=f"the scan's views are {np.degrees(step):.3g}° apart: nothing to average")
+        return StudyRow(label, None, reason=f"the scan's views are {np.degrees(step):.3g}° apart: nothing to average")
     room = order.size - w + 1
     n = order.size // w if count is None else count
     if n < 2 or n > room:
-        return Row(
+        return StudyRow(
             label, None, reason=f"asks for {max(n, 2)} windows of {w}; the {order.size} views hold {max(room, 0)}"
         )
     starts = np.arange(n) * w if count is None else np.linspace(0, room - 1, n).round().astype(np.int64)
     groups = order[starts[:, None] + np.arange(w)]
     together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
     if together.sum() < 2:
-        return Row(label, None, reason="the scan's views are too unevenly spread to have neighbours")
-    return Row(label, groups[together].astype(np.int64))
+        return StudyRow(label, None, reason="the scan's views are too unevenly spread to have neighbours")
+    return StudyRow(label, groups[together].astype(np.int64))

@@ -16,7 +16,7 @@ import numpy as np
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.version import version
-from beamline.study.studies import Row, Study
+from beamline.study.studies import Study, StudyRow
 from beamline.tradeoff.report import finite
 from beamline.tradeoff.trials import Status
 
@@ -43,7 +43,7 @@ class Cell:
         message: why there are no figures.
     """
 
-    row: Row
+    row: StudyRow
     method: str
     status: Status = "not run"
     figures: Mapping[str, float] = field(default_factory=dict)

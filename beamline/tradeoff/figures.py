@@ -12,13 +12,13 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from beamline.report.figures import png
 from beamline.tradeoff.trials import Outcome, Trial
-from recon.methods import by_name
+from beamline.tradeoff.varied import colour_of
 
 _SIZE, _DPI = (8.6, 5.2), 110
 _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
-    "loss": "X", "start": "*",
+    "loss": "X", "start": "*", "rectification": "h",
 }  # fmt: skip
 
 
@@ -38,7 +38,7 @@ def pareto_plot(
     for trial, cost, quality in shown:
         axes.scatter(
             cost, quality, s=_size(trial.group), marker=_MARKERS.get(trial.group, "o"),
-            color=by_name(trial.method).colour, edgecolors="white", linewidths=0.6, zorder=3,
+            color=colour_of(trial.method), edgecolors="white", linewidths=0.6, zorder=3,
         )  # fmt: skip
     kept = [points[i] for i in front]
     axes.step([p[1] for p in kept], [p[2] for p in kept], where="post", color="black", lw=1.1, alpha=0.5, zorder=2)
@@ -70,7 +70,7 @@ def cost_curves(outcomes: Sequence[Outcome]) -> bytes:
     for outcome in outcomes:
         seconds, quality = np.array(outcome.curve).T
         axes.plot(
-            seconds, quality, lw=1.4, color=by_name(outcome.trial.method).colour,
+            seconds, quality, lw=1.4, color=colour_of(outcome.trial.method),
             ls="-" if outcome.curve_of == "views held out" else "--",
             label=f"{outcome.trial.method} ({outcome.curve_of})",
         )  # fmt: skip
@@ -101,7 +101,7 @@ def _legend(figure: Figure, axes: Axes, shown: Sequence[tuple[Trial, float, floa
     methods = dict.fromkeys(t.method for t, _, _ in shown)
     groups = dict.fromkeys("steps" if t.group == "iterations" else t.group for t, _, _ in shown)
     handles = [
-        axes.scatter([], [], color=by_name(m).colour, s=40, label=m) for m in methods
+        axes.scatter([], [], color=colour_of(m), s=40, label=m) for m in methods
     ] + [
         axes.scatter(
             [], [], color="white", edgecolors="0.2", marker=_MARKERS.get(g, "o"), s=_size(g), label=_WORDS.get(g, g)

@@ -13,7 +13,6 @@ from typing import Any
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
 from beamline.tradeoff.trials import Outcome, Status, Trial
-from recon.base.method import PRECISION
 
 
 def command(job: Path) -> Sequence[str]:
@@ -27,7 +26,7 @@ def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
     Args:
         work: a folder with data.npz.
     """
-    kinds = {_kernels(trial): trial for trial in trials if trial.group != PRECISION}
+    kinds = {_kernels(trial): trial for trial in trials}
     job = {"data": str(work / "data.npz"), "compile": [asdict(trial) for trial in kinds.values()]}
     _run(job, work)  # a failure here comes again in a trial, which reports it
 

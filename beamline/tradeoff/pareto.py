@@ -19,7 +19,7 @@ def rounded(cost: float) -> float:
 def front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
     """Positions of the points that no other point beats, by rising cost (and so by rising quality).
 
-    A point is beaten by one with at most its cost and at least its quality, and better in one of the two; of equal
+    A point is beaten by one with at most its cost and at least its quality, and better in one of the two. Of equal
     points the first stays. Points with a value that is not finite are left out.
     """
     known = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]

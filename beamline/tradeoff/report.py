@@ -17,13 +17,12 @@ from beamline.core.machine import machine_line
 from beamline.core.version import version
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
-from beamline.tradeoff.table import MEMORY, TIME, Cost, TrialTable
+from beamline.tradeoff.table import MEMORY, TIME, TrialCost, TrialTable
 from beamline.tradeoff.trials import Outcome
 from recon.assess.time_model import duration_text
-from recon.base.method import PRECISION
 
 _FIELDS = ("group", "method", "views", "binning")
 _WIDTH = 120  # characters
@@ -48,23 +47,21 @@ _COLUMNS = {
 
 _FSC = (
     "FSC: a smaller period is better among settings of one method only. Two halves that are regularised alike agree "
-    "also in what the prior made, and in rings; no method is sharper than FBP because its FSC is: look at the slices."
+    "also in what the prior made, and in rings. A higher FSC than that of FBP does not prove a sharper volume: look "
+    "at the slices."
 )
 
 
 def text(table: TrialTable) -> str:
     """The table for people; * marks the trials that no other beats in both time and quality."""
     lines = [machine_line(dict(table.machine)), ""]
-    shown = [o for o in table.outcomes if o.trial.group != PRECISION]
-    width = max((len(outcome.trial.label) for outcome in shown), default=5)
+    width = max((len(outcome.trial.label) for outcome in table.outcomes), default=5)
     names = _metric_names(table)
     lines.append(
         f"  {'trial':<{width}}{'s':>8}{'CPU s':>8}{'MB':>6}" + "".join(f"{_COLUMNS[n].short:>9}" for n in names)
     )
     best = {table.compared[i].trial for i in table.front(TIME)}
     for outcome in table.outcomes:
-        if outcome.trial.group == PRECISION and outcome.status == "done":
-            continue
         mark = "*" if outcome.trial in best else " "
         row = f"{mark} {outcome.trial.label:<{width}}"
         if outcome.status == "done":
@@ -97,7 +94,7 @@ def _duration(seconds: float) -> str:
 
 
 def conclusions(table: TrialTable) -> list[str]:
-    """Sentences: the time of each further dB along the front, and the error and time of float32."""
+    """Sentences: the time of each further dB along the front."""
     compared, qualities, seconds = table.compared, table.qualities, table.costs(TIME)
     kept = table.front(TIME)
     out = [f"Quality: {table.quality_name}, dB."]
@@ -112,17 +109,7 @@ def conclusions(table: TrialTable) -> list[str]:
         )
     if any("resolution" in outcome.metrics for outcome in compared):
         out.append(_FSC)
-    out += [_precision(o.details) for o in table.outcomes if o.trial.group == PRECISION and o.details]
     return out
-
-
-def _precision(details: Mapping[str, float]) -> str:
-    return (
-        "The same small fit in float32 and in the float64 reference implementation: residual "
-        f"{details['residual_float32']:.5f} and {details['residual_float64']:.5f}, volumes "
-        f"{details['difference']:.2g} apart (relative RMS), {_duration(details['seconds_float32'])} and "
-        f"{_duration(details['seconds_float64'])}."
-    )
 
 
 def write_table(folder: Path, table: TrialTable) -> None:
@@ -160,7 +147,7 @@ def to_csv(table: TrialTable) -> str:
     return out.getvalue()
 
 
-def write_figures(folder: Path, table: TrialTable, slices: Slices) -> None:
+def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
     """Write the pictures, as far as there are data for them, and the page; `slices` of each baseline, and the truth."""
     pictures = []
     for cost in (TIME, MEMORY):
@@ -187,7 +174,7 @@ def write_figures(folder: Path, table: TrialTable, slices: Slices) -> None:
     _write(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]))
 
 
-def _pareto(table: TrialTable, cost: Cost) -> bytes:
+def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
     points = zip(table.compared, table.costs(cost), table.qualities, strict=True)
     return pareto_plot(
         [(outcome.trial, value * cost.scale, quality) for outcome, value, quality in points],
@@ -216,7 +203,6 @@ def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
                 "reason": f"{outcome.status}: {outcome.message}".rstrip(": "),
             }
             for outcome in table.outcomes
-            if outcome.trial.group != PRECISION
         ],
         scan=table.scan,
         command=table.command,

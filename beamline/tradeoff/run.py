@@ -20,15 +20,15 @@ from beamline.projections.prepare import PreparedProjections, prepare_projection
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.recon_report import facts_of
-from beamline.report.slice_sheet import Slices
+from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
+from beamline.tradeoff.varied import Depth
 from drivers.clock import Clock
-from recon.base.method import Depth
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting.initialise import default_count
@@ -103,7 +103,7 @@ def run_tradeoff(
         command=options.command,
     )
     sink(Event("tradeoff_started", clock.now(), {"file": options.source.path, "trials": len(trials), "by": table.by}))
-    slices = Slices()
+    slices = SliceSheet()
     if truth is not None:
         slices.add("truth", truth)
     with result_folder(folder) as work:
@@ -142,7 +142,7 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
 def _each(
     table: TrialTable,
     work: Path,
-    slices: Slices,
+    slices: SliceSheet,
     options: TradeoffOptions,
     sink: Sink,
     clock: Clock,

@@ -9,11 +9,10 @@ from typing import Any
 
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
-from recon.base.method import PRECISION
 
 
 @dataclass(frozen=True)
-class Cost:
+class TrialCost:
     """A cost of a trial, and how a picture shows it.
 
     Attributes:
@@ -31,8 +30,8 @@ class Cost:
     of: Callable[[Outcome], float]
 
 
-TIME = Cost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds)
-MEMORY = Cost(
+TIME = TrialCost("seconds", "time", "time (s)", 1.0, lambda outcome: outcome.seconds)
+MEMORY = TrialCost(
     "memory", "memory", "peak memory of the process (MB)", 1e-6,
     lambda outcome: math.nan if outcome.peak_bytes is None else float(outcome.peak_bytes),
 )  # fmt: skip
@@ -70,7 +69,7 @@ class TrialTable:
     @property
     def compared(self) -> tuple[Outcome, ...]:
         """The trials that reconstructed the scan successfully."""
-        return tuple(o for o in self.outcomes if o.status == "done" and o.trial.group != PRECISION)
+        return tuple(o for o in self.outcomes if o.status == "done")
 
     @property
     def qualities(self) -> list[float]:
@@ -81,11 +80,11 @@ class TrialTable:
     def quality_name(self) -> str:
         return "PSNR" if self.by == "psnr" else "−20 log₁₀ of the held-out residual"
 
-    def costs(self, cost: Cost) -> list[float]:
+    def costs(self, cost: TrialCost) -> list[float]:
         """The cost of each trial in `compared`."""
         return [cost.of(outcome) for outcome in self.compared]
 
-    def front(self, cost: Cost) -> list[int]:
+    def front(self, cost: TrialCost) -> list[int]:
         """Positions in `compared` of the trials on the front of quality and `cost`.
 
         Costs are compared to 1 %: smaller differences between two trials are chance.
@@ -104,5 +103,4 @@ class TrialTable:
             "quality_db": outcome.quality(self.by),
             "message": outcome.message,
             **outcome.metrics,
-            **outcome.details,
         }

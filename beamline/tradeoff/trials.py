@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from recon.base.method import PRECISION, Depth, Method, Plain
+from beamline.tradeoff.varied import Depth, trials_of, work_of
+from recon.base.method import Method, Plain
 from recon.methods import build, by_name
 
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
@@ -21,8 +22,7 @@ class Trial:
     """One reconstruction to make.
 
     Attributes:
-        group: what it varies: "method" where nothing, `PRECISION` for the comparison with the float64 reference
-            implementation.
+        group: what it varies: "method" where nothing.
         method: its name in `recon.methods`.
         views: how many, spread evenly over those chosen.
         binning: of detector pixels, on top of the selection's.
@@ -48,8 +48,6 @@ class Trial:
     @property
     def label(self) -> str:
         """The settings in a few words."""
-        if self.group == PRECISION:
-            return "float32 against float64"
         parts = [self.method, f"{self.views} views"]
         parts += [f"bin {self.binning}"] if self.binning > 1 else []
         return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
@@ -89,9 +87,8 @@ class Outcome:
         metrics: psnr, ssim3d (with a truth), residual_held_out, resolution (mm), by name.
         gaussians: in the model at the end; None for voxel methods.
         curve: (seconds, dB) of its own record of the residual.
-        curve_of: of which views that is, in words.
+        curve_of: which views that record is of, in words.
         message: why there are no figures.
-        details: of the comparison with the float64 reference implementation.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
     """
 
@@ -104,7 +101,6 @@ class Outcome:
     curve: Sequence[tuple[float, float]] = ()
     curve_of: str = ""
     message: str = ""
-    details: Mapping[str, float] = field(default_factory=dict)
     cpu_seconds: float = math.nan
 
     def quality(self, by: str) -> float:
@@ -142,24 +138,20 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     counts = sorted({max(2, round(share * n_views)) for share in _SHARES[depth]} - {n_views})
     first: list[Trial] = []
     rest: list[Trial] = []
-    last: list[Trial] = []
     for method in methods:
         base, *others = (
             Trial(tried.varies, method, n_views, tried.binning, tried.settings)
-            for tried in by_name(method).trials(gaussians, depth)
+            for tried in trials_of(method, gaussians, depth)
         )
         first.append(replace(base, halves=True))
         rest += [replace(base, group="views", views=n) for n in counts]
-        rest += [trial for trial in others if trial.group != PRECISION]
-        last += [trial for trial in others if trial.group == PRECISION]
-    return tuple(dict.fromkeys([*first, *sorted(rest, key=work), *last]))
+        rest += others
+    return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
 
 
 def work(trial: Trial) -> float:
     """A rough number for how long a trial takes, to be compared within one method only."""
-    if trial.group == PRECISION:
-        return float(trial.views)
-    return trial.build().work(trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
+    return work_of(trial.build(), trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,10 @@ from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import PRECISION, DataUse, RunControl
+from recon.base.method import DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
-from recon.splatting.precision import compare
 from recon.voxels.projector import data_residual
 from recon.warm_up import warm_up
 
@@ -64,9 +63,6 @@ def run(
     Raises:
         ValueError: the reconstruction refuses these settings.
     """
-    if trial.group == PRECISION:
-        found = compare(data.projections, data.geometry, seed, now)
-        return {"seconds": found["seconds_float32"], "peak_bytes": peak_memory(), "details": found}
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
     grid = Grid.matching(data.geometry)

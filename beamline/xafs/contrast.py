@@ -24,7 +24,7 @@ KNOWN = 0.5  # least share of pixels with a value in a region
 
 
 @dataclass(frozen=True, eq=False)
-class Regions:
+class ContrastRegions:
     """The pixels that are compared.
 
     Attributes:
@@ -44,7 +44,7 @@ class Regions:
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class XafsCurve:
     """Absorption over energies.
 
     Attributes:
@@ -96,12 +96,12 @@ class Curve:
         return float(self.energies[first]), float(self.energies[last])
 
 
-def contrast_of(frame: Reals, regions: Regions) -> tuple[float, float]:
+def contrast_of(frame: Reals, regions: ContrastRegions) -> tuple[float, float]:
     """Contrast of a radiograph of line integrals, and the noise of the difference of two of its pixels (NaN: too few
     pixels).
 
-    Both are NaN where a region is not usable: more than 1 % of its pixels are dark (+inf; the mean of the others is not
-    the region's, and pixels without light have no noise), or less than half of them have a value.
+    Both are NaN where a region is not usable: more than 1 % of its pixels are dark (+inf), or less than half of them
+    have a value. The mean of the others is not the region's then, and pixels without light have no noise.
     """
     inside, noise = _level(frame, regions.inside)
     if regions.around is None:
@@ -110,15 +110,15 @@ def contrast_of(frame: Reals, regions: Regions) -> tuple[float, float]:
     return inside - around, float(np.hypot(noise, noise_around))
 
 
-def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: Regions) -> Curve:
+def curve_of(energies: Reals, points: Sequence[tuple[float, float]], regions: ContrastRegions) -> XafsCurve:
     """The curve of points from `contrast_of`, sorted by energy; unknown points are left out."""
     order = np.argsort(energies, kind="stable")
     contrast, noise = np.array(points, dtype=np.float64).reshape(-1, 2).T[:, order]
     known, e = np.isfinite(contrast), energies[order]
     contrast, noises = contrast[known], None if np.isnan(noise[known]).any() else noise[known]
     if regions.thickness is None:
-        return Curve(e[known], contrast, contrast, noises, left_out=e[~known])
-    return Curve(e[known], contrast / regions.thickness, contrast, noises, "1/mm", e[~known])
+        return XafsCurve(e[known], contrast, contrast, noises, left_out=e[~known])
+    return XafsCurve(e[known], contrast / regions.thickness, contrast, noises, "1/mm", e[~known])
 
 
 def _level(frame: Reals, mask: Mask) -> tuple[float, float]:

@@ -14,8 +14,8 @@ LEAST_SHARE = 1e-3
 
 
 def line_integrals(signal: Reals, flat: Reals) -> Reals:
-    """-log(signal / flat), [row, col], of counts above the dark level; +inf where no light was transmitted, NaN where
-    the flat has none either, or either is not finite."""
+    """-log(signal / flat), [row, col], of counts above the dark level. +inf where no light was transmitted, NaN where
+    the flat is dark too, or where one of them is not finite."""
     lit = np.minimum(LEAST, LEAST_SHARE * flat)
     out = np.full(np.broadcast_shapes(signal.shape, flat.shape), np.nan)
     known = np.isfinite(signal) & (flat > 0) & (flat < np.inf)

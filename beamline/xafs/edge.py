@@ -22,7 +22,7 @@ SMOOTH = 1e-3  # of the absorption: tolerated difference of a noiseless smooth c
 
 
 @dataclass(frozen=True)
-class Edge:
+class AbsorptionEdge:
     """Edge and white line of a curve.
 
     Attributes:
@@ -42,15 +42,15 @@ class Edge:
     noise: float
 
 
-def find_edge(energies: Reals, absorption: Reals) -> Edge:
+def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:
     """The edge of a curve.
 
     A curve without an edge is Victoreen's, a + b E^-3 + c E^-4 (J. Appl. Phys. 19, 855, 1948), within its noise. There
     is an edge where a step upwards at one of the energies improves the fit more than chance would in one of a million
-    such curves (Student's t of the step, times the number of its possible places), or where the curve differs from
-    Victoreen's by five times its noise, which is estimated from second differences. The edge is the maximum of the
-    slope near that step (of parabolas through five points). The white line is the maximum above it, if it exceeds the
-    noise and the extrapolation of the curve's far end.
+    such curves. The test is Student's t of the step, times the number of its possible places. There is also one where
+    the curve differs from Victoreen's by five times its noise, estimated from second differences. The edge is the
+    maximum of the slope near that step (of parabolas through five points). The white line is the maximum above it, if
+    it exceeds the noise and the extrapolation of the curve's far end.
 
     Args:
         energies: keV, rising, [n].
@@ -67,8 +67,8 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
     misfit = float(np.sqrt(np.mean(rest**2)))
     step, chance = _step(rest, basis)
 
-    def none(reason: str) -> Edge:
-        return Edge(False, reason, None, None, misfit, noise)
+    def none(reason: str) -> AbsorptionEdge:
+        return AbsorptionEdge(False, reason, None, None, misfit, noise)
 
     stands_out = chance < FALSE_ALARM or misfit > SURE * noise
     if not stands_out or misfit <= SMOOTH * float(np.abs(absorption).mean()):
@@ -80,7 +80,7 @@ def find_edge(energies: Reals, absorption: Reals) -> Edge:
         return none("the absorption rises nowhere")
     if steepest < 2 or steepest > energies.size - 3:
         return none("it is steepest at the end of the range; widen the range there")
-    return Edge(
+    return AbsorptionEdge(
         True, "", _top(energies, slope, steepest, 1), _white_line(energies, absorption, steepest, noise), misfit, noise
     )
 

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
+from beamline.monitor.view import PixelBox
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.xafs.contrast import Curve, Regions
-from beamline.xafs.radiographs import Part, Radiographs, reals
+from beamline.xafs.contrast import ContrastRegions, XafsCurve
+from beamline.xafs.radiographs import FramePart, Radiographs, reals
 from beamline.xafs.series import Series
 
 Reals = NDArray[np.float64]
-Box = tuple[int, int, int, int]
 
 EV_BEYOND, KEV_BELOW = 500.0, 0.05
 """keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
@@ -77,22 +77,22 @@ class FileOptions:
 
     Attributes:
         low, high: keV, the first and the last energy.
-        region, around: (first row, row after the last, first column, column after the last) of the material, and of
-            its surroundings, from which the material is excluded; None: all of the frame, and none.
+        region, around: (first row, row after the last, first column, column after the last) of the material, and of its
+            surroundings, from which the material is excluded. None: the whole frame, and no surroundings.
         unit: of the energies, "keV" or "eV"; None: as in the file, else keV.
         quantity: of the frames, "counts" or "line_integrals"; None: counts.
     """
 
     low: float = 0.0
     high: float = np.inf
-    region: Box | None = None
-    around: Box | None = None
+    region: PixelBox | None = None
+    around: PixelBox | None = None
     unit: str | None = None
     quantity: str | None = None
 
 
 @contextmanager
-def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
+def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve]:
     """The curve or the radiographs of a file, which is open within the context.
 
     Raises:
@@ -111,24 +111,24 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | Curve]:
         if isinstance(source, AbsorptionTable):
             if options.region or options.around:
                 raise ConfigError(f"{path} has no frames, so that regions do not apply. Nothing was written.")
-            yield Curve(energies, source.absorption[kept], unit="as in the file")
+            yield XafsCurve(energies, source.absorption[kept], unit="as in the file")
             return
         inside = _mask(source.shape, options.region or (0, source.shape[0], 0, source.shape[1]))
         around = None if options.around is None else _mask(source.shape, options.around) & ~inside
         if around is not None and not around.any():
             raise ConfigError(f"{path}: --around has no pixel outside of --region. Nothing was written.")
         part = _bounds(inside if around is None else inside | around)
-        regions = Regions(inside[part], None if around is None else around[part])
+        regions = ContrastRegions(inside[part], None if around is None else around[part])
         yield Series(path.name, kept.size, source.line_integrals(kept.tolist(), part), regions)
 
 
-def _bounds(mask: NDArray[np.bool_]) -> Part:
+def _bounds(mask: NDArray[np.bool_]) -> FramePart:
     """The rows and columns of the mask and its neighbouring pixels: no more of a frame is read."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
 
 
-def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
+def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
     if box[1] > shape[0] or box[3] > shape[1]:
         raise ConfigError(
             f"The region {box[0]}:{box[1]},{box[2]}:{box[3]} is not in frames of {shape[0]} x {shape[1]} pixels. "
@@ -141,8 +141,8 @@ def _mask(shape: tuple[int, int], box: Box) -> NDArray[np.bool_]:
 
 @contextmanager
 def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[AbsorptionTable | Radiographs]:
-    """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col] beside `flats`
-    ([n, row, col] or [row, col]) and perhaps `darks` ([row, col] or [k, row, col]).
+    """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col]. Beside frames it
+    has `flats` ([n, row, col] or [row, col]), perhaps `darks` ([row, col] or [k, row, col]).
 
     Args:
         unit: of the energies, "keV" or "eV"; None: as in the dataset, else keV.
@@ -191,7 +191,7 @@ def _darks(path: Path, file: h5py.File, shape: tuple[int, ...]) -> h5py.Dataset 
 
 
 def _numbers(path: Path, file: h5py.File, name: str) -> h5py.Dataset | None:
-    """A dataset of numbers; None where there is none of that name."""
+    """A dataset of numbers; None where no dataset has that name."""
     item = hdf5.dataset(file, name)
     if item is not None:
         require_real(item.dtype, f"{path}: {name}")

@@ -15,7 +15,7 @@ from beamline.storage import hdf5
 from beamline.xafs.depth import line_integrals
 
 Reals = NDArray[np.float64]
-Part = tuple[slice, slice]
+FramePart = tuple[slice, slice]
 
 EVERYTHING = (slice(None), slice(None))
 
@@ -40,8 +40,8 @@ class Radiographs:
     def shape(self) -> tuple[int, int]:
         return int(self.frames.shape[1]), int(self.frames.shape[2])
 
-    def line_integrals(self, which: Sequence[int], part: Part = EVERYTHING) -> Iterator[tuple[float, Reals]]:
-        """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each; +inf where no light
+    def line_integrals(self, which: Sequence[int], part: FramePart = EVERYTHING) -> Iterator[tuple[float, Reals]]:
+        """(keV, line integrals [row, col]) of the frames `which`, in that order, of a part of each. +inf where no light
         was transmitted, NaN without a value, also for integers that are the largest of their type.
 
         Raises:
@@ -60,7 +60,7 @@ class Radiographs:
             raise DataError(f"{self.frames.file.filename} cannot be read ({hdf5.reason(error)}).") from error
 
 
-def _mean(item: h5py.Dataset | None, part: Part) -> Reals:
+def _mean(item: h5py.Dataset | None, part: FramePart) -> Reals:
     """Mean of the frame or frames of a dataset, read one by one; 0 without a dataset."""
     if item is None:
         return np.zeros(1)

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 
 from beamline.core.files import refuse_existing, write_whole
 from beamline.report.figures import png
-from beamline.xafs.contrast import Curve
-from beamline.xafs.edge import Edge
+from beamline.xafs.contrast import XafsCurve
+from beamline.xafs.edge import AbsorptionEdge
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,8 @@ class XafsResult:
     """
 
     title: str
-    curve: Curve
-    edge: Edge
+    curve: XafsCurve
+    edge: AbsorptionEdge
 
     @property
     def criterion(self) -> str:
@@ -87,14 +87,14 @@ def lines(result: XafsResult) -> list[str]:
     return text
 
 
-def left_out(curve: Curve) -> str:
+def left_out(curve: XafsCurve) -> str:
     """The energies that are left out, as a sentence."""
     e = curve.left_out
     where = f"{e[0]:.4f} keV" if e.size == 1 else f"{e.size} energies between {e[0]:.4f} and {e[-1]:.4f} keV"
     return f"{where}: too dark, too bright for the sensor, or without values"
 
 
-def table(curve: Curve) -> str:
+def table(curve: XafsCurve) -> str:
     """CSV: energy, absorption and, where they are known, contrast, noise and contrast-to-noise."""
     columns: dict[str, Any] = {"energy_kev": curve.energies, f"absorption ({curve.unit})": curve.absorption}
     if curve.contrast is not None and curve.noise is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.events import Event, Sink
-from beamline.xafs.contrast import Curve, Regions, contrast_of, curve_of
+from beamline.xafs.contrast import ContrastRegions, XafsCurve, contrast_of, curve_of
 from drivers.clock import Clock
 
 Reals = NDArray[np.float64]
@@ -33,14 +33,14 @@ class Series:
     title: str
     n: int
     frames: Iterable[tuple[float, Reals]]
-    regions: Regions
+    regions: ContrastRegions
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesResult:
     """A curve; `stopped` where it ended before its last energy."""
 
-    curve: Curve
+    curve: XafsCurve
     stopped: bool = False
 
 

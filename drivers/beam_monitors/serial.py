@@ -1,7 +1,7 @@
 """SerialSource: a beam monitor's text from an electrometer on a serial line, one line in reply to a query.
 
 Not tested on an instrument. The defaults are meant for the Keithley 6485 picoammeter (`READ?` answers
-`+1.0427E-12A,+2.345E+02,+0.000E+00`: current, time, status; 9600 baud; line end as set on its front panel) and were
+`+1.0427E-12A,+2.345E+02,+0.000E+00`: current, time, status; 9600 baud; line end as set on its front panel). They were
 not checked against its manual: check them on yours.
 """
 

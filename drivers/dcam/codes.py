@@ -143,7 +143,7 @@ class CaptureMode(IntEnum):
     SNAP = 0
 
 
-class Event(IntFlag):
+class DcamEvent(IntFlag):
     """DCAMWAIT_CAPEVENT."""
 
     FRAMEREADY = 0x0002

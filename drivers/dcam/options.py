@@ -60,7 +60,7 @@ class DcamOptions:
     """Options of a `DcamCamera`.
 
     trigger_active, _mode, _times and _delay apply to external triggers; a software trigger always gives one frame of
-    the set exposure. With LEVEL or SYNC_READOUT the pulses set the exposure; the exposure in CameraSettings must still
+    the set exposure. With LEVEL or SYNC_READOUT the pulses set the exposure. The exposure in CameraSettings must still
     equal their length (or distance), since the time of the first frame of a run is computed from it.
 
     Attributes:

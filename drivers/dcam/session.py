@@ -9,7 +9,7 @@ from pathlib import Path
 from drivers import usb
 from drivers.dcam import codes
 from drivers.dcam.abi import Dcam, DcamError
-from drivers.dcam.codes import Error, Event
+from drivers.dcam.codes import DcamEvent, Error
 from drivers.errors import DeviceError
 
 
@@ -43,7 +43,7 @@ class Session:
             self._steps.append(lambda: self.dcam.dev_close(self.camera))  # also ends a capture and frees the ring
             self.wait, supported = self.dcam.wait_open(self.camera)
             self._steps.append(lambda: self.dcam.wait_close(self.wait))
-            self.events = (Event.FRAMEREADY | Event.STOPPED) & supported
+            self.events = (DcamEvent.FRAMEREADY | DcamEvent.STOPPED) & supported
         except BaseException:
             with suppress(DcamError):
                 self.close()

@@ -135,11 +135,12 @@ def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSetti
 def read_timing(properties: Properties, trigger: TriggerSource, options: DcamOptions) -> CameraTiming:
     """Frame shape and timing that the camera reports, with the shortest trigger period.
 
-    The vendor's rule for external triggers (DCAM property reference): with exposure Tx, cyclic trigger period Tc and
-    minimum blanking Tb, triggers are at least max(Tc, Tx + Tb) apart, and not closer than the minimum trigger interval.
-    Tx is left out where the pulses set the exposure; where n pulses give one frame, pulses may be n times as close.
+    The vendor's rule for external triggers (DCAM property reference). With exposure Tx, cyclic trigger period Tc and
+    minimum blanking Tb, triggers are at least max(Tc, Tx + Tb) apart. They are also not closer than the minimum trigger
+    interval. Tx is left out where the pulses set the exposure; where n pulses give one frame, pulses may be n times as
+    close.
 
-    Frames of a set exposure are also not closer than in free run, where the camera allows for the link: a full frame
+    Frames of a set exposure are also not closer than in free run, where the camera allows for the link. A full frame
     takes 56 ms over USB and 8 ms on the sensor.
     """
     get = properties.get

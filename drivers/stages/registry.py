@@ -1,6 +1,6 @@
-"""The registry of stages: each kind's settings, with which its driver is opened.
+"""The registry of stages: the driver of each kind.
 
-Adding a stage takes its folder `drivers/stages/<kind>` with a module `settings`, and its line in REGISTRY.
+Adding a stage takes its folder `drivers/stages/<kind>` with a module `stage`, and its line in REGISTRY.
 """
 
 from __future__ import annotations
@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import import_module
 
-from drivers.stages.settings import StageSettings
+from drivers.plugins import plugins
+from drivers.stages.settings import StageDriver
 
-REGISTRY = {  # kind, as a configuration names it: class in the kind's module `settings`
-    "pm16c": "PM16CSettings",
-    "pi_gcs": "PiGcsSettings",
-    "zaber": "ZaberSettings",
+REGISTRY = {  # kind, as a configuration names it: class in the kind's module `stage`
+    "pm16c": "PM16CStage",
+    "pi_gcs": "PiGcsStage",
+    "zaber": "ZaberStage",
 }
-STAGES: Mapping[str, type[StageSettings]] = {
-    kind: getattr(import_module(f"drivers.stages.{kind}.settings"), name) for kind, name in REGISTRY.items()
+STAGES: Mapping[str, StageDriver] = {
+    **{kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name) for kind, name in REGISTRY.items()},
+    **plugins("stage", REGISTRY),
 }
-"""Kind -> the settings."""
+"""Kind -> the driver."""

@@ -133,7 +133,7 @@ class Wiring:
 
 
 class StageSettings(Protocol):
-    """What a driver is opened with; each stage's folder has one, and `drivers.stages.registry` lists them."""
+    """What a driver is opened with."""
 
     @property
     def figures(self) -> StageFigures: ...
@@ -150,7 +150,17 @@ class StageSettings(Protocol):
         """What the driver will say of the stage, as far as that is known before it is connected."""
         ...
 
-    def connect(self, url: str, clock: Clock) -> RotationStage:
+
+class StageDriver(Protocol):
+    """A driver's class; each stage's folder has one, and `drivers.stages.registry` lists them.
+
+    Attributes:
+        Settings: the class of what it is opened with.
+    """
+
+    Settings: type[StageSettings]
+
+    def __call__(self, url: str, settings: Any, clock: Clock) -> RotationStage:
         """The driver, connected at what pyserial opens. Nothing moves.
 
         Raises:
@@ -159,7 +169,7 @@ class StageSettings(Protocol):
         """
         ...
 
-    def halt(self, url: str, clock: Clock) -> None:
+    def halt(self, url: str, settings: Any, clock: Clock) -> None:
         """Stop whatever the stage does, also a move that a program began which has died; it may still slow down then.
 
         Raises:

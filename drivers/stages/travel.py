@@ -83,7 +83,7 @@ class Travel:
         return self.to_counts(angle)
 
     def refuse_train(self, train: TriggerTrain) -> None:
-        """Refuses a train without pulses or intervals, one whose pulses would run together at full speed or are no
+        """Refuses a train without pulses or intervals. Also one whose pulses would run together at full speed or are no
         multiple of `interval_unit` apart, and one beyond the soft limits. How far apart a single pulse is says nothing.
         """
         interval, least = abs(train.interval), least_interval(self.limits)
@@ -107,8 +107,8 @@ class Travel:
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
-        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`, or that has passed
-        the count before that from which on pulses are let through."""
+        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`. Also refuses it
+        where the stage has passed the count before, from which on pulses are let through."""
         if train.interval * (train.start - counts) <= 0:
             raise DeviceRefused(
                 self.name,

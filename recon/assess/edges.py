@@ -19,9 +19,9 @@ def edge_steepness(volumes: Sequence[F32]) -> list[float]:
     """Mean slope of each volume [z, y, x] across the edges of the smoothest one, over that of the steepest volume.
 
     Edges are the voxels where the smoothest volume (least mean slope), smoothed further by one voxel, changes nearly as
-    much as in its steepest hundredth; slopes are taken along its gradient. So the noise of the others does not choose
-    where they are looked at. It adds to a slope by as much as it is correlated with the noise of the smoothest one,
-    which tells where no edge is above the noise. NaN for each volume where one has values that are not finite.
+    much as in its steepest hundredth. Slopes are taken along its gradient. So the noise of the others does not choose
+    where they are looked at. It adds to a slope by as much as it is correlated with the noise of the smoothest one.
+    This tells where no edge is above the noise. NaN for each volume where one has values that are not finite.
 
     Raises:
         ValueError: no volumes, volumes of different shapes, or of fewer than two voxels along y or x.

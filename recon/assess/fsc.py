@@ -23,7 +23,7 @@ class ShellCorrelation:
     Attributes:
         frequency: [shell], 1/mm, the middle of each shell; the first is one period over the longest edge.
         correlation: [shell], -1..1; NaN in a shell where a volume has no power.
-        independent: [shell], number of independent Fourier values in a shell; for white noise the correlation
+        independent: [shell], number of independent Fourier values in a shell. For white noise the correlation
             scatters about 0 with a standard deviation of 1/sqrt(independent), or up to 30 % less under a mask.
         nyquist: 1/mm, of the coarsest voxel edge; shells end there.
     """
@@ -119,8 +119,8 @@ def fourier_shell_correlation(
         mask: weights [z, y, x], such as `soft_cylinder`; None: all 1.
 
     Raises:
-        ValueError: for shapes that differ, fewer than 4 voxels along the longest axis, values that are not finite,
-            spacings that are not positive, or a volume that is constant under the mask.
+        ValueError: for shapes that differ, fewer than 4 voxels along the longest axis, values that are not finite, or
+            spacings that are not positive. Also for a volume that is constant under the mask.
     """
     if first.shape != second.shape or first.ndim != 3:
         raise ValueError(f"two volumes [z, y, x] of one shape are needed, got {first.shape} and {second.shape}")

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
-Quality = Literal["preview", "standard", "best"]
+from recon.base.choices import DEFAULT_STEPS, Quality
 
 _MOST_BINNED = 2  # of the measured curves
 
@@ -59,9 +58,9 @@ class Curve:
         return speeds.sweep * self.pace / (self.binning * further) ** 3 if self.pace > 0 else 0.0
 
 
-# Means of four scans: a slab of a measured walnut (40 rows of 256 pixels, 60 views), a simulated battery of four rays a
-# pixel (48 rows of 160 pixels, 90 views, 5000 photons a pixel), the same in half the views with 100 000 photons, and
-# simulated spheres (48 rows of 96 pixels, 60 views, 10 000 photons). Fits with a finish of 8 sweeps. A curve begins
+# Means of four scans: a slab of a measured walnut (40 rows of 256 pixels, 60 views). A simulated battery of four rays a
+# pixel (48 rows of 160 pixels, 90 views, 5000 photons a pixel). The same in half the views with 100 000 photons.
+# Simulated spheres (48 rows of 96 pixels, 60 views, 10 000 photons). Fits with a finish of 8 sweeps. A curve begins
 # where its method is above FBP on all of them. Binning helps only where FBP of all pixels takes too long.
 CURVES: tuple[Curve, ...] = (
     Curve("fbp", "", 1, 0.0, 0.0, 0.0, ((1, 0.0),)),
@@ -159,8 +158,8 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
     """For each method the settings with the best expected quality within `budget` seconds; the best method first.
 
     Each measured curve gives the quality of a kind of reconstruction after the steps for which the time suffices. A
-    method for which it does not suffice is left out; if it suffices for none, the one that takes the least time is
-    there alone, with a gain of -inf.
+    method that needs more is left out. If all need more, the one that takes the least time is there alone, with a gain
+    of -inf.
 
     Args:
         budget: s for everything: FBP, placing, steps, finish and filling the volume.
@@ -194,7 +193,8 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
 
 def best_steps(method: str) -> int:
     """Steps of this method beyond which no measured curve gains: more follow the noise."""
-    return max(max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
+    found = (max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
+    return max(found, default=DEFAULT_STEPS)
 
 
 def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choice | None:

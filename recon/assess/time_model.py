@@ -73,10 +73,10 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
 def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
     """Additional time for a fit to gain a dB, from the quality of fits of other lengths (`CURVES`).
 
-    A fit's own record is no basis: much of its gain towards the end comes from the falling learning rates, a gain that
-    a longer fit has only once, too. The curves are means over four scans; `low` and `high` are the best and the worst
-    of the curves for different numbers of Gaussians. Beyond its last point a curve is extrapolated with its last slope,
-    to at most four times its steps.
+    A fit's own record is no basis. Much of its gain towards the end comes from the falling learning rates; a longer fit
+    has that gain only once, too. The curves are means over four scans; `low` and `high` are the best and the worst of
+    the curves for different numbers of Gaussians. Beyond its last point a curve is extrapolated with its last slope, to
+    at most four times its steps.
 
     Args:
         seconds: time that the fit took.

@@ -10,7 +10,7 @@ def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float
     """Means of factor x factor line integrals [view, row, col]; trailing pixels that do not fill a bin are dropped.
 
     Where line integrals differ within a bin, their mean is slightly larger than the line integral of the mean
-    transmission; the correction can bin counts instead (`--bin`).
+    transmission. The correction can bin counts instead (`--bin`).
 
     Raises:
         ValueError: for a factor below 1, or larger than the detector.

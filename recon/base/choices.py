@@ -12,9 +12,10 @@ AUTO = "auto"
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 Loss = Literal["l1", "l2", "poisson"]
 Noise = Literal["auto", "log", "counts"]
+Quality = Literal["preview", "standard", "best"]
 Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
 FlatFields = Literal["groups", "dynamic"]
-Start = Literal["fbp", "tv"]
+Start = Literal["fbp", "tv", "published"]
 
 KERNEL = Kernel.COMPACT
 """Of a fit's Gaussians."""

@@ -7,13 +7,13 @@ Convention (fixed for the whole project): the object stands still and the view t
     rays run along d = (-sin θ, cos θ, 0)
 
 Parallel beam: column i has its centre at u = (i - axis_col) * pixel_pitch, so `axis_col` counts pixels from 0 at the
-centre of the first column; row j has its centre at v = (j - axis_row) * pixel_pitch, with axis_row = (rows - 1) / 2
-by default.
+centre of the first column. Row j has its centre at v = (j - axis_row) * pixel_pitch, with axis_row = (rows - 1) / 2 by
+default.
 
-Cone beam: the source lies at -sod * d, the detector sdd away from it; a point at depth w = sod + x·d falls on column
+Cone beam: the source lies at -sod * d, the detector sdd away from it. A point at depth w = sod + x·d falls on column
 axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_pitch, with pixel_pitch on the detector.
 
-A real set-up departs from that in three ways, each given for every view: `tilt` leans the rotation axis along the beam
+A real set-up departs from that in three ways, each given for every view. `tilt` leans the rotation axis along the beam
 (laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector.
 """
 
@@ -44,8 +44,8 @@ class Geometry:
         detector_shape: (rows, cols) in pixels.
         pixel_pitch: detector pixel in mm: at the sample for a parallel beam (1.0 = work in pixels), on the detector
             for a cone.
-        axis_col, axis_row: where the rotation axis, and the height z = 0, fall on the detector (a cone: its central
-            ray): pixels from 0 at the centre of the first column, row.
+        axis_col, axis_row: where the rotation axis and the height z = 0 fall on the detector (a cone: its central ray).
+            In pixels from 0 at the centre of the first column, row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
         shifts: float64 [view, 2], pixels (col, row) by which each view is displaced.
         roll: float64 [view], radians; the detector turned about the beam: its columns run along u cos + v sin.
@@ -143,8 +143,8 @@ class Geometry:
     def period(self) -> float:
         """Angle, in radians, after which views repeat the same rays: π for a centred parallel beam, else 2π.
 
-        2π holds for a cone, for an axis that leans along the beam, and for an axis so far off the detector's middle
-        that views half a turn apart see different parts (more than a tenth of the field).
+        2π holds for a cone, and for an axis that leans along the beam. It also holds for an axis more than a tenth of
+        the field off the detector's middle: views half a turn apart then see different parts.
         """
         return 2 * math.pi if self.is_cone or self.tilt.any() or self.is_off_middle else math.pi
 
@@ -224,8 +224,8 @@ class Geometry:
             widest = float(np.ptp(own, axis=0).max())
             if widest > 0:
                 raise ValueError(
-                    f"{name} differ from view to view (by up to {widest:.3g}), so that those of views at other angles "
-                    "are not known: give a geometry whose views share one value, or one that holds the other views"
+                    f"{name} differ from view to view (by up to {widest:.3g}), so those at other angles are not "
+                    f"known. Give a geometry whose views share one value, or one that holds the other views"
                 )
         n = np.size(angles)
         return _checked(
@@ -251,7 +251,7 @@ class Geometry:
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
 
-        For a parallel beam v is then measured from the middle of these rows, so that a slab is a scan of its own; the
+        For a parallel beam v is then measured from the middle of these rows, so that a slab is a scan of its own. The
         central ray of a cone stays where it is.
         """
         rows = self.detector_shape[0]

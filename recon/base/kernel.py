@@ -13,9 +13,9 @@ class Kernel(StrEnum):
         compact:1.5    (1 - q / R²)₊^m,   m = 3/2,   R² = 2 m + 5
 
     R gives the compact kernel the second moment of the Gaussian, so that a covariance means the same with both. Its
-    line integral is of the same form with exponent m + 1/2, a polynomial at m = 3/2, and nothing has to be truncated:
-    ∫ (1 - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). Its shadow is steeper at the edge and has no
-    tail, which suits matter that ends.
+    line integral is of the same form with exponent m + 1/2, a polynomial at m = 3/2. Nothing has to be truncated. ∫ (1
+    - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). Its shadow is steeper at the edge and has no tail,
+    which suits matter that ends.
     """
 
     GAUSSIAN = "gaussian"

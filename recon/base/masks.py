@@ -19,7 +19,7 @@ Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[
 
 @dataclass(frozen=True, eq=False)
 class RayWeights:
-    """Weights of rays [view, row, col] as a product, of which no more is made than is asked for.
+    """Weights of rays [view, row, col] as a product; only the part that is asked for is computed.
 
     Attributes:
         factors: float32 [view, row, col] each, one at least; see numpy.broadcast_to.
@@ -75,8 +75,8 @@ def masked(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Projections with all values finite, and their weights.
 
-    Pixels that are not finite, or have weight 0, take the mean of their neighbours in the same view, which direct
-    methods and first volumes use; their weight is 0, so that a fit ignores them.
+    Pixels that are not finite, or have weight 0, take the mean of their neighbours in the same view, for direct methods
+    and first volumes. Their weight is 0, so that a fit ignores them.
 
     Args:
         projections: [view, row, col]; not changed.

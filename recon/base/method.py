@@ -1,28 +1,26 @@
 """Method: what every reconstruction method is, and the values that go in and come out.
 
-A method is a frozen dataclass of its settings that meets the Protocol `Method`. `recon.methods` registers it.
+A method is a frozen dataclass of its settings that meets the Protocol `Method`. `recon.methods` registers it. What only
+some can do is a Protocol beside it.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol, Self
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
 F32 = NDArray[np.float32]
-Depth = Literal["quick", "full"]
 Plain = str | int | float
-
-PRECISION = "precision"
-"""`TrialSettings.varies` of a comparison of float32 kernels with the float64 reference implementation."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class RunControl:
 
     should_stop: Callable[[], bool] | None = None
     on_progress: Callable[[Progress], None] | None = None
-    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None
+    on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], object] | None = None
     checkpoint_every: float = 60.0
     resume: Mapping[str, NDArray[Any]] | None = None
     now: Callable[[], float] = time.perf_counter
@@ -139,6 +137,7 @@ class Traits:
         budget: a time budget chooses its settings, see `recon.assess.plans`.
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
+        needs_matter: it refuses views without any, such as those of a slab of air.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
     """
 
@@ -149,22 +148,8 @@ class Traits:
     presets: bool = False
     budget: bool = False
     any_grid: bool = False
+    needs_matter: bool = False
     halo: int = 0
-
-
-@dataclass(frozen=True)
-class TrialSettings:
-    """One way in which a trade-off tries a method.
-
-    Attributes:
-        varies: the group of the trial: "method" for the baseline, else what differs from it, or `PRECISION`.
-        settings: that differ from the defaults, by name as `recon.methods.build` takes them.
-        binning: of detector pixels.
-    """
-
-    varies: str
-    settings: Mapping[str, Plain] = field(default_factory=dict)
-    binning: int = 1
 
 
 class Method(Protocol):
@@ -173,13 +158,11 @@ class Method(Protocol):
     Attributes:
         name: in commands, files and events.
         label: in reports.
-        colour: in pictures, as matplotlib takes it.
         traits: what it can do.
     """
 
     name: ClassVar[str]
     label: ClassVar[str]
-    colour: ClassVar[str]
     traits: ClassVar[Traits]
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
@@ -194,20 +177,53 @@ class Method(Protocol):
         """The same method with as little work as still runs each of its kernels."""
         ...
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        """The settings that a trade-off tries on all views, the baseline first.
-
-        Args:
-            gaussians: how many a fit starts from by default.
-            depth: "quick" has fewer trials, and shorter ones.
-        """
-        ...
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Bytes that `run` takes at most beside the projections, and their weights where they are `weighted`."""
         ...
 
-    def work(self, n_views: int, binning: int) -> float:
-        """A rough measure of the time that a run takes, to be compared within one method only."""
+
+@runtime_checkable
+class DividedMethod(Method, Protocol):
+    """A method with settings that depend on how much of a volume it makes."""
+
+    def for_part(self, share: float, of_time: float) -> Self:
+        """The method for this share of a volume, in this share of its seconds."""
         ...
+
+
+@runtime_checkable
+class PresetMethod(Method, Protocol):
+    """A method with the trait `presets`."""
+
+    def with_quality(self, quality: Quality, default_count: int) -> Self:
+        """With the settings of a preset, for a grid that is worth `default_count` Gaussians."""
+        ...
+
+
+@runtime_checkable
+class TimedMethod(Method, Protocol):
+    """A method that ends by itself when a time is over."""
+
+    def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
+        """The method begun on these views, which takes the seconds that are `left` then."""
+        ...
+
+
+@runtime_checkable
+class CheckpointedMethod(Method, Protocol):
+    """A method with the trait `checkpoints`."""
+
+    @property
+    def planned_steps(self) -> int | None:
+        """Steps that end it; None where a time does."""
+        ...
+
+    @property
+    def made_by(self) -> tuple[Any, Mapping[str, Plain]]:
+        """Everything of its settings that decides what a step is: a dataclass, and more by name."""
+        ...
+
+
+def candidates_of(method: Method) -> tuple[Method, ...]:
+    """The methods that it chooses among, by preference; itself where it does not choose."""
+    return getattr(method, "candidates", (method,))

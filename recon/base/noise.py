@@ -28,10 +28,10 @@ def noise_level(images: F32) -> float:
 
     Matter changes slowly from pixel to pixel, noise does not: differences of order n both ways keep the noise and
     little else. Those of white noise have C(2n, n) times its standard deviation. Noise that was blurred, by
-    interpolation or in a scintillator, has less at high frequencies, so that the fourth differences, divided by
-    C(8, 4), are smaller than the third ones, divided by C(6, 3): their ratio gives the width of the blur, taken as
-    Gaussian, and so the noise at all frequencies. What all views have in a pixel (rings) does not count. [our own;
-    median of differences: Immerkær 1996, Comput. Vis. Image Underst. 64, 300]
+    interpolation or in a scintillator, has less at high frequencies. So the fourth differences, divided by C(8, 4), are
+    smaller than the third ones, divided by C(6, 3). Their ratio gives the width of the blur, taken as Gaussian, and so
+    the noise at all frequencies. What all views have in a pixel (rings) does not count. [our own; median of
+    differences: Immerkær 1996, Comput. Vis. Image Underst. 64, 300]
 
     White noise on real samples is found within a third, noise blurred by up to 0.7 pixel within a half, see
     tests/recon/base/test_noise.py. Fine texture in almost noiseless views counts as noise.

@@ -32,12 +32,12 @@ class RayModel:
     """How the line integral of a Gaussian along a ray is computed.
 
     Attributes:
-        exact_above: in a cone, Gaussians whose affine footprint is off by more than this (an estimate of the relative
-            L2 error, see recon.kernels.cpu.footprints) are integrated exactly along each ray; inf: none, 0: all. The
+        exact_above: in a cone, Gaussians with a larger error of the affine footprint are integrated exactly along each
+            ray. The error is relative L2, estimated, see recon.kernels.cpu.footprints. inf: none, 0: all. The
             footprints of a parallel beam are exact.
-        rectified: False gives the uncorrected footprints of 3DGS, as in X-Gaussian (see Zha et al. 2024, section 4.2):
-            density times one length for all, half the width of the field, whatever length of the ray lies in the
-            Gaussian. It serves to show the bias.
+        rectified: False gives the uncorrected footprints of 3DGS, as in X-Gaussian (see Zha et al. 2024, section 4.2).
+            The weight is then density times one length for all, half the width of the field, whatever length of the ray
+            lies in the Gaussian. It serves to show the bias.
     """
 
     exact_above: float = math.inf

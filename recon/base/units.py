@@ -16,8 +16,8 @@ _LOOKED_AT = 2**16  # values
 def look_like_degrees(angles: NDArray[np.floating]) -> bool:
     """Whether angles [view] that are said to be radians are degrees, by the look of them.
 
-    They are where all are whole numbers, or where they span more than ten turns and are round to two digits, or span
-    180 or 360.
+    They are degrees if all are whole numbers, or if they span 180 or 360. They are also if they span more than ten
+    turns and are round to two digits.
     """
     distinct = np.unique(angles)
     if distinct.size < _FEWEST or not np.isfinite(distinct).all():
@@ -46,8 +46,8 @@ def warn_of_degrees(angles: NDArray[np.floating]) -> None:
 def look_like_counts(projections: NDArray[np.floating]) -> bool:
     """Whether values [view, row, col] that are said to be line integrals are counts, by the look of some of them.
 
-    They are where nine in ten are so large that no detector could have measured the light that is left, or where half
-    are and all are whole numbers.
+    They are counts if nine in ten are so large that no detector could have measured the light that is left. Half of
+    them suffice if all are whole numbers.
     """
     flat = projections.reshape(-1)
     some = flat[:: max(1, flat.size // _LOOKED_AT)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
 
-# Box of a fit over the field, across, where the sample is wider. Two regions of interest: +2.0 and +3.8 dB; 1.4 gains
+# Box of a fit over the field, across, where the sample is wider. Two regions of interest: +2.0 and +3.8 dB. 1.4 gains
 # as much there, and loses 0.5 to 1.5 dB where the matter ends with the box (1.2: 0 and 0.8).
 _WIDER = 1.2
 _COARSEST = 4.0  # pixels: largest voxel of a fit's box, also where the volume wanted is coarser
@@ -68,7 +68,7 @@ class Grid:
         """A box around the rotation axis that holds all that any view sees, wherever the axis is on the detector.
 
         It spans what shifted views see, also for an axis outside the detector; rolled and tilted views count as
-        straight ones. The field of a cone is measured at the rotation axis, the usual convention: matter nearer the
+        straight ones. The field of a cone is measured at the rotation axis, the usual convention. Matter nearer the
         source is magnified more, and only few views see it. The box of a wide cone ends before its source.
         """
         low, high = geometry.heights
@@ -82,8 +82,8 @@ class Grid:
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
         """The box that a fit covers: the whole field, in voxels of the size wanted.
 
-        A sample that is wider than the field (`wider`) gets a fifth more across: what is beyond adds to every view, and
-        left out it appears inside as a bright rim.
+        A sample that is wider than the field (`wider`) gets a fifth more across. Matter beyond adds to every view; left
+        out, it appears inside as a bright rim.
 
         The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
         from which a fit can start.

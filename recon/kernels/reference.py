@@ -5,11 +5,11 @@ Projection and voxelisation are dense float64 sums over all Gaussians:
     density   σ(x) = Σ_i ρ_i exp(-1/2 (x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),   Σ = R S² Rᵀ          (Zha et al. 2024)
     ray       ∫ σ dt = Σ_i ρ_i μ_i exp(-1/2 (u - m_i)ᵀ Σ₂⁻¹ (u - m_i))       (parallel beam: exact; cone: affine)
 
-With the covariance taken to the detector by the Jacobian of the projection at the centre, a third row along the ray,
-and split as [[Σ₂, v], [vᵀ, f]], the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)): the Schur complement, the square
-of the last pivot of Σ' = L Lᵀ. L comes from J R S itself by orthogonal steps (QR): a needle of aspect 10⁴ would leave
-nothing of the difference even in float64. The exact ray of a cone needs no projection: with H = S⁻¹Rᵀ, δ from the
-source to the centre and D along the ray of a pixel,
+The covariance is taken to the detector by the Jacobian of the projection at the centre, with a third row along the ray.
+It is split as [[Σ₂, v], [vᵀ, f]]. Then the corrected factor is μ = sqrt(2π (f - vᵀ Σ₂⁻¹ v)). This is the Schur
+complement, the square of the last pivot of Σ' = L Lᵀ. L comes from J R S itself by orthogonal steps (QR): a needle of
+aspect 10⁴ would leave nothing of the difference even in float64. The exact ray of a cone needs no projection: with H =
+S⁻¹Rᵀ, δ from the source to the centre and D along the ray of a pixel,
 
     ∫ σ dt = Σ_i ρ_i sqrt(2π) |D| / |H D| exp(-1/2 |Hδ x HD|² / |HD|²)
 

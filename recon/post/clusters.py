@@ -69,8 +69,8 @@ def clusters(values: NDArray[np.floating], k: int | None = None, seed: int = 0) 
 def elbow(inertias: F64) -> int:
     """The number of clusters at the elbow of the mean squared distances W for 1, 2, ... clusters; at least 2.
 
-    That is the sharpest bend of log W. Of W itself (Thorndike 1953) the bend is at 2 for any number of equal steps,
-    because W falls as 1 / k² before it.
+    That is the sharpest bend of the logarithm log(W). The bend of W itself (Thorndike 1953) is at 2 for any number of
+    equal steps, because W falls as 1 / k² before it.
     """
     if inertias.size < 3:
         return 2

@@ -17,7 +17,7 @@ F32 = NDArray[np.float32]
 
 _GRID = 0.5
 """Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
-are parted, with it 1; of 40 pairs of touching balls 38 are parted, for 40."""
+are parted, with it 1. Of 40 pairs of touching balls 38 are parted, for 40."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +87,8 @@ def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
 def parted(mask: Mask, neck: float = NECK) -> Labels:
     """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, parted where they are only joined by a neck.
 
-    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979); two basins are joined again
-    where the distance on the neck between them is at least `neck` of the smaller of their maxima, widest necks first.
+    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two basins are joined again
+    where the distance on the neck between them is at least `neck` of the smaller maximum, widest necks first.
 
     Args:
         neck: 0: connected parts as they are; above 1: every maximum is a particle.

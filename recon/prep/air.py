@@ -30,8 +30,8 @@ def edge_profiles(transmission: F32) -> F32:
 def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int, int]:
     """Number of columns at the left and right edge that show air in all views; (0, 0) if none do.
 
-    Air columns are nowhere darker than the outermost ones by more than the tolerance (or the noise, if larger), in
-    every view and over the whole height. A sample that fills the view is thinnest at the edge, so a trend towards
+    Air columns are nowhere darker than the outermost ones by more than the tolerance (or the noise, if larger). This
+    holds in every view, over the whole height. A sample that fills the view is thinnest at the edge, so a trend towards
     darker is sample; a slow trend towards brighter is the beam. A side of fewer than 4 % of the columns, or darker than
     the other side by more than 10 %, counts as 0.
 

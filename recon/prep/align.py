@@ -1,7 +1,7 @@
 """find_axis: the rotation axis from the data, with the curve of each estimate and whether it is reliable.
 
-Four methods with different weaknesses: the pair needs two views half a turn apart, and an axis near the middle;
-opposite views need a full turn; the double wedge needs views over about half a turn; the centre of mass takes any
+Four methods with different weaknesses: the pair needs two views half a turn apart, and an axis near the middle.
+Opposite views need a full turn. The double wedge needs views over about half a turn. The centre of mass takes any
 sector, but needs the whole sample in the field and air at zero.
 """
 
@@ -56,8 +56,8 @@ def axis_from_pair(
 ) -> AxisEstimate:
     """Axis from two views half a turn apart: p180 is p0 mirrored about the axis.
 
-    The normalised correlation of p0 with the mirrored p180 is taken at every half column (a mirror about a half column
-    maps pixels on pixels, so nothing is interpolated), then a parabola through the peak. Samples wider than the field
+    The normalised correlation of p0 with the mirrored p180 is taken at every half column, then a parabola through the
+    peak. A mirror about a half column maps pixels on pixels, so nothing is interpolated. Samples wider than the field
     are allowed: only columns that both views see are compared.
 
     Args:
@@ -91,7 +91,7 @@ def axis_from_opposites(
     """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
 
     As `axis_from_pair`, of the views' slopes along the columns, which have no trend in common where the overlap is
-    narrow, summed over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
+    narrow. The sum is over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
     29, 17849).
 
     Args:
@@ -166,9 +166,9 @@ def axis_from_sinogram(
     """Axis from all views, without a pair: for uneven, sparse and noisy scans, sectors and full turns.
 
     About half a turn or more: the double wedge. The Fourier transform of a sinogram along the columns holds, at
-    frequency ω, only the angular harmonics |n| <= ω r of a sample of radius r (Edholm, Lewitt & Lindholm 1986; used for
-    the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis the view at θ + π is the mirrored view at
-    θ, so the real part has even harmonics only and the imaginary part odd ones. The curve is the residual of a
+    frequency ω, only the angular harmonics |n| <= ω r of a sample of radius r. (Edholm, Lewitt & Lindholm 1986; used
+    for the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis the view at θ + π is the mirrored view
+    at θ. So the real part has even harmonics only and the imaginary part odd ones. The curve is the residual of a
     least-squares fit of these harmonics to the views. It takes angles in any spacing and is a sum of cosines of the
     axis, so nothing is interpolated.
 
@@ -352,7 +352,7 @@ def find_axis(
 ) -> AxisEstimate:
     """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
-    Where all views do not tell it and they go round the full turn, pairs of opposite views do: the axis of a wide field
+    Where all views do not tell it and they go round the full turn, pairs of opposite views do. The axis of a wide field
     stands near an edge of the detector.
 
     Args:

@@ -33,7 +33,7 @@ _LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # of the rays of a view; of the views
 _WINDOWS = (45, 15, 5, 1)  # views that share a surface
 _BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75  # of the mean square left: fewer views, or a higher order, must pay
 _BETTER = 0.99  # so must any surface
-_LEFT = 2.0  # times the noise: air of which a surface leaves more is no air
+_LEFT = 2.0  # times the noise: where a surface leaves more, there is no air
 _FARTHEST = 1000.0  # largest variance of a surface over that of a constant: beyond it extrapolates
 _ROWS_A_POWER = 4
 

@@ -150,9 +150,9 @@ class Correction:
     """Correction of one scan's views, which come in the order they were taken, in batches of any size.
 
     For each batch: `transmission`, then `survey`, then `line_integrals`. A view depends on the references, on the air
-    columns (those of all views surveyed so far, where they are found), and on its two neighbours. So the newest view
-    waits for the next one, and with the same references and air columns the line integrals are the same to the bit,
-    however the views were split into batches.
+    columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
+    With the same references and air columns the line integrals are the same to the bit, however the views were split
+    into batches.
     """
 
     def __init__(

@@ -14,8 +14,8 @@ from scipy import ndimage
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# Smoothing of the counts that the likelihood is expanded around, in pixels: from 1, 1.5, 2 and 3 by the error of the
-# expansion on three samples at 10 to 10 000 photons, see docs/notes/exploration.md. So are the other two.
+# Smoothing of the counts that the likelihood is expanded around, in pixels. Chosen from 1, 1.5, 2 and 3 by the error of
+# the expansion on three samples at 10 to 10 000 photons, see docs/notes/exploration.md. So are the other two.
 _SIGMA, _SPREAD = 1.5, 2.0
 _DETAIL = 1.5  # variance over that of counting beyond which a place has detail
 _FEWEST = 0.25  # photons: the least that a ray is taken to expect
@@ -99,9 +99,9 @@ def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64
     """Line integrals and weights whose weighed squares expand the likelihood to second order, element by element.
 
     With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
-    Σ λ - n ln λ has at p0 the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information:
-    p~ = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh & Nelder
-    1989, section 2.5). Zero counts are as good as any.
+    is Σ λ - n ln λ. At p0 it has the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information. p~
+    = p0 - (n - λ) / (λ - extra), w = (λ - extra)² / λ (iteratively reweighted least squares: McCullagh & Nelder 1989,
+    section 2.5). Zero counts are as good as any.
     """
     seen = beam * np.exp(-around)
     return around - (photons - seen) / seen, seen * seen / (seen + extra)

@@ -62,7 +62,7 @@ def zingers(view: Image, others: list[Image], threshold: float) -> tuple[NDArray
     """Pixels (r, c) hit by a stray photon, and the median around each.
 
     Compared in √transmission, where photon noise is uniform. A bright feature of the sample is also in the neighbouring
-    views, or is larger than the two or three pixels of a zinger; a zinger is brighter than both.
+    views, or is larger than the two or three pixels of a zinger. A zinger is brighter than both.
     """
     root = np.sqrt(np.maximum(view, 0))
     step = max(1, int(np.sqrt(view.size / 4096)))

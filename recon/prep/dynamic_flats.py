@@ -1,9 +1,9 @@
 """Dynamic flats: how the beam's shape changes from flat to flat, and how much of each change a view was taken with.
 
-After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975: principal components
-of the flats, as many as parallel analysis finds, and for each view the weights at which the corrected view has the
-least total variation. [our own: components of the logarithm, so that a flat is mean * exp(weights @ components) and the
-weights of a view are a convex fit of its line integrals]
+After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975. They are principal
+components of the flats, as many as parallel analysis finds. For each view come the weights at which the corrected view
+has the least total variation. [our own: components of the logarithm, so that a flat is mean * exp(weights @ components)
+and the weights of a view are a convex fit of its line integrals]
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _APART = 4  # pixels between which differences are taken: a beam changes more sl
 _ROUNDS = 20  # of reweighting
 _SMOOTHED = 5  # pixels a side, to tell air
 _LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1  # percentile of line integrals that is air's, its range, and its least share
-_MOST_LEFT = 3.0  # times the noise: what is left of air that is none is more
+_MOST_LEFT = 3.0  # times the noise: what is left where there is matter is more
 _DARKEST = 0.05  # of the median flat; darker pixels tell nothing
 
 
@@ -53,8 +53,8 @@ class DynamicFlats:
         return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
 
     def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """Weights [part] at which the line integrals of this view vary least from pixel to pixel (sum of absolutes),
-        and then least squares of those pixels that so turn out to be air, where there are some.
+        """Weights [part] at which the line integrals of this view vary least from pixel to pixel (sum of absolutes).
+        Where some pixels turn out to be air, least squares of these follow.
 
         Args:
             view: float32 [row, col], counts without the dark.

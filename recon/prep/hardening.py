@@ -1,6 +1,6 @@
 """Beam hardening: line integrals of many energies turned into those of a thin layer's attenuation, for one material.
 
-A beam of several energies loses the soft ones first, so that line integrals grow more slowly than thickness: bodies are
+A beam of several energies loses the soft ones first, so line integrals grow more slowly than thickness. Bodies are
 darker inside (cupping), and between dense parts are streaks. For one material the relation is a curve, which is
 inverted (Herman 1979, Phys. Med. Biol. 24, 81).
 """
@@ -69,7 +69,7 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
 
 def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
-    """The curve of two energies that is closest to line integrals over paths through the material (Van de Casteele et
+    """The curve of two energies that is closest to line integrals over paths through the material. (Van de Casteele et
     al. 2002, Phys. Med. Biol. 47, 4181): it always rises, and less and less.
 
     Args:

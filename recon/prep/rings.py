@@ -36,17 +36,17 @@ _DB5 = np.array(
 
 
 def width_for(cols: int) -> int:
-    """Odd number of columns, of a median along them, that is wider than small stripes and narrower than the sample: 31
-    for 2048, 7 for 160, 3 for 40."""
+    """Odd number of columns for a median along them, wider than small stripes and narrower than the sample. 31 for
+    2048, 7 for 160, 3 for 40."""
     return 2 * round(max(cols * 0.015, min(6.0, cols / 24)) / 2) + 1
 
 
 def by_sorting(sinogram: F32, width: int | None = None) -> F32:
     """Small and medium stripes out: a median along the columns of values sorted in each column.
 
-    A stripe shifts all values of its column; sorted, neighbouring columns look alike, so that what differs is the
-    stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3). [our own: what a stripe adds is about
-    the same in all views, so that nothing else is taken; edges of metal made black streaks across the slice]
+    A stripe shifts all values of its column. Sorted, neighbouring columns look alike, so that the difference is the
+    stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3). [our own: a stripe adds about the same
+    to all views, and only that is taken; edges of metal made black streaks across the slice]
     """
     order = np.argsort(sinogram, axis=0, kind="stable")
     ranked = np.take_along_axis(sinogram, order, axis=0)
@@ -72,9 +72,9 @@ def without_dead_columns(sinogram: F32) -> F32:
 def without_large_stripes(sinogram: F32) -> F32:
     """Wide or strong stripes shifted onto their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
 
-    Only columns whose sorted values lie off those around by three times the noise of a pixel, over the middle four
-    fifths of them, and by about as much in all of these, are changed, and none where a tenth of all are. [our own: the
-    second condition; metal near the axis was taken for a stripe]
+    A column is changed only where its sorted values lie off those around by three times the noise of a pixel. They must
+    do so over their middle four fifths, by about as much everywhere. If that is a tenth of all columns, no column is
+    changed. [our own: the second condition; metal near the axis was taken for a stripe]
     """
     ranked = np.sort(sinogram, axis=0)
     smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
@@ -97,7 +97,7 @@ def by_wavelets(sinogram: F32, levels: int = _LEVELS, damping: float = _DAMPING)
     """Stripes out of the wavelet coefficients that hold them (Münch, Trtik, Marone & Stampanoni 2009, Opt. Express 17,
     8567).
 
-    Coefficients that are smooth along the views and rough along the columns hold the stripes; there, frequencies k
+    Coefficients that are smooth along the views and rough along the columns hold the stripes. There, frequencies k
     along the views are damped by 1 - exp(-k² / (2 damping²)).
     """
     views, cols = sinogram.shape
@@ -161,10 +161,10 @@ def remove_rings(projections: NDArray[np.floating], angles: NDArray[np.float64],
         projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
         angles: [view], radians.
         rings: "sort" for small and medium stripes (Vo et al. 2018, algorithm 3), "vo" also for dead columns and large
-            ones, "wavelet" by wavelets (Münch et al. 2009), "none"; "auto" looks and chooses sort, vo or none.
+            ones. "wavelet" by wavelets (Münch et al. 2009), "none". "auto" looks and chooses sort, vo or none.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or a `rings` that is none of these.
+        ValueError: shapes that do not fit, values that are not finite, or another `rings`.
     """
     views, theta = np.array(projections, np.float32), np.asarray(angles, np.float64)
     if views.ndim != 3 or theta.shape != views.shape[:1]:

@@ -41,8 +41,8 @@ class TiltEstimate:
 def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEstimate:
     """The straight line through the axes of bands of rows with the least sum of the logarithms of their mismatches.
 
-    The mismatch of a band with an axis is that of the double wedge, or where that does not tell it and the views go
-    round the full turn, that of opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band
+    The mismatch of a band with an axis is that of the double wedge. Where that does not tell it and the views go round
+    the full turn, it is that of opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band
     whose noise is not known: it weighs little where a band fits badly with any axis, as air or a clipped row does. The
     uncertainty has two parts: that of the jackknife over bands, or over neighbouring ones together, which see the same
     sample, where that is larger (Efron & Stein 1981, Ann. Stat. 9, 586); and the scatter of the bands' own axes about
@@ -112,7 +112,7 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
 def _scatter(splines: list[CubicSpline], heights: F64, line: F64) -> float:
     """Standard deviation of the slope by how far from the line the bands have their own axes (weighted least squares).
 
-    A band's weight is the bend of its logarithm. Those at the ends, which turn the line, may be few: the scatter is
+    A band's weight is the bend of its logarithm. Those at the ends, which turn the line, may be few. So the scatter is
     divided by how many bands carry the slope, not by their number.
     """
     at = line[0] + line[1] * heights

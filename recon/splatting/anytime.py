@@ -1,15 +1,15 @@
-"""Rates and mean of a fit of which nobody knows how many steps are to come.
+"""Rates and mean of a fit whose number of steps is not known.
 
 The rates fall as 1 / (1 + t / 60) with the steps t, and the model is the mean of the parameters over the last quarter
-of them. A step follows one or two views, so that at a high rate the parameters wander about where all views would have
-them; their mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit whose
-rates were planned to end there (docs/notes/performance.md, "Streaming").
+of them. A step follows one or two views, so at a high rate the parameters wander about the point where all views would
+have them. Their mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit
+whose rates were planned to end there (docs/notes/performance.md, "Streaming").
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.optimise import FitState
@@ -23,9 +23,24 @@ WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=
 """The rates of a fit to all views, to a lower end; density control at any rate, as far as the rounds make room."""
 
 
-def fallen(steps: int, decay: float) -> float:
-    """How far the rates have come after so many steps on their logarithmic way to `decay` of the first ones, 0..1."""
-    return min(1.0, math.log1p(steps / HALF) / max(-math.log(decay), 1e-9))
+def while_views_come(settings: FitSettings) -> FitSettings:
+    """The same, with what a caller's settings have other than the defaults."""
+    usual = FitSettings()
+    chosen = {
+        f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
+    }
+    if isinstance(policy := chosen.get("policy"), DensityPolicy):  # how many steps there will be is not known
+        chosen["policy"] = replace(policy, start=0.0, stop=2.0)
+    return replace(WHILE_VIEWS_COME, **chosen)
+
+
+def fallen(steps: int, settings: FitSettings) -> float:
+    """How far the rates have come after so many steps on their logarithmic way to the last ones, 0..1.
+
+    Rates that are lower from the start fall as much later.
+    """
+    half = HALF * WHILE_VIEWS_COME.pace / settings.pace
+    return min(1.0, math.log1p(steps / half) / max(-math.log(settings.decay), 1e-9))
 
 
 def average(state: FitState, since: int) -> None:

@@ -125,8 +125,8 @@ def backend_for(device: str) -> Backend[Any]:
         return Cpu()
     if not re.fullmatch(r"cuda(:\d+)?", device):
         raise ValueError(
-            f"device {device!r} was asked for, and a fit computes on 'cpu' or on 'cuda', the current CUDA device: name "
-            "one of these; CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
+            f"device {device!r} was asked for; a fit computes on 'cpu' or on 'cuda', the current CUDA device. Name "
+            f"one of these. CUDA_VISIBLE_DEVICES, set before Python starts, chooses the current CUDA device"
         )
     from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,17 @@ _APART = 0.75
 # is part of the views: without it, matter at the border is lost (0.05 to 0.16 dB, measured).
 _LOST = 3.0
 
+_PUBLISHED_SHRINK = 1.6  # by which the published split makes both halves narrower
+
+Rule = Literal["mass", "published"]
+
 
 @dataclass(frozen=True)
 class DensityPolicy:
     """When density control runs, and its thresholds.
 
-    `every`, `stop` and `threshold` are those of Zha et al. 2024, the rest is for short fits. Theirs for 30 000 steps:
-    from step 500, split above 0.1 of the field, prune below 1e-5, at most 500 000 Gaussians.
+    `every`, `stop` and `threshold` are those of Zha et al. 2024, the rest is for short fits. See `published` for all
+    of theirs.
 
     Attributes:
         start, stop: first and last step as fractions of all steps.
@@ -32,6 +37,9 @@ class DensityPolicy:
         large: fraction of the field above whose length it is split; a smaller one is cloned.
         prune_below: density (in density units) below which a Gaussian is removed.
         growth: largest number of Gaussians, relative to the number at the start.
+        rule: "mass": clones and splits conserve the mass of the Gaussian, see `control`. "published": a clone is two
+            equal Gaussians of half the density; a split draws two centres from the Gaussian, both of half its density
+            and of its width over 1.6; a Gaussian is removed where its centre leaves the box.
     """
 
     start: float = 0.05
@@ -41,6 +49,11 @@ class DensityPolicy:
     large: float = 0.01
     prune_below: float = 1e-4
     growth: float = 1.5
+    rule: Rule = "mass"
+
+    def __post_init__(self) -> None:
+        if self.rule not in get_args(Rule):
+            raise ValueError(f"rule must be one of {', '.join(get_args(Rule))}, got {self.rule!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +85,7 @@ def control(
     box: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Change:
-    """Compute one round. Every clone and split conserves the mass ρ √|Σ|, so the projections hardly change.
+    """Compute one round. By the rule "mass" every clone and split conserves ρ √|Σ|: the projections hardly change.
 
     Pruning comes first: a model at its limit may add as many Gaussians as were pruned. Together the two then relocate
     Gaussians, at a constant number, from where they are faint or outside the box to where the statistic is largest.
@@ -88,7 +101,8 @@ def control(
         rng: draws the direction in which a clone or half moves.
     """
     density = np.logaddexp(0, raw)
-    reach = _LOST * np.exp(log_scales.max(axis=1, keepdims=True))
+    lost = _LOST if policy.rule == "mass" else 0.0
+    reach = lost * np.exp(log_scales.max(axis=1, keepdims=True))
     alive = (density >= policy.prune_below) & ((means >= box[0] - reach) & (means <= box[1] + reach)).all(axis=1)
     wanted = np.flatnonzero(alive & (statistic > policy.threshold))
     free = max(0, limit - int(alive.sum()))
@@ -96,28 +110,53 @@ def control(
         wanted = wanted[np.argsort(-statistic[wanted], kind="stable")[:free]]
         wanted.sort()
 
+    split = np.exp(log_scales[wanted].max(axis=1)) > policy.large * field
+    halves = _halves if policy.rule == "mass" else _published_halves
+    first, second, narrower, divisor = halves(log_scales[wanted], rotations.reshape(-1, 3, 3)[wanted], split, rng)
     new_means, new_scales, new_raw = means.copy(), log_scales.copy(), raw.copy()
-    axis = log_scales[wanted].argmax(axis=1)
-    longest = np.exp(log_scales[wanted, axis])
-    direction = rotations.reshape(-1, 3, 3)[wanted, :, axis]
-    split = longest > policy.large * field
-    # Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
-    # Cloning: two of half the density, a small distance apart, since two equal ones would always get equal gradients.
-    apart = np.where(split, _APART, 0.25) * longest * np.where(rng.random(wanted.size) < 0.5, 1, -1)
-    shrink = np.where(split, np.sqrt(1 - _APART**2), 1.0)
-    child_density = density[wanted] / (2 * shrink)
-    offset = (apart[:, None] * direction).astype(np.float32)
-    new_means[wanted] += offset
-    new_scales[wanted, axis] += np.log(shrink).astype(np.float32)
-    new_raw[wanted] = _inverse(child_density)
+    new_means[wanted] += first
+    new_scales[wanted] += narrower
+    new_raw[wanted] = _inverse(density[wanted] / divisor)
     keep = np.flatnonzero(alive)
     return Change(
         keep,
         wanted,
-        np.concatenate((new_means[keep], means[wanted] - offset)),
+        np.concatenate((new_means[keep], means[wanted] + second)),
         np.concatenate((new_scales[keep], new_scales[wanted])),
         np.concatenate((new_raw[keep], new_raw[wanted])),
     )
+
+
+def _halves(
+    log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[F32, F32, F32, NDArray[np.float64]]:
+    """What becomes of the Gaussians that are split or cloned, by the rule "mass".
+
+    Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
+    Cloning: two of half the density, a small distance apart, since two equal ones would always get equal gradients.
+
+    Returns:
+        Shifts of the first and second halves [n, 3] mm, what is added to their log scales [n, 3], and what their
+        density is divided by [n].
+    """
+    at, axis = np.arange(split.size), log_scales.argmax(axis=1)
+    sign = np.where(rng.random(split.size) < 0.5, 1, -1)
+    apart = np.where(split, _APART, 0.25) * np.exp(log_scales[at, axis]) * sign
+    shrink = np.where(split, np.sqrt(1 - _APART**2), 1.0)
+    offset = (apart[:, None] * rotations[at, :, axis]).astype(np.float32)
+    narrower = np.zeros_like(log_scales)
+    narrower[at, axis] = np.log(shrink)
+    return offset, -offset, narrower, 2 * shrink
+
+
+def _published_halves(
+    log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[F32, F32, F32, NDArray[np.float64]]:
+    """The same by the rule "published": mass and covariance are not conserved."""
+    own = np.exp(log_scales) * rng.standard_normal((2, *log_scales.shape))
+    first, second = np.einsum("nij,hnj->hni", rotations, own * split[:, None]).astype(np.float32)
+    narrower = np.where(split, -np.log(_PUBLISHED_SHRINK), 0.0)[:, None].astype(np.float32)
+    return first, second, np.broadcast_to(narrower, log_scales.shape), np.full(split.size, 2.0)
 
 
 def _inverse(density: NDArray[np.floating]) -> F32:

@@ -66,8 +66,8 @@ class _Watch:
 
 @dataclass
 class _FromModel:
-    """The refinement as an iterative method of `recon.voxels.iterative.solve`, which makes as many more sweeps as views
-    held out prefer where `by_content`, and none where `watch` ends the trials of it."""
+    """The refinement as an iterative method of `recon.voxels.iterative.solve`. With `by_content` it makes as many more
+    sweeps as views held out prefer; it makes no more where `watch` ends the trials."""
 
     iterations: int
     by_content: bool
@@ -112,18 +112,19 @@ def finish(
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
-    The sweeps see the measured views, not what the fit leaves of them, which is better by 0.5 to 2 dB wherever voxels
-    can explain the views. Where they cannot, because pixels are coarse, the noise is low or matter lies outside the
-    box, they would bend the volume (-6 dB on a teapot of 10⁵ photons, -12 dB on a region of interest). So where the
-    projection of the voxels at the start differs from that of the Gaussians by more than 0.6 of the noise, and the
-    sweeps leave more than the fit or 1.05 times the noise, they are tried anew on p - G + A x: measured views p less
-    the views G of the Gaussians plus the projection A x of the voxels at the start; what voxels cannot explain then
-    counts as noise. The second volume is taken unless it leaves its views worse explained by more than a tenth.
+    The sweeps see the measured views, not what the fit leaves of them. That is better by 0.5 to 2 dB wherever voxels
+    can explain the views. They cannot where pixels are coarse, the noise is low or matter lies outside the box. There
+    measured views would bend the volume (-6 dB on a teapot of 10⁵ photons, -12 dB on a region of interest). So two
+    things are looked at. The projection of the voxels at the start may differ from that of the Gaussians by more than
+    0.6 of the noise. The sweeps may leave more than the fit, or 1.05 times the noise. Where both hold, the sweeps are
+    tried anew on p - G + A x. Here p are the measured views, G those of the Gaussians, A x the projection of the voxels
+    at the start. What voxels cannot explain then counts as noise. The second volume is taken unless it leaves its views
+    worse explained by more than a tenth.
 
-    Single pixels that stand out in all views alike, which become rings, are brought back to their neighbours first, see
+    Single pixels that stand out in all views alike become rings. They are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`, or is the one that views held
     out prefer, see `preferred_weight`. Measured on 26 small scans, with the former: 0.5 to 7 dB above the fit in 25 of
-    them, 0.9 below it in one of 500 photons a pixel; level on a measured walnut (docs/notes/exploration.md).
+    them. In one, of 500 photons a pixel, 0.9 dB below it. It is level on a measured walnut (docs/notes/exploration.md).
     Memory: 8 volumes and 5 times the projections.
 
     Args:
@@ -134,8 +135,9 @@ def finish(
             and `bregman_weight`.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. A stop between the
-            two attempts keeps the first where it explains the views of a parallel beam, which see all matter, better
-            than the fit, else the fit. Of such views it keeps the first during the second, too.
+            two attempts keeps the first if it explains the views better than the fit, and the fit otherwise. Only views
+            of a parallel beam, which see all matter, can tell that. Of such views it keeps the first during the second,
+            too.
 
         nonnegative: voxels below zero are clipped.
 

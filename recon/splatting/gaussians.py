@@ -124,6 +124,15 @@ class Gaussians:
             "kernel_exponent": np.asarray(self.kernel.exponent),
         }
 
+    def physical(self) -> dict[str, NDArray[np.float32]]:
+        """Centres [n, 3] (x, y, z) and widths [n, 3] in mm, unit quaternions [n, 4] (w, x, y, z), densities [n] 1/mm.
+
+        The inverse is `from_physical`.
+        """
+        turned = torch.nn.functional.normalize(self.quaternions, dim=1)
+        values = {"centres": self.means, "widths": self.scales, "rotations": turned, "densities": self.densities}
+        return {name: value.detach().cpu().numpy() for name, value in values.items()}
+
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.floating]]) -> Gaussians:
         """The inverse of `arrays`; without `kernel_exponent`, as in older files, they are true Gaussians."""

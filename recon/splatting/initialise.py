@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, gaussian_gradient_magnitude
 from scipy.spatial import cKDTree
 
 from recon.base.binning import bin_views
+from recon.base.choices import Filter
 from recon.base.choices import Start as Start
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
@@ -34,6 +35,9 @@ MATTER = 0.05
 # and overlap less (after 800 steps: walnut 29.6 dB against 29.5, battery 28.9 against 28.3). With a finish on voxels
 # 0.6 is as good as 0.8 in a tenth less time, since a Gaussian covers fewer pixels.
 _SPREAD = 0.6
+
+# Of the published start: density of a Gaussian over that of its voxel, and its least width over the field's.
+_PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
 # A pixel counts as wild above this many times the largest pixel of other views, a ratio that no sample reaches. Up to a
 # tenth of the views, and at least one, may contain such pixels.
@@ -96,6 +100,8 @@ def place(
         coarse = Grid((nz, ny, nx), factor * grid.voxel_size, grid.centre, pitch)
         volume = first_volume(bin_views(projections, factor), binned_geometry(geometry, factor), coarse, start)
     radius = math.inf if leaves_the_field(projections, geometry) else geometry.reach
+    if start == "published":
+        return sample_as_published(volume, wanted, rng, field_radius=radius, kernel=kernel)
     placed = sample_gaussians(volume, wanted, rng, field_radius=radius, kernel=kernel)
     return scale_to_data(placed, without_wild_pixels(projections), geometry, rays=rays)
 
@@ -136,18 +142,19 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
 
     "fbp": FBP or FDK; a short scan of a cone, which FDK does not cover, gets a few sweeps of OS-SIRT with TV instead.
-    "tv": these sweeps in every case: slower, and free of streaks with few views. Rolled and tilted views count as
-    straight ones here; the fit then uses the full geometry.
+    "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
+    ramp. Rolled and tilted views count as straight ones here; the fit then uses the full geometry.
     """
     straight, projections = geometry.straightened(), without_wild_pixels(projections)
     if _swept(geometry, start):
         sweeps = OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True)
         return solve(sweeps, Projector(straight, grid), projections)
+    ramp: Filter = "ram-lak" if start == "published" else "hann"
     if geometry.is_cone:
-        return Volume(fdk(projections, straight, grid, "hann"), grid)
+        return Volume(fdk(projections, straight, grid, ramp), grid)
     # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
-    return Volume(fbp(projections, straight, grid, "hann") * whole, grid)
+    return Volume(fbp(projections, straight, grid, ramp) * whole, grid)
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:
@@ -170,8 +177,8 @@ def sample_gaussians(
 ) -> Gaussians:
     """At most n isotropic Gaussians drawn from a volume.
 
-    The volume is smoothed first (streaks of few views would attract Gaussians; Yuluo et al. 2025, GR-Gaussian, gain
-    0.4 dB with 25 views), then voxels above 5 % of the density unit are drawn without replacement, with a
+    The volume is smoothed first, since streaks of few views would attract Gaussians. (Yuluo et al. 2025, GR-Gaussian,
+    gain 0.4 dB with 25 views.) Then voxels above 5 % of the density unit are drawn without replacement, with a
     probability that is half density and half gradient. A Gaussian's size is the distance to its neighbours, its density
     the voxel's.
 
@@ -185,8 +192,47 @@ def sample_gaussians(
     Raises:
         ValueError: where the volume holds no matter inside the field.
     """
-    data = gaussian_filter(np.maximum(volume.data, 0), smooth) if smooth > 0 else np.maximum(volume.data, 0)
+    data, unit, candidates = _matter(volume, field_radius, smooth)
+    data /= unit  # so that squares of gradients stay in float32's range
+    slope = gaussian_gradient_magnitude(data, 1.0).ravel()[candidates]
+    value = data.ravel()[candidates]
+    weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
+    # Exponential keys give a weighted draw without replacement in one pass (Efraimidis & Spirakis 2006).
+    keys = rng.exponential(size=candidates.size) / weight
+    chosen = candidates if candidates.size <= n else candidates[np.argpartition(keys, n)[:n]]
     z, y, x = volume.grid.coordinates()
+    k, j, i = np.unravel_index(chosen, data.shape)
+    jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.spacing[::-1]
+    means = np.stack((x[i], y[j], z[k]), 1) + jitter
+    scales = _SPREAD * neighbour_distance(means)
+    scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))
+    densities = data.ravel()[chosen].astype(np.float64) * unit
+    return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)
+
+
+def sample_as_published(
+    volume: Volume, n: int, rng: np.random.Generator, *, field_radius: float, kernel: Kernel = Kernel.GAUSSIAN
+) -> Gaussians:
+    """The published start (Zha et al. 2024): voxels above 5 % of the density unit, all equally likely.
+
+    A Gaussian is as wide as its neighbours are far, with 0.15 of its voxel's density. Theirs sit half a voxel off the
+    centres of the voxels; these sit at the centres. Arguments and errors as of `sample_gaussians`.
+    """
+    data, unit, candidates = _matter(volume, field_radius, 0.0)
+    chosen = rng.permutation(candidates)[:n]
+    z, y, x = volume.grid.coordinates()
+    k, j, i = np.unravel_index(chosen, data.shape)
+    means = np.stack((x[i], y[j], z[k]), 1)
+    side = volume.grid.voxel_size * max(data.shape)
+    scales = np.clip(neighbour_distance(means), _PUBLISHED_LEAST * side, side / 2)
+    densities = _PUBLISHED_SHARE * data.ravel()[chosen].astype(np.float64)
+    return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)
+
+
+def _matter(volume: Volume, field_radius: float, smooth: float) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
+    """The smoothed volume within the field, its density unit, and the voxels that may hold a Gaussian."""
+    data = gaussian_filter(np.maximum(volume.data, 0), smooth) if smooth > 0 else np.maximum(volume.data, 0)
+    _, y, x = volume.grid.coordinates()
     inside = (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
     data = np.where(inside[None], data, 0).astype(np.float32)
     unit = density_unit(Volume(data, volume.grid))
@@ -196,20 +242,7 @@ def sample_gaussians(
             f"the initial volume holds no matter: {candidates.size} voxels above {MATTER:.0%} of {unit:.3g} 1/mm; "
             "are the projections line integrals (-log of the transmission), and is the axis right?"
         )
-    data /= unit  # so that squares of gradients stay in float32's range
-    slope = gaussian_gradient_magnitude(data, 1.0).ravel()[candidates]
-    value = data.ravel()[candidates]
-    weight = value / value.sum() + slope / max(float(slope.sum()), 1e-30)
-    # Exponential keys give a weighted draw without replacement in one pass (Efraimidis & Spirakis 2006).
-    keys = rng.exponential(size=candidates.size) / weight
-    chosen = candidates if candidates.size <= n else candidates[np.argpartition(keys, n)[:n]]
-    k, j, i = np.unravel_index(chosen, data.shape)
-    jitter = (rng.random((chosen.size, 3)) - 0.5) * volume.grid.spacing[::-1]
-    means = np.stack((x[i], y[j], z[k]), 1) + jitter
-    scales = _SPREAD * neighbour_distance(means)
-    scales = np.clip(scales, 0.5 * volume.grid.voxel_size, 0.25 * volume.grid.voxel_size * min(data.shape[1:]))
-    densities = data.ravel()[chosen].astype(np.float64) * unit
-    return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)
+    return data, unit, candidates
 
 
 def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:

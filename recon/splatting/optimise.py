@@ -243,8 +243,8 @@ def _update(
 def _normalise_quaternions(state: FitState, backend: Backend[Any]) -> None:
     """Quaternions of length 1 that turn as before, with Adam's moments in their measure.
 
-    A gradient is across its quaternion, so that every step makes it longer and the next turn smaller: twice as long
-    after 30 000 steps, without this. What has no direction is left as it is.
+    A gradient is across its quaternion, so that every step makes it longer and the next turn smaller. Without this it
+    is twice as long after 30 000 steps. What has no direction is left as it is.
     """
     values = backend.numpy(state.parameters["quaternions"]).astype(np.float64)
     length = np.linalg.norm(values, axis=1, keepdims=True)

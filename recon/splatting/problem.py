@@ -20,7 +20,7 @@ from recon.splatting.backend import Backend, ProjectionLoss
 
 _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 
-# Images hold values of about one. No matter in the field can cause values beyond this limit, and in SSIM the sums of
+# Images hold values of about one. No matter in the field can cause values beyond this limit. In SSIM the sums of
 # products of their squares would exceed the range of float32.
 _LARGEST = 1e6
 # For later views, where the unit may come from noise before the sample was there: the limit of SSIM in float32.
@@ -80,9 +80,8 @@ def make_problem(
     """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
 
     Values that are not finite, or more than a million half fields times density units, get no weight, see
-    `masks.masked`. The squared losses are scaled to the size of the
-    absolute one at the data's noise (see `noise_level`), so that the weights of SSIM and total variation keep their
-    meaning.
+    `masks.masked`. The squared losses are scaled to the size of the absolute one at the data's noise (see
+    `noise_level`). So the weights of SSIM and total variation keep their meaning.
 
     Args:
         weights: of each ray [view, row, col], 0 or more; None: one for all.
@@ -153,7 +152,7 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
 def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) -> FitProblem:
     """The same problem on binned pixels: a first look at the large scales for a fraction of the time.
 
-    A binned pixel is the weighted mean of its pixels and weighs their mean weight, so that those that were not measured
+    A binned pixel is the weighted mean of its pixels and weighs their mean weight. So pixels that were not measured
     have no part in it.
 
     Raises:

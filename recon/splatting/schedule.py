@@ -15,9 +15,9 @@ from recon.base.choices import SHORT_STEPS as SHORT_STEPS
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem
 
-# At this step fits of 500 photons a pixel leave 1.2 to 1.4 times the noise, those of 1000 to 50 000 photons 2.0 to 7
-# times (eighteen slabs of seven samples). At 1.7 to 1.9 a disc with cracks loses 0.4 to 0.9 dB in the short fit, at 1.3
-# 0.1 dB (docs/notes/exploration.md).
+# At this step fits of 500 photons a pixel leave 1.2 to 1.4 times the noise. Those of 1000 to 50 000 photons leave 2.0
+# to 7 times (eighteen slabs of seven samples). At 1.7 to 1.9 a disc with cracks loses 0.4 to 0.9 dB in the short fit,
+# at 1.3 0.1 dB (docs/notes/exploration.md).
 _LOOKED_AT, _NEAR_NOISE = 100, 1.5
 
 

@@ -18,8 +18,8 @@ NAMES = ("means", "log_scales", "quaternions", "raw")
 # Total variation is a prior: it weighs the more, the noisier a pixel (variance) and the fewer pixels a Gaussian has.
 # Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
 _TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
-# A box of a 64th of the grid: seen more seldom, total variation comes in kicks that Adam's moments take for steepness
-# and that brake all the rest (-1.8 dB on a battery of 256³ voxels).
+# A box of a 64th of the grid: seen more seldom, total variation comes in kicks. Adam's moments take these for
+# steepness, which brakes all the rest (-1.8 dB on a battery of 256³ voxels).
 _TV_SHARE, _TV_SIZES = 4, (32, 96)
 
 
@@ -30,17 +30,17 @@ class FitSettings:
     Attributes:
         loss: "l1" (published), "l2", or "poisson" (squares weighed by the transmission).
         ssim_weight: of 1 - SSIM beside it.
-        tv_weight: of total variation; None takes 3e5 times the variance of a pixel's noise (in units of the half field
-            times the density unit), divided by the pixels that a Gaussian has, between 0.02 and 0.25.
+        tv_weight: of total variation. None takes 3e5 times the variance of a pixel's noise (in units of the half field
+            times the density unit). That is divided by the pixels of a Gaussian and kept between 0.02 and 0.25.
         tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
             side, 32 to 96.
         tv_moves: total variation may move centres. The published code has that gradient too small by the voxel size
-            squared, so that in effect it does not (there the weight is 0.05); with the right gradient we measure
-            +0.2 dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
+            squared, so that in effect it does not (there the weight is 0.05). With the right gradient we measure +0.2
+            dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
-            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there; 26 times with a
-            higher last rate gives in 400 steps and a finish what 20 gives in 500 (see docs/notes/exploration.md).
+            Twenty times as fast, with two views a step and a low last rate, gains 1 to 4 dB there. 26 times with a
+            higher last rate gives in 400 steps and a finish as much as 20 in 500 (see docs/notes/exploration.md).
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.

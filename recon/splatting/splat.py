@@ -1,7 +1,7 @@
 """project and voxelize: Gaussians to line integrals and to voxels, differentiable.
 
 The implementation follows from the tensors: float32 on the CPU uses the threaded CPU kernels, float32 on a CUDA device
-the GPU kernels, and float64 (or `implementation="reference"`) the reference implementation, which runs on the CPU.
+the GPU kernels. float64 (or `implementation="reference"`) uses the reference implementation, which runs on the CPU.
 """
 
 from __future__ import annotations

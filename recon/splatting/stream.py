@@ -1,11 +1,11 @@
 """StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
 
-The first Gaussians come from an FBP of the first well-spread views; where there is time for many steps, from the
-model's volume and an FBP of what it leaves of the views, when these have grown by half. From then on the model stays:
-each time the views have grown by half, a new round makes room for more Gaussians, which density control clones and
-splits where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any number of steps
-to come (`anytime`): the step after its arrival learns a view, every third of the others takes one of the newest,
-the rest replay all of them evenly (`arrivals`).
+The first Gaussians come from an FBP of the first well-spread views. Where there is time for many steps, they are placed
+anew when the views have grown by half: from the model's volume and an FBP of what it leaves of the views. From then on
+the model stays. Each time the views have grown by half, a new round makes room for more Gaussians. Density control
+clones and splits them where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any
+number of steps to come (`anytime`). The step after its arrival learns a view, every third of the others takes one of
+the newest, the rest replay all of them evenly (`arrivals`).
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ class StreamingFit:
 
     def _fraction(self) -> float:
         assert self._state is not None
-        return fallen(self._state.step - self._schedule_step, self._settings.decay)
+        return fallen(self._state.step - self._schedule_step, self._settings)
 
     def _begin_round(self, force: bool = False) -> None:
         theta = np.asarray(self._angles)

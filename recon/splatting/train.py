@@ -7,7 +7,7 @@ import operator
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.finish import finish
+from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.in_time import FINISH_SHARE, fill_seconds, finish_within, first_sweep_seconds
 from recon.splatting.initialise import leaves_the_field, place, sweeps_of_start
@@ -30,9 +31,6 @@ from recon.splatting.problem import FitProblem, binned_geometry, coarser
 from recon.splatting.schedule import Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.voxels.projector import data_residual
-
-if TYPE_CHECKING:
-    from recon.splatting.r2 import R2
 
 _TIMED = 3  # steps by which it is planned what a fit's seconds suffice for
 _LOOK = 50  # steps between two measurements of the views held out
@@ -80,7 +78,7 @@ class _HeldOutTracker:
                 self.kept = arrays_of(state, self.problem.backend)
 
 
-def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodResult:
+def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> MethodResult:
     """Fit the line integrals of a problem; see `R2`.
 
     Raises:
@@ -198,7 +196,7 @@ def run_fit(method: R2, problem: ReconProblem, control: RunControl) -> MethodRes
     return MethodResult(volume, record, tuple(history), model, checkpoint)
 
 
-def _factor_in_time(method: R2, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
+def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
     """The binning of the views that a fit starts from, so that its seconds suffice for the start.
 
     Warns:
@@ -213,7 +211,7 @@ def _factor_in_time(method: R2, geometry: Geometry, grid: Grid, now: Callable[[]
     factors = [n for n in (2, 4, 8) if n <= min(geometry.detector_shape) // 4] or [1]
     factor = next((n for n in factors if needed / n**3 <= _START_SHARE * left), factors[-1])
     warnings.warn(
-        f"seconds={method.seconds:g} do not suffice for the start of the fit, which takes about {needed:.3g} s: it "
+        f"seconds={method.seconds:g} do not suffice for the start of the fit, which takes about {needed:.3g} s. It "
         f"starts from views binned {factor} x {factor}, and ends with what is left of the time",
         stacklevel=2,
     )
@@ -221,10 +219,10 @@ def _factor_in_time(method: R2, geometry: Geometry, grid: Grid, now: Callable[[]
 
 
 def _finish_in_time(
-    method: R2, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
+    method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
 ) -> tuple[int | None, float]:
-    """The sweeps of the finish as `finish_within` says, or those of the method where the time suffices for two, and
-    their seconds, of so many `left` after the first steps, each of which takes `step`."""
+    """The sweeps of the finish and their seconds, of so many `left` after the first steps, at `step` seconds each.
+    `finish_within` gives the sweeps; where the time suffices for two, the method's own are taken."""
     room = FINISH_SHARE * left
     sweeps, seconds = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
     return (sweeps, seconds) if method.finish is None or sweeps == 0 else (method.finish, room)
@@ -268,7 +266,13 @@ def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[N
 
 
 def _first_state(
-    data: F32, geometry: Geometry, field_grid: Grid, method: R2, seed: int, backend: Backend[Any], factor: int = 1
+    data: F32,
+    geometry: Geometry,
+    field_grid: Grid,
+    method: FitMethod,
+    seed: int,
+    backend: Backend[Any],
+    factor: int = 1,
 ) -> tuple[FitState, int, float]:
     """The state of a fresh fit, how many Gaussians it starts from, and their density unit."""
     start = method.gaussians

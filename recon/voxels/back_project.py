@@ -1,11 +1,11 @@
 """Back-projection of filtered views of a parallel beam, sixteen slices at a time: ray by ray, or by gridding.
 
 f(x, y) = Σ_view q_view(x cos θ + y sin θ), where q interpolates the columns of a view linearly. Ray by ray it costs
-views x voxels. Gridding costs views x columns and a few FFTs: by the projection-slice theorem a view is a line through
+views x voxels. Gridding costs views x columns and a few FFTs. By the projection-slice theorem a view is a line through
 the middle of the volume's Fourier plane (O'Sullivan 1985, IEEE Trans. Med. Imaging 4, 200). That plane is periodic, as
-the volume is sampled, so that it also holds what linear interpolation adds beyond the sampling frequency, and both ways
-give one volume, wherever all views see it. Beyond, they differ by how a view ends: ray by ray with half a pixel more,
-in gridding with a ramp to 0 within one.
+the volume is sampled. So it also holds what linear interpolation adds beyond the sampling frequency. Both ways give one
+volume, wherever all views see it. Beyond, they differ by how a view ends: ray by ray with half a pixel more, in
+gridding with a ramp to 0 within one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _STEPS = 2048  # of the kernel's table within a cell
 _LEAST = 7e-5  # 1/pixel, of filter and linear interpolation: what the latter adds is followed down to it
 _MOST = 30  # cycles a column, at most
 
-# ns for sixteen slices, on two cores (sum of both) with AVX-512 in halves: of a voxel in a view, of a point on its way
+# ns for sixteen slices, on two cores (sum of both) with AVX-512 in halves. Of a voxel in a view, of a point on its way
 # into the Fourier plane, of a cell of that plane, of a point in the plan.
 _NS_A_RAY, _NS_A_POINT, _NS_A_CELL, _NS_OF_PLAN = 5, 85, 150, 20
 
@@ -121,8 +121,8 @@ def _spread(
 
     Tiles of one colour, 0 to 3, do not touch, so that threads may fill them at the same time.
 
-    spectra [view, k, 16] has one period of the views' spectra, turns [view, period, 2] the phase of each later one,
-    gain [point] the transfer function of linear interpolation at the frequencies k [point].
+    spectra [view, k, 16] has one period of the views' spectra, turns [view, period, 2] the phase of each later one.
+    gain [point] is the transfer function of linear interpolation at the frequencies k [point].
     """
     n, used = spectra.shape[1], plane.shape[2]
     rows, cols = plane.shape[0], plane.shape[1]

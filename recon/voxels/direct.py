@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Self, get_args
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import Depth, MethodResult, Progress, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import MethodResult, Progress, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import Filter, fbp, fbp_memory
 from recon.voxels.fdk import fdk
@@ -31,7 +31,6 @@ class Fbp:
 
     name: ClassVar[str] = "fbp"
     label: ClassVar[str] = "FBP"
-    colour: ClassVar[str] = "0.35"
     traits: ClassVar[Traits] = Traits(direct=True)
 
     filter: Filter = "hann"
@@ -55,17 +54,10 @@ class Fbp:
     def toy(self) -> Self:
         return self
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return [TrialSettings("method")]
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         views, (rows, cols) = geometry.n_views, geometry.detector_shape
         beside = fbp_memory(views, max(cols, grid.shape[2]))
         return 4 * (math.prod(grid.shape) + 2 * weighted * views * rows * cols) + beside
-
-    def work(self, n_views: int, binning: int) -> float:
-        return n_views / binning**3
 
 
 def direct(
@@ -76,9 +68,9 @@ def direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
 ) -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone takes `on_block` and `out`, and `fdk`."""
+    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone takes `out`, and `fdk`."""
     if geometry.is_cone:
-        return fdk(projections, geometry, grid, filter)
+        return fdk(projections, geometry, grid, filter, on_block)
     return fbp(projections, geometry, grid, filter, on_block, out)
 
 

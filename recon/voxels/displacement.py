@@ -1,9 +1,9 @@
 """Displacement: by how much a sample that slipped on its stage lies elsewhere, from the views before and after.
 
 Views of one part of the scan predict those of another wherever both see the sample from near directions. So a volume of
-the longest part is projected into the views of the others, and what differs is explained by a shift and a turn of the
-sample. Then all views together, corrected, give the next volume (joint reconstruction and reprojection: Gürsoy et al.
-2017, Sci. Rep. 7, 11818; here with one rigid displacement a part in place of one shift a view).
+the longest part is projected into the views of the others. A shift and a turn of the sample explain the differences.
+Then all views together, corrected, give the next volume (joint reconstruction and reprojection: Gürsoy et al. 2017,
+Sci. Rep. 7, 11818; here with one rigid displacement a part in place of one shift a view).
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def displacements(
 ) -> list[Displacement]:
     """The displacement of each part against the longest one.
 
-    Precise to some 0.1 pixel where matter has edges; what moves the sample by more than a tenth of the field, or
-    otherwise than as a rigid body, is not found, see `judge`.
+    Precise to some 0.1 pixel where matter has edges. Motion by more than a tenth of the field, or with deformation, is
+    not found, see `judge`.
 
     Args:
         projections: [view, row, col], line integrals.

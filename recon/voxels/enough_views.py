@@ -1,7 +1,7 @@
 """When views are enough: what the views still to come would add to the volume, predicted without a truth.
 
 The volume of the views so far is taken for the sample: its views at all planned angles get the noise that it leaves of
-the measured ones, and are reconstructed from those so far and from all (a parametric bootstrap; Efron & Tibshirani
+the measured ones. They are reconstructed from those so far and from all (a parametric bootstrap; Efron & Tibshirani
 1993, ch. 6.5). How much nearer the second volume is to the sample is the gain that is predicted.
 """
 

@@ -2,7 +2,7 @@
 
 f(x, y) = ∫₀^π q_θ(x cos θ + y sin θ) dθ, where q_θ is a view convolved with the band-limited ramp
 (Kak & Slaney 1988, eq. 3.61 and 3.69). Rows are independent, so the work runs in blocks of sixteen slices, counted from
-the volume's first: whoever asks for blocks one by one gets the volume of all of them, to the bit.
+the volume's first. Blocks that are asked for one by one equal those of the whole volume to the bit.
 """
 
 from __future__ import annotations
@@ -223,9 +223,9 @@ def fbp(
 ) -> F32:
     """Reconstruct by filtered back-projection (Kak & Slaney 1988, §3.3), views in any order.
 
-    Voxels take the filtered views by linear interpolation at their centres, many of them by gridding, which is within
+    Voxels take the filtered views by linear interpolation at their centres, many of them by gridding. This is within
     1e-3 of the peak (see `recon.voxels.back_project`): for voxels larger than a pixel bin the projections first. A
-    voxel that a view does not see gets nothing from that view, unless its opposite does: a full turn with the axis off
+    voxel that a view does not see gets nothing from that view, unless its opposite does. A full turn with the axis off
     the middle of the detector, or beside it, reaches as far as its far columns.
 
     Args:

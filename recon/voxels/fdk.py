@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit, prange
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, OPTIONS
+from recon.kernels.cpu.joseph import calls
 from recon.voxels.fbp import Filter, filter_projections
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import circle_weights, fan_shares
@@ -64,26 +66,32 @@ def _back_project(
 
 
 def fdk(
-    projections: NDArray[np.float32], geometry: Geometry, grid: Grid | None = None, filter: Filter = "ram-lak"
+    projections: NDArray[np.float32],
+    geometry: Geometry,
+    grid: Grid | None = None,
+    filter: Filter = "ram-lak",
+    on_block: Callable[[int, int], None] = lambda done, of: None,
 ) -> NDArray[np.float32]:
     """Reconstruct a cone-beam scan (Feldkamp, Davis & Kress 1984, J. Opt. Soc. Am. A 1, 612), views in any order.
 
-    Exact in the plane of the source; above and below, values fall off with the square of the cone's angle, and flat
+    Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
     interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
-    both (see `fan_shares`): what it cuts off brightens the rim. A voxel that a view does not see gets nothing from it.
+    both (see `fan_shares`). Matter that it cuts off brightens the rim. A voxel that a view does not see gets nothing
+    from it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
         grid: voxels wanted; None: `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
+        on_block: told how many of how many layers are there, by the views that they have.
 
     Returns:
         float32 [z, y, x], 1/mm.
 
     Raises:
-        ValueError: for a parallel beam, rolled or tilted views, a short scan, a shape that does not belong to the
-            geometry, values that are not finite, a box that reaches the source, or an unknown filter.
+        ValueError: for a parallel beam, rolled or tilted views, a short scan, or an unknown filter. Also for a shape
+            that does not belong to the geometry, values that are not finite, or a box that reaches the source.
     """
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:
@@ -111,16 +119,19 @@ def fdk(
         prepared = _prepared(projections[start : start + slab], part, rays, (before, after), filter)
         if not np.isfinite(prepared).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")
-        _back_project(
-            prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0] + before,
-            part.axis_row + part.shifts[:, 1], part.sod, part.sdd, part.pixel_pitch, x, y, z, volume,
-        )  # fmt: skip
+        for layers in calls(y.size, part.n_views * x.size * z.size):
+            some = slice(layers.start, layers.stop)
+            _back_project(
+                prepared, np.cos(part.angles), np.sin(part.angles), part.axis_col + part.shifts[:, 0] + before,
+                part.axis_row + part.shifts[:, 1], part.sod, part.sdd, part.pixel_pitch, x, y[some], z, volume[some],
+            )  # fmt: skip
+            on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
     return volume_slices(volume)
 
 
 def _prepared(views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], filter: Filter) -> F32:
-    """Views times the weights [view, col] and the cosine of each ray, with columns of zeros before and after, filtered:
-    [view, col + 2, row + 2], the rim twice."""
+    """Views times the weights [view, col] and the cosine of each ray, filtered. Columns of zeros stand before and
+    after. Shape [view, col + 2, row + 2], the rim twice."""
     rows, cols = geometry.detector_shape
     out = np.empty((geometry.n_views, sum(beyond) + cols + 2, rows + 2), np.float32)
     for view in range(geometry.n_views):

@@ -33,7 +33,7 @@ MOST_SWEEPS = _ROUNDS * _SWEEPS
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
 _LEVEL = 0.002  # residuals of views held out that differ by less are equal
 
-# Weights of the two runs of `bregman`, in that of one run, and by how much the residual of views held out has to fall:
+# Weights of the two runs of `bregman`, in that of one run. Then by how much the residual of views held out has to fall;
 # less is chance (docs/notes/exploration.md).
 _HEAVY, _LESS_HEAVY = 3.0, 2.5
 _GAIN, _FURTHER_GAIN = 0.003, 0.001
@@ -101,10 +101,11 @@ def choose_weight(
 def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, that views held out prefer, unless it is far above `first`.
 
-    Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, the weight and half of it, and
-    on, until the root mean square of what they leave of the other views rises; the vertex of the parabola through the
-    last three is taken, at most √2 times `first`. A volume that is too smooth misses edges of unseen views, one that
-    follows the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their number.
+    Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, the weight, half of it, and so
+    on. They end when the root mean square of what they leave of the other views rises. The vertex of the parabola
+    through the last three is taken, at most √2 times `first`. A volume that is too smooth misses edges of unseen views.
+    One that follows the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their
+    number.
 
     None where twice the weight leaves less: then nothing shows that the weight by the noise hides anything, and
     it may rise. (Weights far above it are not taken: a walnut of 50 views lost 1.3 dB.) None, too, where nothing can be
@@ -145,9 +146,10 @@ def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
 def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
     """Sweeps from `start` [y, x, z] with the weight μ that views held out prefer: `sweeps`, twice or three times these.
 
-    A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24), others
-    nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Sixteen rows are refined from seven of eight
-    views for as long as each further `sweeps` bring the others nearer. Where slices are not those of rows: `sweeps`.
+    A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24). It leaves
+    others nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Sixteen rows are refined from seven of
+    eight views for as long as each further `sweeps` bring the others nearer. Where slices are not those of rows:
+    `sweeps`.
     """
     errors = _errors_by_round(problem, start, weight, sweeps, lambda last, now: now < _NEARER * last)
     return sweeps * (1 + sum(now < _NEARER * last for last, now in pairwise(errors)))
@@ -156,9 +158,9 @@ def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: i
 def sweeps_by_noise(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
     """Sweeps from `start` [y, x, z] where the weight follows the noise from μ on: `sweeps`, or three times these.
 
-    Most samples come no nearer by more sweeps, and leave a fit that is better than total variation alone (a teapot:
-    39.6 dB after 8, 37.5 after 24); a battery, where fits of few views are far off, does (33.3, 36.1). So views held
-    out have to be predicted better by one per cent, which parts the two (docs/notes/exploration.md).
+    Most samples come no nearer by more sweeps. They leave a fit that is better than total variation alone (a teapot:
+    39.6 dB after 8, 37.5 after 24). A battery, where fits of few views are far off, comes nearer (33.3, 36.1). So views
+    held out have to be predicted better by one per cent, which parts the two (docs/notes/exploration.md).
     """
     if not (_can_hold_out(problem.projector.geometry) and weight > 0):
         return sweeps
@@ -169,8 +171,8 @@ def sweeps_by_noise(problem: VoxelProblem, start: F32, weight: float, sweeps: in
 def _errors_by_round(
     problem: VoxelProblem, start: F32, weight: float, sweeps: int, go_on: Callable[[float, float], bool]
 ) -> list[float]:
-    """What a trial leaves of views held out after each round of `sweeps` from `start`, for as long as the last two let
-    it `go_on`, at most three. Empty where slices are not those of rows."""
+    """What a trial leaves of views held out after each round of `sweeps` from `start`. There are at most three rounds,
+    as long as the last two let it `go_on`. Empty where slices are not those of rows."""
     grid, rows = problem.projector.grid, Grid.matching(problem.projector.geometry)
     if (grid.shape[0], grid.spacing[0], grid.centre[0]) != (rows.shape[0], rows.spacing[0], rows.centre[0]):
         return []

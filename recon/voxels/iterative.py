@@ -65,7 +65,7 @@ def solve(
         on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point
             where its correction was computed: the volume it leaves is better. CGLS, ASD-POCS: of the volume itself.
             The iterations end where it returns something true.
-        on_trial: called after each sweep of a trial, by which a method chooses its weight on some rows; the trials end
+        on_trial: called after each sweep of a trial, by which a method chooses its weight on some rows. The trials end
             where it returns something true, and the iterations follow.
         decide: takes what follows from the whole data, and has the seed of the order of views and subsets.
 

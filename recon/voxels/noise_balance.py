@@ -19,18 +19,18 @@ F32 = NDArray[np.float32]
 
 MATTER = 0.05  # of the density unit: voxels above it count
 EXPLAINED = 1.05
-"""Residual over the noise up to which a volume explains its views: 0.75 to 1.0 on eight scans that voxels explain,
-1.16 to 5.6 on seven cones of coarse voxels, 3 to 7 on three regions of interest."""
+"""Residual over the noise up to which a volume explains its views. On eight scans that voxels explain it is 0.75 to
+1.0. On seven cones of coarse voxels it is 1.16 to 5.6, on three regions of interest 3 to 7."""
 
-# From 22 scans (battery, walnut, thorax, shell, teapot, a box of tissue; 25 to 400 views, 500 to 100 000 photons a
-# pixel, white noise and noise blurred by half a pixel): within 0.4 dB of the best weight on average.
+# From 22 scans (battery, walnut, thorax, shell, teapot, a box of tissue), within 0.4 dB of the best weight on average.
+# They had 25 to 400 views, 500 to 100 000 photons a pixel, white noise and noise blurred by half a pixel.
 _SHARE = 0.75  # of the weight by the first volume
 _POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
-# Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many: +1.0, +0.7, -0.6 dB
-# on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
+# Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many. It gives +1.0,
+# +0.7, -0.6 dB on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
 _MANY_VIEWS, _HALF = 0.3, 0.45
-# What no volume explains of the views, where it is known before: +0.1 to +2.8 dB against no such factor on seven of
-# eight cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
+# The part of the views that no volume explains, where it is known before. It gives +0.1 to +2.8 dB on seven of eight
+# cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
 _KNOWN_BEFORE = 2.5
 # Where only the residual shows it: what it adds to the weight and the largest factor, chosen by eye. A tooth with rings
 # gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A battery in a field too narrow, with a black
@@ -46,16 +46,16 @@ class NoiseBalance:
 
     It begins with 0.75 σ² N / TV(x₀), where x₀ is the filtered back-projection, N its voxels of matter and σ the noise
     of a ray: as if each voxel's change were drawn from a Laplace distribution of the mean change. After each sweep it
-    is the first weight times (σ / s)³, at most four times it, s being the noise-like part of the residual: it rises
-    where the residual has less noise than the data, since then the volume has taken it up. What no volume explains, as
-    rings, errors of the geometry or of the air, makes s large, and bends the volume as noise does: from the third sweep
-    on the weight is 1 + 1.75² ((s / σ)² - 1.05²) times the first, at most five times, s being the least so far, so that
-    it only falls.
+    is the first weight times (σ / s)³, at most four times it, where s is the noise-like part of the residual. It rises
+    where the residual has less noise than the data, since then the volume has taken it up. Rings and errors of the
+    geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So from the third
+    sweep on the weight is 1 + 1.75² ((s / σ)² - 1.05²) times the first, at most five times. Here s is the least so far,
+    so that the weight only falls.
 
     Attributes:
         first: the weight to begin with.
-        noise: of a ray, that the residual is compared with: `noise_level` of the data, up to 1.3 times that where views
-            are so many (π / 2 times the columns determine a slice) that little of the noise fits into a volume.
+        noise: of a ray, with which the residual is compared: `noise_level` of the data. For many views it is up to 1.3
+            times that (π / 2 times the columns determine a slice). Then little of the noise fits into a volume.
         counted: what no volume explains was known before, and is in the first weight.
         value: the weight now.
     """

@@ -1,9 +1,9 @@
-"""odd_views: views of which a part is not what a volume made of them has there, against the views beside them."""
+"""odd_views: views with a part that differs from the volume made of them, compared with the views beside them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from recon.base.masks import RayWeights
 from recon.base.noise import median_deviation
 from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
-from recon.voxels.projector import project
+from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
 F32 = NDArray[np.float32]
 
@@ -25,6 +25,7 @@ LIMIT = 12.0
 _CELLS = 128  # columns of cells, at least, where the detector has so many pixels
 _BLUR = 4  # pixels that a blur by one reaches
 _BAND, _TOGETHER = 16, 32  # rows that are projected together; views that are compared together
+_AT_A_TIME = 8  # views of a cone that are projected together
 _BROAD = 3  # cells a side, over which a difference is averaged
 _AROUND, _BESIDE = 12, 3  # views on either side that say what is usual, without so many next to the one that is judged
 _OUTLIER = 3.0  # times the median of these, which one of them may add
@@ -55,19 +56,21 @@ def odd_views(
     geometry: Geometry,
     weights: F32 | RayWeights | None = None,
     limit: float = LIMIT,
+    told: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[OddView, ...]:
     """Views in which something was in the beam, or the sample was elsewhere, for few views: p - A x, seen by place.
 
-    The difference of each view from the volume's projection, less what all its pixels have in common (light), averaged
-    over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views fully: at
-    edges that it blurs, at rings, at what lies outside the field. So a difference counts by what the 18 views of the
-    nearest angles have at the same place, and by the edges of the volume in the view itself, where a face or a crack
-    that is parallel to the rays is sharp in few views only [our own].
+    The difference of each view from the volume's projection, less what all its pixels have in common (light). It is
+    averaged over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views
+    fully: at edges that it blurs, at rings, at what lies outside the field. So a difference counts relative to the 18
+        views of the nearest angles at the same place. It also counts relative to the edges of the volume in the view
+        itself: a face or a crack parallel to the rays is sharp in few views only [our own].
 
     Args:
         projections: [view, row, col].
         weights: of the rays [view, row, col]; those of weight 0 were not measured.
         limit: score from which a view is odd.
+        told: how many of how many views were compared, of bands of rows by their share.
 
     Returns:
         In the order of the views; none of fewer than 25 views.
@@ -77,7 +80,7 @@ def odd_views(
         return ()
     order = np.argsort(geometry.angles, kind="stable")
     side = _side(geometry)
-    differences, edges = (each[order] for each in _differences(volume, projections, geometry, weights, side))
+    differences, edges = (each[order] for each in _differences(volume, projections, geometry, weights, side, told))
     found = []
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
@@ -118,9 +121,11 @@ def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slic
     rows, band = geometry.detector_shape[0], _band(geometry)
     shifted = geometry.is_cone or bool(geometry.shifts[:, 1].any())
     if shifted or volume.grid != Grid.matching(geometry):
-        for view in range(geometry.n_views):
-            model = project(volume, geometry.select(np.array([view])))
-            yield slice(view, view + 1), slice(0, rows), model, _sharp(model)
+        lines = volume_lines(volume.data)  # once: of a large volume that takes as long as a view
+        for view in range(0, geometry.n_views, _AT_A_TIME):
+            some = slice(view, view + _AT_A_TIME)
+            model = projection_images(Projector(geometry.select(some), volume.grid).forward_lines(lines))
+            yield some, slice(0, rows), model, _sharp(model)
         return
     for first in range(0, rows, band):
         part = slice(first, min(first + band, rows))
@@ -139,7 +144,12 @@ def _sharp(models: F32) -> F32:
 
 
 def _differences(
-    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | RayWeights | None, side: int
+    volume: Volume,
+    projections: F32,
+    geometry: Geometry,
+    weights: F32 | RayWeights | None,
+    side: int,
+    told: Callable[[int, int], None],
 ) -> tuple[F32, F32]:
     """[view, cell, cell] each, averaged over cells, in standard deviations of noise: of the views from the volume, and
     what edges explain of that."""
@@ -147,6 +157,7 @@ def _differences(
     # Means over cells: of the difference in light, what edges explain of it, the pixels that are known, the view in
     # light, the light, and the difference.
     cells, edges, lit, seen, light, left = (np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6))
+    compared, all_rows = 0, geometry.n_views * geometry.detector_shape[0]
     for views, part, model, sharp in _projected(volume, geometry):
         measured = projections[views, part]
         difference = measured - model
@@ -156,6 +167,8 @@ def _differences(
         cells[there], lit[there] = _cells(difference * bright, side), _cells(known, side)
         seen[there], light[there] = _cells(measured * bright, side), _cells(bright, side)
         left[there], edges[there] = _cells(difference * known, side), _cells(sharp * bright, side)
+        compared += len(model) * model.shape[1]
+        told(compared * geometry.n_views // all_rows, geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
         third = np.diff(seen[view], 3, axis=1)  # of the view: what is finest in the sample counts too
         noise = median_deviation(third) / math.sqrt(20.0)

@@ -83,7 +83,7 @@ def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subset
     """Two runs of `ordered_fista`, the second with what the first has left of the views added to them: 2 p - A x₁.
 
     Bregman iteration (Osher, Burger, Goldfarb, Xu & Yin 2005, Multiscale Model. Simul. 4, 460, eq. 3.1 to 3.3). Total
-    variation takes contrast from every structure, from small ones most; the second run gives it back, and takes only
+    variation takes contrast from every structure, from small ones most. The second run gives it back, and takes only
     what it takes from the sum. The residual does not grow from run to run (their proposition 3.2). The first run wants
     a heavy weight, at which little noise is in its volume.
 

@@ -1,15 +1,15 @@
 """The voxel projector: line integrals through a volume, and the exact transpose.
 
-Both directions run on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. Whoever
-applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward` and
-`adjoint` take and give the usual one and pay a copy each way (256³: some 0.05 s on two cores).
+Both directions run on lines along z: volumes [y, x, z], projections [view, col, row], the last index fastest. A caller
+that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
+and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
 A ray has no width: pixels should not be much larger than voxels, or voxels between the rays are not seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -76,6 +76,15 @@ class Projector:
         """Aᵀ p: projections [view, row, col] to a volume [z, y, x]."""
         lines = projection_lines(_fitting(projections, self.projection_shape, "projections"))
         return volume_slices(self.adjoint_lines(lines), out)
+
+    def __call__(self, volume: F32) -> F32:
+        """A x, as `forward`."""
+        return self.forward(volume)
+
+    @property
+    def T(self) -> Callable[[F32], F32]:  # noqa: N802 - the transpose, as numpy spells it
+        """Aᵀ: `A.T(p)` is `A.adjoint(p)`."""
+        return self.adjoint
 
     def forward_lines(self, volume: F32, out: F32 | None = None) -> F32:
         """A x: volume [y, x, z] to projections [view, col, row]."""

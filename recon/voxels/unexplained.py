@@ -18,8 +18,8 @@ from recon.voxels.projector import Projector, seen_rays
 F32 = NDArray[np.float32]
 
 LIMIT = 0.007
-"""Share of the matter above which a volume hides structure: 0.01 to 0.05 of seven fits that fill cracks and round
-edges, up to 0.004 of sixteen finished ones, up to 0.005 of the true volumes on voxels (docs/notes/exploration.md)."""
+"""Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
+edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md)."""
 
 _SIGMAS = 4.0  # of the noise: its own share is below 1e-3
 _FLIPS = 6

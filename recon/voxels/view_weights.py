@@ -88,14 +88,14 @@ def circle_weights(angles: ArrayLike) -> F64:
 def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     """Quadrature weight of each ray of a parallel beam, in radians, on a detector made wider by some columns of zeros.
 
-    Over a full turn the ray at u in a view is measured again at -u half a turn on, if the detector reaches so far: the
+    Over a full turn the ray at u in a view is measured again at -u half a turn on, if the detector reaches so far. The
     two share their weight. Where the axis stands off the middle the rays of the far columns are measured once and have
-    it all. In between shares rise from 0 to 1 as sin² does, over as many columns as are seen once (at most half of
-    those seen twice), so that columns just off the middle stay means of two (Wang 2002, Med. Phys. 29, 1634, for cone
+    it all. In between shares rise from 0 to 1 as sin² does. They rise over as many columns as are seen once, at most
+    half of those seen twice. So columns just off the middle stay means of two (Wang 2002, Med. Phys. 29, 1634, for cone
     beams). Views that, as they stand, end at some -u need zeros up to there: what filtering spreads into them belongs
     to the integral.
 
-    Views that do not cover the full turn weigh as `angular_weights` says, whatever the column: what a far column sees
+    Views that do not cover the full turn weigh as `angular_weights` says, whatever the column. What a far column sees
     from one side only would be missing from the other.
 
     Returns:

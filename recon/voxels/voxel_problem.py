@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import TrialSettings
 from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.direct import direct, has_direct_method
@@ -109,8 +108,8 @@ class Momentum:
 def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6) -> float:
     """An upper bound of the largest eigenvalue of Aᵀ W A, within a few per cent, by power iteration.
 
-    For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942),
-    so the step 1 / bound is safe after any number of rounds; the Rayleigh quotient would err to the other side.
+    For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
+    So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side.
     """
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)
@@ -140,10 +139,3 @@ def iterative_memory(
     wide = max(geometry.detector_shape[1], grid.shape[2])
     beside = fbp_memory(geometry.n_views, wide) if filtered else 0
     return round(4 * (volumes * math.prod(grid.shape) + (rays + weights) * n_rays)) + beside
-
-
-def iteration_trials(numbers: Sequence[int]) -> list[TrialSettings]:
-    """Trials of numbers of iterations: the middle one is the baseline."""
-    base = numbers[len(numbers) // 2]
-    others = [TrialSettings("iterations", {"iterations": n}) for n in numbers if n != base]
-    return [TrialSettings("method", {"iterations": base}), *others]

@@ -2,7 +2,7 @@
 
 Nothing runs in the background: the camera catches up with the trigger line and the clock whenever it is asked, and a
 frame is computed when it is taken. Triggers and frames are numbered over the camera's life for faults and noise, so
-that any frame can be made again alone; framestamps start at 0 with every arm.
+that any frame can be made again alone. Framestamps start at 0 with every arm.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ TOLERANCE = 1e-6
 class SimulatedOrcaQuest:
     """Implements drivers.protocols.Camera.
 
-    External triggers come from `line`; one that comes earlier than the least period after the last accepted one is
-    ignored without a word, as the camera does it. An internally triggered camera runs at the least period and stops
-    after the frames it was armed for.
+    External triggers come from `line`. One that comes earlier than the least period after the last accepted one is
+    ignored without a word, as by the camera. An internally triggered camera runs at the least period and stops after
+    the frames it was armed for.
 
     Args:
         scene: what stands in the beam.

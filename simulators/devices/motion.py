@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
-class Phase:
+class MotionPhase:
     """Constant acceleration for a while. Times are s after the move began; the rest is in the unit of the position."""
 
     begin: float
@@ -38,11 +38,20 @@ class TrapezoidMove:
     begin: float
     start: float
     target: float
-    phases: tuple[Phase, ...]
+    phases: tuple[MotionPhase, ...]
 
     @classmethod
-    def between(cls, start: float, target: float, speed: float, acceleration: float, begin: float) -> TrapezoidMove:
-        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration.
+    def between(
+        cls,
+        start: float,
+        target: float,
+        speed: float,
+        acceleration: float,
+        begin: float,
+        deceleration: float | None = None,
+    ) -> TrapezoidMove:
+        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration, or
+        <= deceleration where it slows down (None: the same).
 
         Raises:
             ValueError: speed or acceleration is not positive.
@@ -50,12 +59,14 @@ class TrapezoidMove:
         if not (speed > 0 and acceleration > 0):
             raise ValueError(f"speed and acceleration must be positive, not {speed} and {acceleration}")
         distance, sign = abs(target - start), math.copysign(1.0, target - start)
-        peak = min(speed, math.sqrt(distance * acceleration))
-        ramp = peak / acceleration
-        cruise = max(0.0, distance / peak - ramp) if peak > 0 else 0.0
-        up = Phase(0.0, ramp, start, 0.0, sign * acceleration)
-        flat = Phase(ramp, cruise, start + sign * 0.5 * peak * ramp, sign * peak, 0.0)
-        down = Phase(flat.end, ramp, target - sign * 0.5 * peak * ramp, sign * peak, -sign * acceleration)
+        slow = deceleration or acceleration
+        mean = acceleration if slow == acceleration else 2 * acceleration * slow / (acceleration + slow)
+        peak = min(speed, math.sqrt(distance * mean))
+        rise, fall = peak / acceleration, peak / slow
+        cruise = max(0.0, distance / peak - (rise + fall) / 2) if peak > 0 else 0.0
+        up = MotionPhase(0.0, rise, start, 0.0, sign * acceleration)
+        flat = MotionPhase(rise, cruise, start + sign * 0.5 * peak * rise, sign * peak, 0.0)
+        down = MotionPhase(flat.end, fall, target - sign * 0.5 * peak * fall, sign * peak, -sign * slow)
         return cls(begin, start, target, tuple(phase for phase in (up, flat, down) if phase.duration > 0))
 
     @property
@@ -79,6 +90,11 @@ class TrapezoidMove:
             return self.start if time < self.begin else self.target
         low, high = sorted((self.start, self.target))
         return min(max(phase.position_after(time - self.begin - phase.begin), low), high)
+
+    def counts(self, time: float) -> int:
+        """The last whole position passed on the way."""
+        exact = self.position(time)
+        return math.floor(exact) if self.direction >= 0 else math.ceil(exact)
 
     def velocity(self, time: float) -> float:
         phase = self._phase(time)
@@ -110,7 +126,7 @@ class TrapezoidMove:
         seconds = abs(velocity) / acceleration
         if seconds == 0:
             return TrapezoidMove(self.begin, self.start, here, past)
-        slow = Phase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
+        slow = MotionPhase(time - self.begin, seconds, here, velocity, -math.copysign(acceleration, velocity))
         return TrapezoidMove(self.begin, self.start, slow.position_after(seconds), (*past, slow))
 
     def halted(self, position: float) -> TrapezoidMove:
@@ -121,13 +137,24 @@ class TrapezoidMove:
         """
         return TrapezoidMove(self.begin, self.start, position, self._until(self.time_at(position)))
 
-    def _phase(self, time: float) -> Phase | None:
+    def slowed(self, time: float, deceleration: float) -> TrapezoidMove:
+        """The same move until `time`, then slowed down with `deceleration` (> 0) to the last whole position that still
+        comes on the way."""
+        position, velocity = self.position(time), self.velocity(time)
+        stand = position + self.direction * velocity**2 / (2 * deceleration)
+        last = math.floor(stand) if self.direction > 0 else math.ceil(stand)
+        if self.direction * (last - position) <= 0:
+            return self.halted(self.counts(time))
+        braked = self.braked(time, velocity**2 / (2 * abs(last - position)))
+        return TrapezoidMove(braked.begin, braked.start, last, braked.phases)
+
+    def _phase(self, time: float) -> MotionPhase | None:
         """The phase at `time`; None while it stands: before, and from `end` on as that number is rounded."""
         if not self.begin <= time < self.end:
             return None
         return next((phase for phase in self.phases if time - self.begin < phase.end), None)
 
-    def _until(self, time: float) -> tuple[Phase, ...]:
+    def _until(self, time: float) -> tuple[MotionPhase, ...]:
         seconds = time - self.begin
         return tuple(
             replace(phase, duration=min(phase.end, seconds) - phase.begin)
@@ -136,7 +163,7 @@ class TrapezoidMove:
         )
 
 
-def _seconds_for(distance: float, phase: Phase, sign: int) -> float:
+def _seconds_for(distance: float, phase: MotionPhase, sign: int) -> float:
     """Time to cover `distance` ahead in a phase: the root of d = vt + at²/2 in the form that does not cancel."""
     velocity, acceleration = sign * phase.velocity, sign * phase.acceleration
     root = math.sqrt(max(velocity * velocity + 2.0 * acceleration * distance, 0.0))

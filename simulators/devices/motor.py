@@ -1,7 +1,7 @@
 """Pulse motor: one axis that counts commanded pulses, with limits, stops and a position-synchronised trigger output.
 
-Nothing runs in the background: a move is a closed form of time, so its trigger pulses are put on the line, with their
-exact times, the moment it starts, and those still to come are taken away when it is stopped.
+Nothing runs in the background: a move is a closed form of time. So its trigger pulses are put on the line, with their
+exact times, the moment it starts. Those still to come are taken away when it is stopped.
 """
 
 from __future__ import annotations
@@ -179,8 +179,7 @@ class PulseMotor:
 
     def position(self) -> int:
         """Pulses put out so far, signed."""
-        exact = self.move.position(self._clock.now())
-        return math.floor(exact) if self.move.direction >= 0 else math.ceil(exact)
+        return self.move.counts(self._clock.now())
 
     def angle_at(self, time: float) -> float:
         """True angle in radians at any time since the oldest move remembered."""
@@ -214,14 +213,7 @@ class PulseMotor:
         self.ended = Ended.SLOW_STOP
         if not self.moving():
             return
-        position, velocity = move.position(now), move.velocity(now)
-        stand = position + move.direction * velocity**2 / (2 * acceleration)
-        last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
-        if move.direction * (last - position) <= 0:
-            self._replace(move.halted(last))
-        else:
-            braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
-            self._replace(TrapezoidMove(braked.begin, braked.start, last, braked.phases))
+        self._replace(move.slowed(now, acceleration))
         self._put_on_line(now)
 
     def halt(self) -> None:

@@ -1,6 +1,6 @@
 """Trigger line: the cable from the stage's trigger output to the camera; the stage schedules, the camera consumes.
 
-Pulses are put on the line with the time at which they will rise, often ahead of that time: the stage knows its motion
+Pulses are put on the line with the time at which they will rise, often ahead of that time. The stage knows its motion
 when it starts. A consumer takes a pulse as sent only once the clock has passed its time, for a stop cancels the rest.
 """
 

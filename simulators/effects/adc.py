@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from drivers.orca_quest import BITS
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import CannotExposeError, Image, Shot
 
 
 @dataclass(frozen=True)
-class Adc:
-    """Counts in steps of 2^(16 - bits), from 0 to the last step: the codes are the upper bits of 16, so that conversion
-    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits; photon numbers
+class Adc(ImageEffect):
+    """Counts in steps of 2^(16 - bits), from 0 to the last step. The codes are the upper bits of 16, so that conversion
+    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits. Photon numbers
     can be resolved only then, since fewer bits have steps wider than an electron.
 
     Attributes:
         bits: of a code.
         nonlinearity: integral: the largest departure of the response from the straight line through its ends, as a
-            share of the full range F; the response bows, y = x + 4 nonlinearity x (1 - x / F).
+            share of the range. F is the full range. The response bows, y = x + 4 nonlinearity x (1 - x / F).
     """
 
     bits: Literal[8, 12, 16] = 16
     nonlinearity: float = 0.0
-
-    name: ClassVar[str] = "adc"
-    domain: ClassVar[Domain] = Domain.COUNTS
-    final: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 12, 16):

@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import SamplingEffect
 from simulators.frame.shot import Moments, Shot
 
 Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Afterglow:
+class Afterglow(SamplingEffect):
     """Light of time t is prompt by 1 - sum of shares; a share p comes from t - s, s exponential with its decay time.
 
     The delays of all components and the moments of earlier effects (name it after motion_blur) form one distribution of
     times. A Gauss rule of `samples` moments replaces it, exact for its powers up to 2 x samples - 1 (Golub & Welsch
-    1969), so that `samples` line integrals are added and no more. An edge that moves by many pixels within a decay time
+    1969). So `samples` line integrals are added and no more. An edge that moves by many pixels within a decay time
     appears as that many ghosts instead of a trail.
 
-    Shutter, sample and beam are assumed unchanged over the delays: the light that is missing just after the shutter
-    opens, and that of a dark just after it closes, are not simulated. The weights sum to 1.
+    Shutter, sample and beam are assumed unchanged over the delays. Not simulated are the light that is missing just
+    after the shutter opens, and the light in a dark just after it closes. The weights sum to 1.
 
-    Figures: a maker's table (Crytur, scintillation materials) gives the light 6 ms after the X-rays as below 2 % for
-    CsI:Tl and below 0.005 % for YAG:Ce, with decay constants of 900 ns and 70 ns of the prompt light (LuAG:Ce: 70 ns,
+    Figures: a maker's table (Crytur, scintillation materials) gives the light 6 ms after the X-rays. It is below 2 %
+    for CsI:Tl and below 0.005 % for YAG:Ce. Decay constants of the prompt light are 900 ns and 70 ns (LuAG:Ce: 70 ns,
     no afterglow stated). It depends on dose and temperature: measure.
 
     Attributes:
@@ -39,10 +38,6 @@ class Afterglow:
     shares: tuple[float, ...]
     decay_times: tuple[float, ...]
     samples: int = 3
-
-    name: ClassVar[str] = "afterglow"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not self.shares or len(self.shares) != len(self.decay_times):
@@ -74,7 +69,7 @@ class Afterglow:
 
 def gauss_rule(points: Reals, weights: Reals, n: int) -> tuple[Reals, Reals]:
     """n points and weights with the same moments up to order 2n - 1 as the given points and weights (fewer points where
-    fewer suffice), by Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
+    fewer suffice). By Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
     scale = float(np.abs(points).max()) or 1.0
     basis = [np.sqrt(weights / weights.sum())]
     diagonal, beside = [], []

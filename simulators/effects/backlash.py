@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import PoseEffect
 from simulators.frame.pose import Pose
 from simulators.frame.shot import AngleAt, Shot
 
@@ -22,7 +21,7 @@ HISTORY = 3600.0
 
 
 @dataclass(frozen=True)
-class Backlash:
+class Backlash(PoseEffect):
     """Lost motion of a gear (ISO 230-2:2014, reversal value) between the encoder, on the motor's side, and the sample.
 
     The stage's angles hold where it turns forwards (angles grow). Backwards the other flanks of the teeth push, and the
@@ -32,10 +31,6 @@ class Backlash:
     """
 
     lost_motion_deg: float
-
-    name: ClassVar[str] = "backlash"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not self.lost_motion_deg > 0:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class BeamBend:
+class BeamBend(ImageEffect):
     """With the sample in the beam, a ray has -log of its light changed by level + drift t + Σ curvature x².
 
     x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t in s since the camera
@@ -27,10 +26,6 @@ class BeamBend:
     curvature: tuple[float, float] = (0.0, 0.0)
     level: float = 0.0
     drift: float = 0.0
-
-    name: ClassVar[str] = "beam_bend"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not np.isfinite((*self.curvature, self.level, self.drift)).all():

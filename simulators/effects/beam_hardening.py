@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class BeamHardening:
+class BeamHardening(ImageEffect):
     """exp(-d') = sum of w_k exp(-r_k d), with sum w_k = 1 and sum w_k r_k = 1, for a sample given by its attenuation.
 
     The sample's attenuation is the mean over the spectrum, so that d' = d for a thin sample and d' < d for a thick one.
@@ -29,10 +28,6 @@ class BeamHardening:
     weights: tuple[float, ...]
     energies: tuple[float, ...] | None = None
     ratios: tuple[float, ...] | None = None
-
-    name: ClassVar[str] = "beam_hardening"
-    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         given = self.energies if self.ratios is None else self.ratios

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class BeamProfile:
+class BeamProfile(ImageEffect):
     """A Gaussian of 1 in its middle times horizontal stripes, as a multilayer monochromator leaves them.
 
     The middle of the beam, stripes and all, is at centre + wander_speed t + wander sin(2 pi t / wander_period), t in s
@@ -38,10 +37,6 @@ class BeamProfile:
     wander_speed: tuple[float, float] = (0.0, 0.0)
     wander: tuple[float, float] = (0.0, 0.0)
     wander_period: float = 60.0
-
-    name: ClassVar[str] = "beam_profile"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (min(self.sigma) > 0 and 0 <= self.stripes < 1 and self.stripe_period > 0):

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label, Views, check_views, lit_share, within
-from simulators.frame.domain import Domain
+from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class BlackBand:
+class BlackBand(ImageEffect, Anomaly):
     """The band's edge is soft by the penumbra of the source; flats have the band too.
 
     Attributes:
@@ -29,10 +28,6 @@ class BlackBand:
     penumbra: float = 0.0
     share: float = 0.0
     views: Views | None = None
-
-    name: ClassVar[str] = "black_band"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.width > 0 and self.penumbra >= 0 and 0 <= self.share < 1):

@@ -12,6 +12,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
+from drivers.plugins import plugins
 from simulators.frame.domain import Domain
 
 
@@ -25,17 +26,19 @@ class Entry:
         follows: effects of the same domain that must come before it: those with which the frame would differ if they
             came after it.
         reason: why they must.
+        final: it ends its domain: nothing of that domain may follow.
     """
 
     domain: Domain
     summary: str
     follows: frozenset[str] = frozenset()
     reason: str = ""
+    final: bool = False
 
 
 _BEAM = frozenset({"beam_profile", "beam_bend", "narrow_field"})
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
-CATALOGUE: Mapping[str, Entry] = MappingProxyType(
+_OURS: Mapping[str, Entry] = MappingProxyType(
     {
         "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
         "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
@@ -87,7 +90,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
             frozenset({"scatter", "scintillator_blur"}),
             "pixels differ in their response to light that is spread already",
         ),
-        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
+        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random", final=True),
         "dark_current": Entry(Domain.ELECTRONS, "electrons that arise without light"),
         "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
         "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
@@ -103,10 +106,29 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
             _CHARGE,
             "dead pixels hold a constant charge",
         ),
-        "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
+        "read_noise": Entry(Domain.ELECTRONS, "noise of the readout", final=True),
         "offset": Entry(Domain.COUNTS, "the digital bias"),
-        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
+        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one", final=True),
     }
+)
+
+
+def _fitting(name: str, effect: type[Any]) -> type[Any]:
+    """The class of another package's effect, which says itself what our entries say of ours."""
+    if effect.name != name:
+        raise ValueError(f"its class calls itself {effect.name!r}; expected the entry point's name")
+    _entry_of(effect)
+    return effect
+
+
+def _entry_of(effect: type[Any]) -> Entry:
+    summary, follows = (effect.__doc__ or "").partition("\n")[0], frozenset(getattr(effect, "follows", ()))
+    return Entry(Domain(effect.domain), summary, follows, getattr(effect, "reason", "its package says so"))
+
+
+_PLUGGED: Mapping[str, type[Any]] = plugins("effect", _OURS, _fitting)
+CATALOGUE: Mapping[str, Entry] = MappingProxyType(
+    {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()}}
 )
 
 
@@ -120,5 +142,7 @@ def order_error(earlier: str, later: str) -> str:
 
 def load_effect(name: str) -> type[Any]:
     """The class (see chain.AnyEffect) of an effect; this imports its module."""
+    if name in _PLUGGED:
+        return _PLUGGED[name]
     module = import_module(f"simulators.effects.{name}")
     return getattr(module, name.title().replace("_", ""))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label
-from simulators.effects.catalogue import order_error
+from simulators.effects.catalogue import CATALOGUE, order_error
 from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Moments, Shot
@@ -23,13 +23,20 @@ StepHook: TypeAlias = Callable[[str], AbstractContextManager[object]]
 class Effect(Protocol):
     """An effect is a frozen dataclass of its parameters.
 
-    `name` is that of its module. `final` marks the last effect of its domain: photon noise for photons, read noise for
-    electrons and the converter for counts.
+    `name` is that of its module; with it the catalogue says `domain` and `final`, which marks the last effect of its
+    domain: photon noise for photons, read noise for electrons and the converter for counts. An effect that is not in
+    the catalogue states all three.
     """
 
     name: ClassVar[str]
     domain: ClassVar[Domain]
     final: ClassVar[bool]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        name = cls.__module__.rpartition(".")[2]
+        if entry := CATALOGUE.get(name):
+            cls.name, cls.domain, cls.final = name, entry.domain, entry.final
 
 
 @runtime_checkable

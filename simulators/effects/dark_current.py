@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.sensor import DARK_CURRENT
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
@@ -17,20 +16,16 @@ FEW = 1.0
 
 
 @dataclass(frozen=True)
-class DarkCurrent:
+class DarkCurrent(ImageEffect):
     """Poisson around the dark current times the exposure.
 
-    A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely, which makes
+    A few electrons are placed over the frame: their number is Poisson and each pixel is equally likely. This makes
     every pixel's number Poisson and independent of the others' (Kingman 1993, "Poisson Processes", sec. 5.1).
 
     `rate`: electrons a second and sensor pixel.
     """
 
     rate: float = DARK_CURRENT
-
-    name: ClassVar[str] = "dark_current"
-    domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not self.rate >= 0:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import places
 
 
 @dataclass(frozen=True)
-class DeadPixels:
+class DeadPixels(ImageEffect):
     """The same pixels of the sensor in every frame. Name it after all effects that add charge and before the read
     noise, which dead pixels have like others. A binned pixel loses the share of its dead ones.
 
@@ -26,10 +25,6 @@ class DeadPixels:
     fraction: float = 1e-4
     charge: float = 0.0
     seed: int = 0
-
-    name: ClassVar[str] = "dead_pixels"
-    domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.fraction <= 0.1 and self.charge >= 0 and self.seed >= 0):

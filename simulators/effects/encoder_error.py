@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.effects.chain import PoseEffect
 from simulators.effects.turn_waves import Wave, check, series
-from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
 
 
 @dataclass(frozen=True)
-class EncoderError:
+class EncoderError(PoseEffect):
     """Angular positioning error: the sample is at the angle of the trigger plus the error.
 
     Attributes:
@@ -26,10 +25,6 @@ class EncoderError:
 
     harmonics: tuple[Wave, ...] = ()
     random_mdeg: float = 0.0
-
-    name: ClassVar[str] = "encoder_error"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check("harmonics", self.harmonics)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.orca_quest import SENSOR_SHAPE
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot, fixed_rng
 
 Reals = NDArray[np.float64]
@@ -18,10 +17,10 @@ REACH = 4.0
 
 
 @dataclass(frozen=True)
-class FlatStructure:
+class FlatStructure(ImageEffect):
     """Each speck and scratch multiplies the light by 1 - depth x Gaussian.
 
-    A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them: name dust on the
+    A flat corrects them, unless the beam has moved (beam_profile) or is blurred after them. Name dust on the
     scintillator before scintillator_blur, dust on the camera's window after it. They are computed for sensor pixels and
     averaged over binned ones, so that any ROI and binning shows the same ones.
 
@@ -44,10 +43,6 @@ class FlatStructure:
     scratch_width_um: float = 3.0
     scratch_depth: float = 0.05
     seed: int = 0
-
-    name: ClassVar[str] = "flat_structure"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.specks <= 100_000 and 0 <= self.scratches <= 1000):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from simulators.effects.anomaly import VISIBLE, Label, Views, check_views, within
-from simulators.frame.domain import Domain
+from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.shot import Image, Shot, fixed_rng
 
 MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
@@ -46,7 +46,7 @@ class Crumb:
 
 
 @dataclass(frozen=True)
-class Floaters:
+class Floaters(ImageEffect, Anomaly):
     """Crumbs on the outside of the can or elsewhere in the beam.
 
     Turning crumbs turn with the stage. Where they are farther from the axis than the frame is wide, they cross it twice
@@ -74,10 +74,6 @@ class Floaters:
     speed: float = 0.05
     views: Views | None = None
     seed: int = 0
-
-    name: ClassVar[str] = "floaters"
-    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_views(self.views)

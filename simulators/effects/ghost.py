@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import VISIBLE, Label
-from simulators.frame.domain import Domain
+from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class Ghost:
+class Ghost(ImageEffect, Anomaly):
     """A smooth change of the light by a cos², as high as the frame. Flats do not have it.
 
     An early data set of a battery has it: "fog" that crosses the frame in a few views, with intensities that no other
@@ -33,10 +32,6 @@ class Ghost:
     width: float
     speed: float
     gain: float = 0.3
-
-    name: ClassVar[str] = "ghost"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.view >= 0 and self.width > 0 and self.speed > 0):

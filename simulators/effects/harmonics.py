@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 
 PHOTOELECTRIC = 3.0**-3
@@ -15,7 +14,7 @@ PHOTOELECTRIC = 3.0**-3
 
 
 @dataclass(frozen=True)
-class Harmonics:
+class Harmonics(ImageEffect):
     """exp(-d') = (1 - share) exp(-d) + share exp(-ratio d), for a sample given by its attenuation.
 
     A crystal that reflects E from its planes (111) reflects 3E from (333). Photoelectric absorption falls as E^-3
@@ -29,10 +28,6 @@ class Harmonics:
 
     share: float
     ratio: float = PHOTOELECTRIC
-
-    name: ClassVar[str] = "harmonics"
-    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.share <= 1 and 0 <= self.ratio <= 1):

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.pattern import places
 
 
 @dataclass(frozen=True)
-class HotPixels:
+class HotPixels(ImageEffect):
     """The same pixels of the sensor in every frame, for any ROI.
 
     Attributes:
@@ -25,10 +24,6 @@ class HotPixels:
     fraction: float = 1e-4
     rate: float = 2000.0
     seed: int = 0
-
-    name: ClassVar[str] = "hot_pixels"
-    domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.fraction <= 0.1 and 0 <= self.rate <= 1e9 and self.seed >= 0):

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label
-from simulators.frame.domain import Domain
+from simulators.effects.chain import Anomaly, PoseEffect
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot
 
@@ -20,7 +19,7 @@ SEEN_PX = 0.01
 
 
 @dataclass(frozen=True)
-class Jump:
+class Jump(PoseEffect, Anomaly):
     """From view `view` on the sample is at another place on the stage: first turned, then shifted.
 
     Every view from the jump on is labelled, since it differs from what it would have been. Errors of the stage precede
@@ -35,10 +34,6 @@ class Jump:
     view: int
     shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_deg: float = 0.0
-
-    name: ClassVar[str] = "jump"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.view < 0 or not (any(self.shift_um) or self.turn_deg):

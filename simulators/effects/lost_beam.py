@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 from simulators.effects.anomaly import Label, Views, check_views, within
-from simulators.frame.domain import Domain
+from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class LostBeam:
+class LostBeam(ImageEffect, Anomaly):
     """The beam is off for a range of views or of time; a frame that overlaps with it loses its part of the light.
 
     Attributes:
@@ -24,10 +23,6 @@ class LostBeam:
     views: Views | None = None
     seconds: tuple[float, float] | None = None
     share: float = 0.0
-
-    name: ClassVar[str] = "lost_beam"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_views(self.views)

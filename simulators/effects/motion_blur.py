@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import SamplingEffect
 from simulators.frame.shot import Moments, Shot
 
 LOOKS = 5
@@ -17,13 +16,13 @@ LOOKS = 5
 
 
 @dataclass(frozen=True)
-class MotionBlur:
+class MotionBlur(SamplingEffect):
     """Mean of the transmission over as many moments of the exposure as the blur needs: one where the stage stands.
 
     The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are no better, since the
-    transmission jumps at edges: for 1 px of blur of a battery, 1, 2, 4 and 8 moments have errors of 1.1, 0.38, 0.13 and
-    0.045 in 1000 of the beam (rms), Gauss-Legendre 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to 1.6 times
-    larger.
+    transmission jumps at edges: a battery with 1 px of blur. 1, 2, 4 and 8 moments have errors of 1.1, 0.38, 0.13 and
+    0.045 in 1000 of the beam (rms). Gauss-Legendre has 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to 1.6
+    times larger.
 
     Attributes:
         tolerance_px: pixels that the sample's rim may travel from one moment to the next. The rim counts even where it
@@ -33,10 +32,6 @@ class MotionBlur:
 
     tolerance_px: float = 0.5
     max_samples: int = 16
-
-    name: ClassVar[str] = "motion_blur"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.tolerance_px > 0 and self.max_samples >= 2):

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import VISIBLE, Label, lit_share
-from simulators.frame.domain import Domain
+from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class NarrowField:
+class NarrowField(ImageEffect, Anomaly):
     """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
 
     Flats are as narrow. The pixels without full light have a label for each side: left, right, above and below.
@@ -31,10 +30,6 @@ class NarrowField:
     height: float | None = None
     centre: tuple[float, float] = (0.0, 0.0)
     penumbra: float = 0.0
-
-    name: ClassVar[str] = "narrow_field"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.width > 0 and (self.height is None or self.height > 0) and self.penumbra >= 0):

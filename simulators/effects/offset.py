@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.sensor import OFFSET
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
 
 
 @dataclass(frozen=True)
-class Offset:
+class Offset(ImageEffect):
     """The same for any binning (to check on a camera); none in the photon number readout.
 
     Attributes:
@@ -23,10 +22,6 @@ class Offset:
 
     spread: float = 0.0
     seed: int = 0
-
-    name: ClassVar[str] = "offset"
-    domain: ClassVar[Domain] = Domain.COUNTS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.spread >= 0 and self.seed >= 0):

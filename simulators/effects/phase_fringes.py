@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numba import config, njit
 from numpy.typing import NDArray
 from scipy import fft
 
+from simulators.effects.chain import ImageEffect
 from simulators.frame.detector import Detector
-from simulators.frame.domain import Domain
 from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged
@@ -27,21 +27,21 @@ not alias either."""
 
 
 @dataclass(frozen=True)
-class PhaseFringes:
+class PhaseFringes(ImageEffect):
     """Fresnel propagation of the wave exp(-d/2 (1 + i delta/beta)) behind an object of one material.
 
     With the refractive index 1 - delta + i beta and mu = 4 pi beta / wavelength, the depth d = mu t gives amplitude and
     phase. The wave's cosine transform is multiplied by exp(-i pi wavelength z f²) (Paganin 2006, Coherent X-Ray Optics,
-    ch. 1.4; f cycles/mm); its square is the intensity, never negative and of the same sum. The frame's edges are
+    ch. 1.4; f cycles/mm). Its square is the intensity, never negative and of the same sum. The frame's edges are
     mirrors. To first order in z it is T - (z delta / mu) laplace T (Paganin et al. 2002, J. Microsc.
     206:33). The transforms are single precision: intensities are right to 1e-5 of the open beam.
 
     In a cone the frame is that of a plane wave at the distance z / M, M = 1 + z / sod, at the sample's scale (Fresnel
-    scaling theorem, Paganin 2006, appendix B), to which the detector's pitch refers here. For the blur of fringes by
-    source and detector name scintillator_blur, too.
+    scaling theorem, Paganin 2006, appendix B). The detector's pitch refers to that scale here. For the blur of fringes
+    by source and detector name scintillator_blur, too.
 
     Edges of solids turn the phase by many radians a pixel, which a wave sampled on the pixels cannot represent. Where
-    the Fresnel number of a pixel is 1 or more, so that fringes are finer than pixels, use "transport": it moves the
+    the Fresnel number of a pixel is 1 or more, so that fringes are finer than pixels, use "transport". It moves the
     light of the first order from pixel to pixel, and no pixel gives more than it has.
 
     Attributes:
@@ -59,10 +59,6 @@ class PhaseFringes:
     energy: float
     oversampling: int = 1
     method: Literal["wave", "transport"] = "wave"
-
-    name: ClassVar[str] = "phase_fringes"
-    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.delta_beta >= 0 and self.distance >= 0 and self.energy > 0):
@@ -119,9 +115,9 @@ class PhaseFringes:
         farthest = n * pitch**2 / self.oversampling / self.wavelength
         if z > farthest:
             raise CannotExposeError(
-                f"phase_fringes: the propagator would alias over {z:g} mm (effective) at {self.energy:g} keV: pixels "
+                f"phase_fringes: the propagator would alias over {z:g} mm (effective) at {self.energy:g} keV. Pixels "
                 f"of {pitch * 1e3:g} um have a Fresnel number of {pitch**2 / (self.wavelength * z):.2g}, and {n} of "
-                f"them with oversampling {self.oversampling} need {self.oversampling / n:.2g} or more; give at most "
+                f"them with oversampling {self.oversampling} need {self.oversampling / n:.2g} or more. Give at most "
                 f"{farthest:.3g} mm, larger pixels or a larger frame"
             )
 

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
 
 
 @dataclass(frozen=True)
-class PhotonNoise:
+class PhotonNoise(ImageEffect):
     """Poisson around the expectation; photons are whole numbers afterwards.
 
     Detected photons and pixels are independent. Behind a scintillator this holds where few of an X-ray's photons reach
-    the same pixel; where g of them do, the variance is 1 + g times larger and correlated by the blur (Cunningham,
-    Westmore & Fenster 1994, Med. Phys. 21:417), which is not simulated: photons_per_s divided by 1 + g gives the same
+    the same pixel. Where g of them do, the variance is 1 + g times larger and correlated by the blur (Cunningham,
+    Westmore & Fenster 1994, Med. Phys. 21:417). That is not simulated: photons_per_s divided by 1 + g gives the same
     signal-to-noise ratio.
     """
-
-    name: ClassVar[str] = "photon_noise"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = True
 
     def apply(self, image: Image, shot: Shot) -> Image:
         return poisson(image, frame_rng(self.name, shot))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import AreaEffect
 
 
 @dataclass(frozen=True)
-class PixelArea:
+class PixelArea(AreaEffect):
     """Mean of the transmission over rays x rays points of a pixel, evenly spread (midpoint rule).
 
-    Without it edges are as sharp as a single ray, and jump from pixel to pixel: no volume of voxels explains such
+    Without it edges are as sharp as a single ray, and jump from pixel to pixel. No volume of voxels explains such
     views, and iterative methods bend theirs (docs/studies.md).
 
     Attributes:
@@ -20,10 +19,6 @@ class PixelArea:
     """
 
     rays: int = 2
-
-    name: ClassVar[str] = "pixel_area"
-    domain: ClassVar[Domain] = Domain.OPTICAL_DEPTH
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not 2 <= self.rays <= 8:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
 
 
 @dataclass(frozen=True)
-class Prnu:
+class Prnu(ImageEffect):
     """The expected light times 1 + spread * a normal number of the sensor pixel, not below 0.
 
     It acts on the light, so that the photon noise stays Poisson. Name it after all effects that blur light.
@@ -26,10 +25,6 @@ class Prnu:
 
     spread: float = 0.01
     seed: int = 0
-
-    name: ClassVar[str] = "prnu"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (0 <= self.spread <= 0.2 and self.seed >= 0):

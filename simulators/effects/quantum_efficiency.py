@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 
 NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
@@ -16,7 +15,7 @@ EFFICIENCY = (0.50, 0.66, 0.80, 0.83, 0.85, 0.83, 0.80, 0.70, 0.62, 0.55, 0.50, 
 
 
 @dataclass(frozen=True)
-class QuantumEfficiency:
+class QuantumEfficiency(ImageEffect):
     """Scales the expectation before the photon noise, which is exact: thinned Poisson is Poisson (Kingman 1993, ch. 5).
 
     A scene's beam.photons_per_s are then photons of the scintillator's light that arrive at the sensor; without this
@@ -29,10 +28,6 @@ class QuantumEfficiency:
 
     value: float | None = None
     wavelength_nm: float | None = None
-
-    name: ClassVar[str] = "quantum_efficiency"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if (self.value is None) == (self.wavelength_nm is None):

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.sensor import READ_NOISE
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import add_normal
@@ -15,7 +14,7 @@ from simulators.pixels.pattern import binned, normals
 
 
 @dataclass(frozen=True)
-class ReadNoise:
+class ReadNoise(ImageEffect):
     """Gaussian. Binned pixels are read one by one, so that their variances add up.
 
     Attributes:
@@ -27,10 +26,6 @@ class ReadNoise:
     rms: float | None = None
     spread: float = 0.0
     seed: int = 0
-
-    name: ClassVar[str] = "read_noise"
-    domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.rms is not None and not self.rms >= 0:

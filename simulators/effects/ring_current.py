@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class RingCurrent:
+class RingCurrent(ImageEffect):
     """Exponential decay exp(-t/lifetime), as a beam lifetime is defined, and back to full at each top-up. The ring is
     full when the camera is connected.
 
@@ -30,10 +29,6 @@ class RingCurrent:
     top_up_every: float | None = None
     top_up_below: float | None = None
     refill: float = 0.0
-
-    name: ClassVar[str] = "ring_current"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not self.lifetime > 0:

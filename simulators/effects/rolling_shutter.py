@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import SamplingEffect
 from simulators.frame.shot import Moments, Shot
 
 
 @dataclass(frozen=True)
-class RollingShutter:
+class RollingShutter(SamplingEffect):
     """Sensor rows are read in pairs, one pair a line time, downwards from the frame's first row.
 
     A line time is two row periods of the sensor: 7.2 us in the standard readout and 172.8 us in ultra quiet (property
@@ -21,10 +20,6 @@ class RollingShutter:
     together are not simulated: DELAYED, which waits for light until the last row is open, and GLOBALRESET, which opens
     all rows together and closes them line by line.
     """
-
-    name: ClassVar[str] = "rolling_shutter"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
         lines = np.arange(moments.times.shape[1]) * shot.binning // 2

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.effects.chain import PoseEffect
 from simulators.effects.turn_waves import Wave, check, series
-from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
 
 
 @dataclass(frozen=True)
-class Runout:
+class Runout(PoseEffect):
     """Radial and axial error motion (ISO 230-7:2015), synchronous (harmonics) and asynchronous (drawn for each frame).
 
     Attributes:
         radial: waves a turn, micrometres, phase in degrees, of the axis' motion across the beam and along it. 1 wave is
-            equivalent to a sample beside the axis, 0 to an axis at another place; others come from the bearing; a
+            equivalent to a sample beside the axis, 0 to an axis at another place. Others come from the bearing. A
             negative number turns against the sample.
         axial: the same, vertically.
         radial_random_um: standard deviation of the random part across the beam, and along it.
@@ -31,10 +30,6 @@ class Runout:
     axial: tuple[Wave, ...] = ()
     radial_random_um: float = 0.0
     axial_random_um: float = 0.0
-
-    name: ClassVar[str] = "runout"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check("radial", self.radial)

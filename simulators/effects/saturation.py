@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.sensor import FULL_WELL
 from simulators.frame.shot import Image, Shot
 
 
 @dataclass(frozen=True)
-class Saturation:
+class Saturation(ImageEffect):
     """Charge x is clipped at the full well W; with a knee, charge above x0 = (1 - knee) W becomes
-    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))), which bends smoothly and stays below the full well.
+    x0 + (W - x0) (1 - exp(-(x - x0) / (W - x0))). This bends smoothly and stays below the full well.
 
     Name it after all effects that add charge and before the read noise. Binned pixels share their light evenly.
 
@@ -26,10 +25,6 @@ class Saturation:
 
     full_well: float = FULL_WELL
     knee: float = 0.0
-
-    name: ClassVar[str] = "saturation"
-    domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.full_well > 0 and 0 <= self.knee <= 1):

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
 
 @dataclass(frozen=True)
-class Scatter:
+class Scatter(ImageEffect):
     """Adds ratio x the mean or a broad blur of the transmitted image, and a constant background.
 
     The ratio is that of scattered to primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). A flat has no
@@ -27,10 +26,6 @@ class Scatter:
     ratio: float = 0.0
     width_mm: float | None = None
     background: float = 0.0
-
-    name: ClassVar[str] = "scatter"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.ratio >= 0 and self.background >= 0):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
@@ -25,7 +25,7 @@ MAX_CORE = 64.0
 
 
 @dataclass(frozen=True)
-class ScintillatorBlur:
+class ScintillatorBlur(ImageEffect):
     """Point spread (1 - tail_share) Gaussian + tail_share tail, of integral 1; the frame's edges are mirrors.
 
     The core's taps go as exp(-b n²) with the b that gives the Gaussian's variance, however narrow (the discrete normal
@@ -44,10 +44,6 @@ class ScintillatorBlur:
     tail_share: float = 0.0
     tail_um: float = 100.0
     tail: Literal["exponential", "lorentzian"] = "exponential"
-
-    name: ClassVar[str] = "scintillator_blur"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.fwhm_um >= 0 and self.tail_um > 0 and 0 <= self.tail_share < 1):

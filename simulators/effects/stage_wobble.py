@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.effects.chain import PoseEffect
 from simulators.effects.turn_waves import Wave, check, series
-from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
 
 
 @dataclass(frozen=True)
-class StageWobble:
+class StageWobble(PoseEffect):
     """Tilt error motion of an axis of rotation (ISO 230-7:2015): a part that repeats every turn, and a random part.
 
     Attributes:
@@ -27,10 +26,6 @@ class StageWobble:
 
     harmonics: tuple[Wave, ...] = ()
     random_urad: float = 0.0
-
-    name: ClassVar[str] = "stage_wobble"
-    domain: ClassVar[Domain] = Domain.MOTION
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check("harmonics", self.harmonics)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
-from simulators.frame.domain import Domain
+from simulators.effects.chain import ImageEffect
 from simulators.frame.shot import CannotExposeError, Image, Shot, frame_rng
 
 DROPS = 200
@@ -17,7 +16,7 @@ MOST = 100_000
 
 
 @dataclass(frozen=True)
-class Zingers:
+class Zingers(ImageEffect):
     """Bright pixels at random places; some may be tracks, and their charge may be spread.
 
     Attributes:
@@ -33,10 +32,6 @@ class Zingers:
     tracks: float = 0.0
     length: float = 20.0
     radius: float = 0.0
-
-    name: ClassVar[str] = "zingers"
-    domain: ClassVar[Domain] = Domain.ELECTRONS
-    final: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if not (self.rate >= 0 and self.charge > 0):

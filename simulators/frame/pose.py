@@ -1,7 +1,7 @@
 """Pose: rotation and displacement of the sample while each row of a frame is exposed.
 
 The laboratory's axes are u (along the rows), b (along the beam, away from the source) and v (up the columns' index).
-A point p = (x, y, z) of the sample at angle θ is at u = x cos θ + y sin θ, b = y cos θ - x sin θ, v = z; the tilt
+A point p = (x, y, z) of the sample at angle θ is at u = x cos θ + y sin θ, b = y cos θ - x sin θ, v = z. The tilt
 rotates that about the laboratory's u and b through the origin, and the shift is added last.
 """
 

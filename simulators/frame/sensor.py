@@ -4,7 +4,7 @@ A beam's photons are the detected ones, so that a photon is an electron, unless 
 The 16-bit converter clips at 65 535 counts = 6991 electrons over the offset, just below a full well of 7000 electrons.
 Binning is digital: charge and noise of the summed pixels add up.
 
-Photon number resolving is a readout of the camera and needs no effect: a count is an electron and there is no offset,
+Photon number resolving is a readout of the camera and needs no effect. A count is an electron and there is no offset,
 so that `digitise` gives round(max(electrons, 0)). To check on a camera: that it subtracts the offset of each pixel,
 reads with the noise of ultra quiet and counts to about 200. A binned pixel is rounded once, after its sum; the camera
 rounds each pixel first, which leaves slightly less noise.

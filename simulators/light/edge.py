@@ -58,10 +58,10 @@ K_EDGES: Mapping[int, KEdge] = MappingProxyType(
     }
 )
 """By atomic number. The Ni line of the charged state is the peak in the battery thesis that this instrument
-follows (figure 2.1: 8348.5 eV, given for LiCoO2, but next to the K edge of nickel and 640 eV above that of cobalt); Co
-and Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most of the charge and cobalt hardly moves
-(Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths are nominal: of the right order, not of
-one sample; and every monochromator has an offset of about an eV."""
+follows (figure 2.1: 8348.5 eV). It is given for LiCoO2 there, but lies next to the K edge of nickel, 640 eV above that
+of cobalt. Co and Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most of the charge and cobalt
+hardly moves (Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths are nominal: of the right
+order, not of one sample; and every monochromator has an offset of about an eV."""
 
 
 def near_edge(

@@ -2,8 +2,8 @@
 
 exp(-mu(E) t) of different energies are nearly linearly dependent, so that a sum over many of them equals a sum over a
 few to any practical accuracy. The energies and weights are found by non-negative least squares (Lawson & Hanson,
-Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and all of them: first a set of
-about a hundred with exactly the same transmission, then as few of these as the tolerance allows.
+Solving Least Squares Problems, 1974, ch. 23). It runs on rays through each material, each pair and all of them. First
+comes a set of about a hundred with exactly the same transmission, then as few of these as the tolerance allows.
 """
 
 from __future__ import annotations

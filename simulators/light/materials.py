@@ -19,7 +19,6 @@ from simulators.light.edge import K_EDGES, MOST_SHIFT, near_edge
 Reals = NDArray[np.float64]
 LEAST_KEV, MOST_KEV = 0.1, 800.0
 AVOGADRO = 0.602214076  # 1e24 / mol
-_DECREMENT = 0.0004151791  # keV² cm³/mol: classical electron radius x (hc)² x Avogadro's number / 2 pi
 
 
 @dataclass(frozen=True)
@@ -72,17 +71,6 @@ class Material:
         flat = e.ravel()
         cm2_per_g = sum((share * self._element(z, flat) for z, share in self.fractions), start=np.zeros_like(flat))
         return (0.1 * self.density * cm2_per_g).reshape(e.shape)
-
-    def decrement(self, energy: float) -> float:
-        """delta of the refractive index 1 - delta + i beta at an energy in keV, by the electrons of the atoms and the
-        dispersion f' (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics, equation 3.2).
-
-        Raises:
-            ValueError: the energy is outside the tables.
-        """
-        self.attenuation(energy)
-        electrons = sum(share * (z + xraylib.Fi(z, energy)) / xraylib.AtomicWeight(z) for z, share in self.fractions)
-        return float(_DECREMENT * self.density * electrons / energy**2)
 
     def _element(self, z: int, energies: Reals) -> Reals:
         """Mass attenuation of an element in cm²/g."""

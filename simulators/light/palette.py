@@ -108,11 +108,6 @@ def known(name: str) -> Material | None:
     return _KNOWN[name]() if name in _KNOWN else _nmc(name)
 
 
-def known_names() -> list[str]:
-    """The names of all known materials but NMC, which is followed by three digits."""
-    return list(_KNOWN)
-
-
 def _own(where: str, name: str, settings: Any) -> Material:
     given = build(_Properties, where, settings)
     base = known(name)

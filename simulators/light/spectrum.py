@@ -59,9 +59,9 @@ def light(
 ) -> Spectrum:
     """The spectrum of a beam, with as many energies as these materials need.
 
-    The nodes of a line or a tube are doubled until the transmission of up to `thickness` mm of each material is stable
-    to 1e-5 of the open beam (up to 513 nodes: with a bare step within a line half a node's weight is uncertain, 0.4 %
-    of the light). Of these, or of a table's energies, the few are kept that have the same transmission to about 1e-5.
+    Nodes of a line or a tube are doubled until the transmission of up to `thickness` mm of each material changes by
+    less than 1e-5. There are up to 513 nodes: with a bare step within a line half a node's weight is uncertain, 0.4 %
+    of the light. Of these, or of a table's energies, the few are kept that have the same transmission to about 1e-5.
 
     Args:
         filters: the attenuation of a material by its name, for a tube.

@@ -1,9 +1,9 @@
 """Broad blur: a wide, round blur computed on a smaller image, since its result has no fine detail.
 
 Edges are mirrors, so that the sum of the image is conserved to rounding. A blur is given by its transfer function of
-(ω width)², ω the angular frequency, in which ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +
+(ω width)², ω the angular frequency. There ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +
 (2 - 2 cos ω_y). Each transfer function of this module is a mixture of Gaussians, so that its kernel is a mixture of
-discrete Gaussians (Lindeberg 1990), which are nonnegative at any width, and so are the photons.
+discrete Gaussians (Lindeberg 1990). These are nonnegative at any width, and so are the photons.
 """
 
 from __future__ import annotations

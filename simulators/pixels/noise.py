@@ -2,7 +2,7 @@
 
 A Poisson number is the quantile C⁻¹(Φ(w)) of a normal number w, where C is Poisson's cumulative distribution: without
 rejection, so that rows can be vectorised. The quantile is the integer part of an expansion in 1 / √λ (Giles 2016,
-"Algorithm 955"), unless the expansion is closer to a whole number than its error, one case in thousands: then the
+"Algorithm 955"). The expansion may be closer to a whole number than its error. In that case, one in thousands, the
 distribution itself is summed. For expectations below 2 a uniform number is looked up in the distribution.
 """
 
@@ -41,8 +41,8 @@ def expansion(w, mean, root):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def summed(w, mean):  # type: ignore[no-untyped-def]
-    """The Poisson quantile of Φ(w) by the sum of the distribution, from its nearer end: the lower tail for w < 0, the
-    upper for w > 0, so that no digits are lost in either; `mean` >= LEAST."""
+    """The Poisson quantile of Φ(w) by the sum of the distribution, from its nearer end. It is the lower tail for w < 0,
+    the upper for w > 0, so that no digits are lost in either; `mean` >= LEAST."""
     tail = 0.5 * math.erfc(abs(w) / math.sqrt(2.0))
     k = max(int(expansion(w, mean, math.sqrt(mean))[0]), 0)
     share = math.exp(k * math.log(mean) - mean - math.lgamma(k + 1.0))
@@ -132,7 +132,7 @@ def _small(state, mean, u, k):  # type: ignore[no-untyped-def]  # pragma: no cov
 
 @njit(cache=True, nogil=True)
 def _normal_rows(key, first, end, rms, stride, image):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add rms * normal; rms [pixel], of which each row begins `stride[0]` further and each column `stride[1]`."""
+    """Add rms * normal. In rms [pixel] each row begins `stride[0]` further and each column `stride[1]`."""
     for row in range(first, end):
         state = begin(key, row)
         for col in range(image.shape[1]):

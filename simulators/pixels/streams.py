@@ -1,8 +1,8 @@
 """Streams: uniform and normal random numbers for compiled loops; the state of a stream is one 64-bit number.
 
-A stream is splitmix64 (Steele, Lea & Flood 2014): the state advances by a fixed step and each number is its hash, so
-that a row of a frame or a pixel of the sensor gets its own stream by hashing its index. Streams that begin at random
-places of a period of 2^64 hardly ever overlap, and where two do they share only a few numbers.
+A stream is splitmix64 (Steele, Lea & Flood 2014): the state advances by a fixed step and each number is its hash. So a
+row of a frame or a pixel of the sensor gets its own stream by hashing its index. Streams that begin at random places of
+a period of 2^64 hardly ever overlap, and where two do they share only a few numbers.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def uniform(state):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def normal(state):  # type: ignore[no-untyped-def]
-    """A number of mean 0 and variance 1 and the state after it; ziggurat of Marsaglia & Tsang (2000), with separate
+    """A number of mean 0 and variance 1 and the state after it. Ziggurat of Marsaglia & Tsang (2000), with separate
     bits for layer, sign and value (Doornik 2005)."""
     while True:
         state += STEP

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,27 +38,4 @@ class Sample(Protocol):
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
         """Label at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
-        ...
-
-
-@runtime_checkable
-class Counted(Protocol):
-    """A sample that also computes counts where nothing but Beer-Lambert is simulated: faster than from its line
-    integrals, and equal to them."""
-
-    def counts(
-        self,
-        angle: ArrayLike | Pose,
-        detector: Detector,
-        open_beam: float,
-        rule: Callable[[NDArray[np.float64]], NDArray[np.uint16]],
-    ) -> NDArray[np.uint16]:
-        """rule(line integrals), uint16 [row, col].
-
-        Args:
-            angle: as for line_integrals.
-            open_beam: counts where the line integral is 0, before they are rounded.
-            rule: counts of line integrals float64 [row, col], which it may overwrite: rounded and clipped open_beam x
-                exp(-line integral). It defines the result.
-        """
         ...

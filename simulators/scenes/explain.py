@@ -23,7 +23,6 @@ from simulators.scenes.scene import Scene
 Seconds = Callable[[], float]
 
 STEPS = {
-    "ideal": "rays, exp(-depth) and whole counts in one go",
     "line_integrals": "rays through the sample",
     "beer_lambert": "photons x exp(-depth)",
     "digitise": "electrons to whole counts",
@@ -78,7 +77,7 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCo
     rounds = [_round(variants, shot, now) for _ in range(repeats + 1)][1:]
     seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
     sizes, peaks = _sizes(variants[0], shot), [_peak(each, shot) for each in variants]
-    costs = [_cost(name, seconds[name], sizes[name]) for name in ("ideal", "line_integrals") if name in seconds]
+    costs = [_cost("line_integrals", seconds["line_integrals"], sizes["line_integrals"])]
     for n, effect in enumerate(ray_effects):
         more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
         costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))

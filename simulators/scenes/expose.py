@@ -16,7 +16,6 @@ from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.sensor import digitise, largest_count
 from simulators.frame.shot import Image, Shot
-from simulators.samples.sample import Counted
 from simulators.scenes.scene import Scene
 
 
@@ -25,13 +24,9 @@ def expose(scene: Scene, shot: Shot, on_step: StepHook = nullcontext) -> NDArray
 
     Args:
         shot: the conditions; the same shot gives the same frame.
-        on_step: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects';
-            or "ideal", where there are no effects and the sample computes the same counts in one step.
+        on_step: entered around each step with its name: "line_integrals", "beer_lambert", "digitise" and the effects'.
     """
     chain = scene.chain
-    if not chain.effects and shot.beam and shot.sample and isinstance(scene.sample, Counted):
-        with on_step("ideal"):
-            return _ideal(scene, scene.sample, shot)
     if shot.beam:
         photons = _photons(scene, shot, on_step)
         electrons = chain.apply(Domain.PHOTONS, photons, shot, on_step)
@@ -43,18 +38,6 @@ def expose(scene: Scene, shot: Shot, on_step: StepHook = nullcontext) -> NDArray
     counts = chain.apply(Domain.COUNTS, electrons, shot, on_step)
     with on_step("digitise"):
         return digitise(counts, largest_count(shot.readout, shot.binning))
-
-
-def _ideal(scene: Scene, sample: Counted, shot: Shot) -> NDArray[np.uint16]:
-    """The same counts in one step."""
-    open_beam = _open_beam(scene, shot)
-
-    def rule(depth: Image) -> NDArray[np.uint16]:
-        photons = _transmitted(depth, open_beam)
-        photons /= shot.conversion
-        return digitise(photons, largest_count(shot.readout, shot.binning))
-
-    return sample.counts(shot.angle, shot.detector, open_beam / shot.conversion, rule)
 
 
 def _open_beam(scene: Scene, shot: Shot) -> float:

@@ -14,6 +14,7 @@ from urllib.parse import parse_qsl
 
 from drivers.clock import Clock
 from drivers.flat import FlatField, flat_fields, from_flat
+from drivers.plugins import plugins
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.wire import Build, Controller
 
@@ -23,7 +24,8 @@ REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's modul
     "zaber": "ZaberBuild",
 }
 WIRES: dict[str, type[Build]] = {
-    kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()
+    **{kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()},
+    **plugins("wire", REGISTRY),
 }
 """Kind -> how its simulated controller is built."""
 

@@ -27,7 +27,7 @@ class Controller(Wire, Protocol):
     """A simulated controller of a stage."""
 
     def output_is_high(self, number: int) -> bool:
-        """The level of a digital output; False where there is none of that number."""
+        """The level of a digital output; False where no output has that number."""
         ...
 
 

@@ -33,7 +33,7 @@ def small(*overrides: str) -> Config:
     return loaded.model_copy(update={"simulation": simulation})
 
 
-def fly(instrument: devices.Instrument, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:
+def fly(instrument: devices.ConnectedDevices, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:
     """The block's passes by hand, as acquisition does it: framestamps and counts [frame, row, col]."""
     stage, camera = instrument.devices.stage, instrument.devices.camera
     camera.configure(devices.camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))

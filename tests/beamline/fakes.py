@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.instrument.connect import Instrument
+from beamline.instrument.connect import ConnectedDevices
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.timeline import work_out
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
@@ -73,8 +73,8 @@ class FakeInstrument:
         self.stage, self.camera = Stage(self), Camera(self)
         self.devices = Devices(self.stage, self.camera, Shutter(self), Sample(self))
 
-    def connected(self) -> Instrument:
-        return Instrument(self.devices, self.clock, None, lambda: self.log.append("close"))
+    def connected(self) -> ConnectedDevices:
+        return ConnectedDevices(self.devices, self.clock, None, lambda: self.log.append("close"))
 
     def timeline(
         self, n: int = 12, mode: Mode = Mode.FLY, passes: int = 1, at: Place = Place.START, speed: float = 30.0

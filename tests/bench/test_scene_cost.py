@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -12,11 +11,8 @@ import yaml
 
 from beamline.core.shipped import shipped_scenes
 from beamline.simulate.scene_file import open_scene
-from recon.base.volume import Grid
 from simulators.effects.catalogue import CATALOGUE
-from simulators.frame.detector import Detector
 from simulators.frame.shot import Shot
-from simulators.samples.sample import Sample
 from simulators.scenes.explain import explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
@@ -90,43 +86,15 @@ def _in_turns(scenes: dict[str, Scene]) -> dict[str, list[float]]:
     return rounds
 
 
-@dataclass(frozen=True)
-class _StepByStep:
-    """A sample that cannot make counts in one go."""
-
-    sample: Sample
-
-    @property
-    def radius(self) -> float:
-        return self.sample.radius
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.sample.names
-
-    def line_integrals(self, angle: Any, detector: Detector) -> Any:
-        return self.sample.line_integrals(angle, detector)
-
-    def attenuation(self, grid: Grid, supersample: int = 3) -> Any:
-        return self.sample.attenuation(grid, supersample)
-
-    def labels(self, grid: Grid) -> Any:
-        return self.sample.labels(grid)
-
-
 @pytest.mark.bench
 def test_each_effect_alone() -> None:
     assert set(TYPICAL) == set(CATALOGUE), "an effect without a typical setting"
     print(f"\n| effect | acts on | ms at {SIDE}² (quartiles) |\n|---|---|---|")
-    # Without any effect a frame is made in one go; what each effect costs is told beside the same frame step by step.
-    stepwise = replace(_sized("ideal", SIDE), sample=_StepByStep(_sized("ideal", SIDE).sample))
-    runs = _in_turns({"one go": _sized("ideal", SIDE), "steps": stepwise})
-    print(
-        f"in one go {statistics.median(runs['one go']):.1f} ms, step by step {statistics.median(runs['steps']):.1f} ms"
-    )
+    bare = _sized("ideal", SIDE)
+    print(f"without effects {statistics.median(_in_turns({'ideal': bare})['ideal']):.1f} ms")
     for name, entry in CATALOGUE.items():
         with_it = yaml.safe_dump([{"kind": name} | TYPICAL[name]], default_flow_style=True, width=10**6).strip()
-        runs = _in_turns({"ideal": stepwise, name: _sized("ideal", SIDE, f"effects={with_it}")})
+        runs = _in_turns({"ideal": bare, name: _sized("ideal", SIDE, f"effects={with_it}")})
         more = [a - b for a, b in zip(runs[name], runs["ideal"], strict=True)]
         low, middle, high = statistics.quantiles(more, n=4)
         print(f"| {name} | {entry.domain.words} | {middle:.1f} ({low:.1f} ... {high:.1f}) |", flush=True)

@@ -9,11 +9,11 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
+from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild
 from simulators.wires.serial_url import register
-from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"pm16c-test-{number}" for number in itertools.count())

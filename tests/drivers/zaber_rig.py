@@ -9,11 +9,11 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.stage import ZaberStage
+from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.serial_url import register
 from simulators.wires.zaber.wire import ZaberBuild
-from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"zaber-test-{number}" for number in itertools.count())

@@ -62,7 +62,7 @@ def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyP
 def test_no_fit_takes_less_than_nothing_on_a_busy_machine(monkeypatch: pytest.MonkeyPatch, runs: list[float]) -> None:
     """Seconds of a first small run, two short ones and two of twice the steps."""
     monkeypatch.setattr(run_time, "reconstruct", lambda *_, **__: None)
-    monkeypatch.setattr(run_time, "_of_fbp", lambda *_: 0.0)
+    monkeypatch.setattr(run_time, "_of_direct", lambda *_: 0.0)
     clock = iter(itertools.accumulate(seconds for run in runs for seconds in (0, run)))
     fit = recon.R2(steps=1000, finish=0)
     assert run_seconds(fit, Extent(108, 128, [16]), clock.__next__) > 1000 * runs[-1] / 100

@@ -18,47 +18,34 @@ from simulators.samples.bodies.solids import (
     Box,
     Cylinder,
     Ellipsoid,
-    Octahedron,
-    Plate,
     Polyhedron,
     Solid,
-    TruncatedOctahedron,
-    Tube,
     Vector,
 )
+from simulators.samples.builders.grains import octahedron, plate, truncated_octahedron
 
 Reals = NDArray[np.float64]
 
 CENTRE, QUATERNION = (0.11, -0.07, 0.05), (0.8, -0.3, 0.5, 0.4)
 CORNERS = ((-0.2, -0.15, -0.1), (0.3, -0.1, -0.12), (0.05, 0.28, -0.08), (0.1, 0.05, 0.3), (-0.15, 0.2, 0.15))
-WEDGE = (
-    (0, 0, -1, 0.1),
-    (1, 0, 1, 0.15),
-    (-2, 0, 2, 0.15),
-    (0, 3, 0, 0.2),
-    (0.1, -1, 0, 0.12),
-)  # normals of any length
 SPIRAL = [(k * 2.4, (2 * k - 23) / 24) for k in range(24)]  # points all over a ball, no four in a plane
 GEM = tuple(
     (0.3 * math.cos(a) * math.sqrt(1 - z * z), 0.25 * math.sin(a) * math.sqrt(1 - z * z), 0.2 * z) for a, z in SPIRAL
 )
 SOLIDS: dict[str, Solid] = {
     "cylinder": Cylinder(0.3, 0.5, 2.0, CENTRE),
-    "tube": Tube(0.3, 0.22, 0.5, 2.0, CENTRE),
     "sphere": Ellipsoid((0.25, 0.25, 0.25), 1.5, CENTRE),
     "ellipsoid": Ellipsoid((0.35, 0.2, 0.1), 1.5, CENTRE, QUATERNION),
     "upright box": Box((0.5, 0.3, 0.4), 1.2, CENTRE),
     "box": Box((0.5, 0.3, 0.4), 1.2, CENTRE, QUATERNION),
-    "octahedron": Octahedron((0.3, 0.25, 0.35), 1.2, CENTRE, QUATERNION),
-    "plate": Plate(0.5, 0.15, 1.3, CENTRE, QUATERNION),
-    "upright plate": Plate(0.5, 0.15, 1.3, CENTRE),
-    "truncated octahedron": TruncatedOctahedron((0.3, 0.25, 0.35), 1.2, 0.7, CENTRE, QUATERNION),
-    "corners": Polyhedron(1.4, vertices=CORNERS, centre=CENTRE, quaternion=QUATERNION),
-    "gem": Polyhedron(1.4, vertices=GEM, centre=CENTRE, quaternion=QUATERNION),
-    "wedge": Polyhedron(1.4, faces=WEDGE, centre=CENTRE, quaternion=QUATERNION),
+    "octahedron": Polyhedron(octahedron((0.3, 0.25, 0.35)), 1.2, CENTRE, QUATERNION),
+    "plate": Polyhedron(plate(0.5, 0.15), 1.3, CENTRE, QUATERNION),
+    "upright plate": Polyhedron(plate(0.5, 0.15), 1.3, CENTRE),
+    "truncated octahedron": Polyhedron(truncated_octahedron((0.3, 0.25, 0.35), 0.7), 1.2, CENTRE, QUATERNION),
+    "corners": Polyhedron(CORNERS, 1.4, CENTRE, QUATERNION),
+    "gem": Polyhedron(GEM, 1.4, CENTRE, QUATERNION),
 }
-CONVEX = [name for name in SOLIDS if name != "tube"]
-TURNABLE = [name for name in CONVEX if name != "cylinder"]
+TURNABLE = [name for name in SOLIDS if name != "cylinder"]
 
 
 def level(solid: Solid, points: Reals) -> Reals:
@@ -66,28 +53,14 @@ def level(solid: Solid, points: Reals) -> Reals:
     q = points - np.array(solid.centre)
     if isinstance(solid, Cylinder):
         return np.maximum(np.hypot(q[..., 0], q[..., 1]) - solid.radius, np.abs(q[..., 2]) - solid.height / 2)
-    assert not isinstance(solid, Tube), "a tube is not convex"
     w, x, y, z = solid.quaternion
     q = Rotation.from_quat([x, y, z, w]).inv().apply(q.reshape(-1, 3)).reshape(q.shape)
     if isinstance(solid, Ellipsoid):
         return np.linalg.norm(q / np.array(solid.semi_axes), axis=-1) - 1
     if isinstance(solid, Box):
         return (np.abs(q) - np.array(solid.edges) / 2).max(-1)
-    if isinstance(solid, Octahedron):
-        return (np.abs(q) / np.array(solid.half_diagonals)).sum(-1) - 1
-    if isinstance(solid, TruncatedOctahedron):
-        share = np.abs(q) / np.array(solid.half_diagonals)
-        return np.maximum(share.sum(-1) - 1, share.max(-1) - solid.cut)
-    if isinstance(solid, Plate):
-        turn = np.deg2rad([30, 90, 150])
-        across = np.abs(np.multiply.outer(q[..., 0], np.cos(turn)) + np.multiply.outer(q[..., 1], np.sin(turn))).max(-1)
-        return np.maximum(across - solid.width / 2 * math.cos(math.pi / 6), np.abs(q[..., 2]) - solid.thickness / 2)
-    if solid.vertices is not None:
-        planes = _hull(solid.vertices)
-        return (q @ planes[:, :3].T + planes[:, 3]).max(-1)
-    planes = np.array(solid.faces, dtype=np.float64)
-    length = np.linalg.norm(planes[:, :3], axis=1)
-    return (q @ (planes[:, :3] / length[:, None]).T - planes[:, 3]).max(-1)
+    planes = _hull(solid.vertices)
+    return (q @ planes[:, :3].T + planes[:, 3]).max(-1)
 
 
 @cache
@@ -98,20 +71,21 @@ def _hull(vertices: tuple[Vector, ...]) -> Reals:
 
 def inside(solid: Solid, points: Reals) -> NDArray[np.bool_]:
     """Indicator of a solid at points [..., 3]."""
-    if isinstance(solid, Tube):
-        outer = Cylinder(solid.outer_radius, solid.height, 1.0, solid.centre)
-        inner = Cylinder(solid.inner_radius, solid.height, 1.0, solid.centre)
-        return (level(outer, points) <= 0) & (level(inner, points) > 0)
     return level(solid, points) <= 0
+
+
+def volume(solid: Solid) -> float:
+    """mm³."""
+    if isinstance(solid, Cylinder):
+        return math.pi * solid.radius**2 * solid.height
+    if isinstance(solid, Ellipsoid):
+        return 4 / 3 * math.pi * math.prod(solid.semi_axes)
+    return math.prod(solid.edges) if isinstance(solid, Box) else float(ConvexHull(solid.vertices).volume)
 
 
 def chords(solid: Solid, start: Reals, ray: Reals, far: float) -> Reals:
     """Lengths of rays start + t ray/|ray| [..., 3], |t| <= far, inside a solid: the least level by golden section, then
     both crossings by bisection; no formula of a chord."""
-    if isinstance(solid, Tube):
-        outer = Cylinder(solid.outer_radius, solid.height, 1.0, solid.centre)
-        inner = Cylinder(solid.inner_radius, solid.height, 1.0, solid.centre)
-        return chords(outer, start, ray, far) - chords(inner, start, ray, far)
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     # From the point nearest to the body's middle, so that digits are not lost on the way from a far source.
     start = start + ray * ((np.array(solid.centre) - start) * ray).sum(-1, keepdims=True)
@@ -158,8 +132,8 @@ def rays(pose: Pose, detector: Detector) -> tuple[Reals, Reals]:
 
 
 def turned(solid: Solid, matrix: Reals) -> Solid:
-    """The solid after a rotation about the origin; not for cylinders and tubes."""
-    assert not isinstance(solid, Cylinder | Tube)
+    """The solid after a rotation about the origin; not for cylinders."""
+    assert not isinstance(solid, Cylinder)
     x, y, z, w = Rotation.from_matrix(matrix @ rotation(solid.quaternion)).as_quat()
     centre = tuple((matrix @ np.array(solid.centre)).tolist())
     return replace(solid, centre=centre, quaternion=(w, x, y, z))

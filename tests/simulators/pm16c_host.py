@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
+from drivers.testing.stages.bench import emitted
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild
 from tests.drivers.stages.flat_settings import flat
-from tests.simulators.cable import emitted
 
 TURN = 360_000
 SPEED = 10_000

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from drivers.testing.stages.bench import emitted
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.wires.zaber.wire import ZaberBuild
 from tests.drivers.stages.flat_settings import flat
-from tests.simulators.cable import emitted
 
 TURN = 360_000
 SPEED = 10_000

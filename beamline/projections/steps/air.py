@@ -31,8 +31,8 @@ def _parts(text: str) -> tuple[Columns, Surface]:
         return "auto", int(match[1])
     if text not in _MODELS:
         raise ValueError(
-            f"{text!r} is none of auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12), surface:ORDER (0 "
-            "to 3)"
+            f"{text!r} is not known; expected auto, none, columns, LEFT,RIGHT (numbers of columns, e.g. 12,12) or "
+            "surface:ORDER (0 to 3)"
         )
     return _MODELS[text]
 
@@ -56,9 +56,9 @@ class Air:
     model: str = option(
         "--air",
         "auto",
-        "What is taken off each view so that its air is at zero. columns: the line through the air at the left "
-        "and right edge; LEFT,RIGHT: of so many columns; surface:0 to 3: also a polynomial through all rays that miss "
-        "the sample; auto: that where the views confirm it, and says so.",
+        "Level the air of each view at zero. columns: take off the line through the air at both edges. "
+        "LEFT,RIGHT: from so many columns. surface:0 to 3: take off a polynomial through all rays that miss the "
+        "sample, too. auto: the surface where the views confirm it.",
         parse=_model,
         metavar="auto|none|columns|LEFT,RIGHT|surface:ORDER",
     )

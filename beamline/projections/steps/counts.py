@@ -25,8 +25,8 @@ class CountModel:
     noise: Noise = option(
         "--noise",
         "auto",
-        "log: line integrals are logarithms of counts; counts: they carry the likelihood of the photons counted, "
-        f"with weights, which few photons need; auto: counts where a pixel of the open beam has fewer than "
+        "log: line integrals are logarithms of counts. counts: line integrals and weights carry the likelihood "
+        "of the photons counted, for few photons. auto: counts where a pixel of the open beam has fewer than "
         f"{FEW_PHOTONS}.",
         choices=get_args(Noise),
     )

@@ -22,9 +22,9 @@ class Flags:
     wanted: str = option(
         "--flags",
         "use",
-        "use: views with an alarm of the monitor are left out, with a warning weigh half (or rays in the flag's "
-        "region), after a jump of the sample are corrected; judge: by what the monitor says of them now, also where "
-        "the file has no flags; ignore: all are alike.",
+        "use: leave out views with an alarm of the monitor, halve the weight of views or regions with a warning, "
+        "correct views after a jump of the sample. judge: let the monitor look at the frames first. ignore: take "
+        "all views alike.",
         choices=("use", "judge", "ignore"),
     )
 

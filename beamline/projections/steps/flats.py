@@ -25,8 +25,8 @@ class Flats:
     fields: FlatFields = option(
         "--flat-fields",
         "groups",
-        "groups: a view's flat is interpolated between the means of groups of flats; dynamic: the mean of all, "
-        "with the components of their changes that the view shows, for a beam that moves (4 flats or more).",
+        "groups: interpolate the flat of a view between the means of groups of flats. dynamic: add the changes "
+        "of the flats that the view shows, for a beam that moves (4 flats or more).",
         choices=get_args(FlatFields),
     )
     ring_current: str = option(

@@ -21,7 +21,8 @@ def _wanted(text: str) -> str | None:
     """`fit` or `material:beam`; None for "none"."""
     if text not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", text):
         raise ValueError(
-            f"{text!r} is none of none, fit, MATERIAL:BEAM (Al:60kV,Al=1 is a tube behind 1 mm Al; or Al:FILE)"
+            f"{text!r} is not known; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a tube behind 1 mm Al; or "
+            "Al:FILE)"
         )
     return None if text == "none" else text
 
@@ -51,7 +52,7 @@ class Hardening:
     def __post_init__(self) -> None:
         if self.wanted is None or self.wanted == "fit" or self.spectrum is not None:
             return
-        from beamline.simulate.matter import in_beam
+        from beamline.projections.beam import in_beam
 
         try:
             object.__setattr__(self, "spectrum", in_beam(*self.wanted.split(":", 1)))

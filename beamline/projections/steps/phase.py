@@ -20,7 +20,7 @@ def _material(text: str) -> str | None:
     """What `paganin:` is followed by; None for "none"."""
     way, _, material = text.partition(":")
     if text != "none" and (way != "paganin" or not material):
-        raise ValueError(f"{text!r} is none of none, paganin:RATIO (delta/beta), paganin:MATERIAL")
+        raise ValueError(f"{text!r} is not known; expected none, paganin:RATIO (delta/beta) or paganin:MATERIAL")
     return material or None
 
 
@@ -94,7 +94,7 @@ class Phase:
         """The ratio of delta to beta. ValueError: the material is not known."""
         if (ratio := self._ratio) is not None:
             return ratio
-        from beamline.simulate.matter import delta_beta
+        from recon.prep.matter import delta_beta
 
         return delta_beta(str(self.material), energy_kev)
 

@@ -22,8 +22,8 @@ class ReferenceCheck:
     wanted: str = option(
         "--references",
         "check",
-        "check: groups of darks and flats that are saturated, dark, uneven or lit are left out, and refused where "
-        "no other is left; accept: all are used as they are.",
+        "check: leave out groups of darks and flats that are saturated, dark, uneven or lit; refuse the scan if "
+        "no group is left. accept: use all as they are.",
         choices=("check", "accept"),
     )
 

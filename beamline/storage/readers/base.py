@@ -1,4 +1,4 @@
-"""ScanSource: one view of a scan, whatever the file. ScanReader and Format: what a file format adds."""
+"""ScanSource: one view of a scan, whatever the file. BaseSource and ScanFormat: what a file format adds."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ class ScanSource(Protocol):
         image_key: int32 [frame], values of drivers.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
         exposures: float64 [frame] s, NaN where unknown.
-        currents: float64 [frame] of the ring, or what else the file's monitor of the beam reads, in its own unit; NaN
-            where unknown; None where there is no monitor.
+        currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit.
+            NaN where unknown; None where there is no monitor.
         pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         attributes: whatever else the file says, for the record.
         flags: of the monitor, by frame; None where no monitor looked at the frames.
         replaces: int64 [frame], the row of the view that a frame was taken again for (an INVALID frame from then on),
-            -1 in others; None where no view was taken again.
+            -1 in others. None where no view was taken again.
         part_starts: int64 [part], ascending, the first row of each part: between two parts the scan was interrupted,
             so that beam and camera may have changed. [0] where it was not.
         checksummed: the file holds a checksum of every frame.
-        altered: rows of which the file says something else than what was written, by the checksum of their record:
-            they are INVALID, for nothing is known of them.
-        damaged: rows read so far whose pixels are not those that were written, by these checksums; frames of
-            which less than half is read are not compared.
+        altered: rows whose record in the file differs from the one that was written, by its checksum. They are INVALID,
+            for nothing is known of them.
+        damaged: rows read so far whose pixels are not those that were written, by these checksums. Frames are compared
+            only where half of them or more is read.
         plan: what the operator asked for, as our files record it; empty where it is not known.
         finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
     """
@@ -146,11 +146,11 @@ def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
     return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
 
 
-class ScanReader(ABC):
+class BaseSource(ABC):
     """Base class of the readers: a format adds what it knows and `read`; the rest is here once.
 
     A subclass sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and `facts` (its attributes) where it
-    opens the file, and whatever of the other fields its format states; see ScanSource for their meaning.
+    opens the file. It also sets those of the other fields that its format states; see ScanSource for their meaning.
     """
 
     path: Path
@@ -270,7 +270,7 @@ class Opening:
 
 
 @dataclass(frozen=True)
-class Format:
+class ScanFormat:
     """A file format in the registry `storage.readers.open.FORMATS`.
 
     Attributes:
@@ -282,4 +282,4 @@ class Format:
 
     name: str
     recognises: Callable[[Path, Opening], bool]
-    open: Callable[[Path, Opening], ScanReader]
+    open: Callable[[Path, Opening], BaseSource]

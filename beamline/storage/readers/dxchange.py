@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import Format, Opening
-from beamline.storage.readers.stacks import Stack, StacksSource
+from beamline.storage.readers.base import Opening, ScanFormat
+from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.frame import FrameKind
 
 PLACES = (
@@ -26,7 +26,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     file = hdf5.open_hdf5(path)
     try:
         found = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
-        stacks = [Stack(kind, where, item) for kind, where, item in found if item is not None]
+        stacks = [FrameStack(kind, where, item) for kind, where, item in found if item is not None]
         source = StacksSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
         if own_angles:
             n_views = len(stacks[-1].frames)
@@ -77,7 +77,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return hdf5.dataset(file, "exchange/data") is not None
 
 
-FORMAT = Format(
+FORMAT = ScanFormat(
     "/exchange/data (Data Exchange)",
     _recognises,
     lambda path, opening: open_exchange(path, own_angles=opening.own_angles),

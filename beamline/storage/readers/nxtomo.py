@@ -20,13 +20,21 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import FrameFlags, read_flags
 from beamline.storage.hdf5 import require_real
 from beamline.storage.parts import require_joined
-from beamline.storage.readers.base import WHOLE, Format, Opening, Quantity, ScanReader, count_in_blocks, frame_indices
+from beamline.storage.readers.base import (
+    WHOLE,
+    BaseSource,
+    Opening,
+    Quantity,
+    ScanFormat,
+    count_in_blocks,
+    frame_indices,
+)
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
 from drivers.frame import Frame, FrameKind
 
 
-class NXtomoSource(ScanReader):
+class NXtomoSource(BaseSource):
     """A scan in NXtomo's structure; see ScanSource."""
 
     def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
@@ -98,14 +106,14 @@ class NXtomoSource(ScanReader):
         key = places.image_key if finer is None else finer
         if self._ours:
             committed = self._file[layout.COMMITTED]
-            committed.refresh()
+            hdf5.look_again(committed)
             n = int(committed[()])
             if n < 0:
                 raise ValueError(f"{n} frames are committed")
             if n > self.n:
                 for item in (places.data, key, places.angle, None if key is places.image_key else places.image_key):
                     if item is not None:
-                        item.refresh()
+                        hdf5.look_again(item)
         else:
             n = int(places.data.shape[0])
         angles = hdf5.radians(places.angle) if places.angle is not None and self._own_angles else np.full(n, np.nan)
@@ -133,7 +141,7 @@ class NXtomoSource(ScanReader):
             return True
         with hdf5.readable(self.path):
             flag = self._file[layout.FINISHED]
-            flag.refresh()
+            hdf5.look_again(flag)
             return bool(flag[()])
 
     @property
@@ -164,7 +172,7 @@ class NXtomoSource(ScanReader):
             said["parts"] = ", ".join(source.file_name for source in self._places.data.virtual_sources())
         if self._ours:
             for item in (self._file[layout.STATUS], self._file[layout.MISSING]):
-                item.refresh()
+                hdf5.look_again(item)
             said["status"] = hdf5.text(self._file[layout.STATUS][()]) or "running"
             said["missing_triggers"] = int(self._file[layout.MISSING].shape[0])
         return said
@@ -280,7 +288,7 @@ class NXtomoSource(ScanReader):
         if item is None:
             return default
         if self._ours:
-            item.refresh()
+            hdf5.look_again(item)
         values = np.asarray(item[()])
         return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
 
@@ -290,7 +298,7 @@ class NXtomoSource(ScanReader):
         if item is None or factor is None or item.dtype.kind not in "uif":
             return np.full(self.n, np.nan)
         if self._ours:
-            item.refresh()
+            hdf5.look_again(item)
         values = np.ravel(item[()]).astype(np.float64) * factor
         if values.size == 1:
             return np.full(self.n, values[0])
@@ -347,7 +355,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return bool(find(file))
 
 
-FORMAT = Format(
+FORMAT = ScanFormat(
     "an NXdetector with frames and an image_key (NXtomo)",
     _recognises,
     lambda path, opening: NXtomoSource(path, follow=opening.follow, own_angles=opening.own_angles),

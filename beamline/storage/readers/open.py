@@ -16,13 +16,14 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
-from beamline.storage.readers.base import Format, Opening, Quantity, ScanReader, ScanSource
-from beamline.storage.readers.overlay import Overlay
+from beamline.storage.readers.base import BaseSource, Opening, Quantity, ScanFormat, ScanSource
+from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.parts_source import PartsSource
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
-from beamline.storage.readers.tiff_series import TiffSeries
+from beamline.storage.readers.tiff_series import TiffSeriesSource
 from drivers.frame import FrameKind
+from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
@@ -33,8 +34,11 @@ REGISTRY = (  # modules in this folder, asked in this order
     "nxtomo",
     "dxchange",
 )
-FORMATS: tuple[Format, ...] = tuple(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY)
-"""Every format that is read; adding one takes its file in this folder and its line in REGISTRY."""
+FORMATS: tuple[ScanFormat, ...] = (
+    *(import_module(f"beamline.storage.readers.{name}").FORMAT for name in REGISTRY),
+    *plugins("reader", REGISTRY).values(),
+)
+"""Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 
 Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [frame, row, col]
 
@@ -91,7 +95,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     _refuse(options, follow)
     if options.data_path is not None:
         with hdf5.readable(path):
-            base: ScanReader = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
+            base: BaseSource = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
     else:
         base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
@@ -102,7 +106,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         if options.angles_path is not None:
             angles_from = f"{options.angles_path} in {path}"
             table = angles_at(path, options.angles_path, options.angles_unit)
-        if table is None and isinstance(base, TiffSeries) and base.angle_text is not None:
+        if table is None and isinstance(base, TiffSeriesSource) and base.angle_text is not None:
             angles_from = f"{base.angle_text[0]} in {path}"
             table = parse_angles(base.angle_text[1], angles_from)
         if options.angle_rows is not None:
@@ -113,7 +117,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             _refuse_all_frames(base, table, angles_from)
         if table is None and darks is None and flats is None and options.quantity is None:
             return base
-        return Overlay(
+        return OverlaidSource(
             base,
             angles=table,
             angles_from=angles_from,
@@ -132,11 +136,11 @@ def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str
     if n < base.image_key.size == table.size:
         raise DataError(
             f"{name} has {table.size} angles, one for each frame, and {base.path} does not say when its darks and "
-            f"flats were taken: say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
+            f"flats were taken. Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
         )
 
 
-def _of_parts(earlier: Sequence[Path], last: ScanReader) -> ScanReader:
+def _of_parts(earlier: Sequence[Path], last: BaseSource) -> BaseSource:
     with ExitStack() as opened:
         sources = [opened.enter_context(_open(path, Opening())) for path in earlier]
         parts = PartsSource(sources, last)
@@ -144,7 +148,7 @@ def _of_parts(earlier: Sequence[Path], last: ScanReader) -> ScanReader:
     return parts
 
 
-def _open(path: Path, opening: Opening) -> ScanReader:
+def _open(path: Path, opening: Opening) -> BaseSource:
     with hdf5.readable(path):
         for kind in FORMATS:
             if kind.recognises(path, opening):

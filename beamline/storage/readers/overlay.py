@@ -1,4 +1,4 @@
-"""Overlay: a scan with angles or references that its file lacks or has wrong, or a quantity that it cannot say."""
+"""OverlaidSource: a scan with angles, references or a quantity that its file lacks or has wrong."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.angle_table import assign
-from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanReader, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, Quantity, ScanSource, frame_indices
 from drivers.frame import Frame, FrameKind
 
 
-class Overlay(ScanReader):
+class OverlaidSource(BaseSource):
     """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
 
     Where darks (flats) are given, those of `base` become INVALID: they stay, and nobody uses them.

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.base import WHOLE, Attributes, ScanReader, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, ScanSource, frame_indices
 
 
-class PartsSource(ScanReader):
+class PartsSource(BaseSource):
     """A ScanSource of the frames of `earlier`, which have ended, and then of `last`, whose path and facts it has.
 
     What is known of a frame by its row, such as the row that it replaces, counts from the first frame of all.

@@ -17,14 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import WHOLE, Attributes, ScanReader, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, frame_indices
 from drivers.frame import FrameKind
 
 _LISTED = 10  # datasets of a file that an error names
 
 
 @dataclass(frozen=True)
-class Stack:
+class FrameStack:
     """Frames of one kind. `frames`: [frame, row, col], a dataset or an array; `name`: for messages."""
 
     kind: FrameKind
@@ -38,13 +38,15 @@ class Closable(Protocol):
     def close(self) -> None: ...
 
 
-class StacksSource(ScanReader):
+class StacksSource(BaseSource):
     """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
 
     Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
     """
 
-    def __init__(self, path: Path, file: Closable, stacks: Sequence[Stack], *, format: str, facts: Attributes) -> None:
+    def __init__(
+        self, path: Path, file: Closable, stacks: Sequence[FrameStack], *, format: str, facts: Attributes
+    ) -> None:
         """Take over an open file. Angles are NaN; `stacks` are in the order of the frames, the projections last."""
         self.path, self.format, self.facts = path, format, facts
         self._file, self._stacks = file, stacks
@@ -104,7 +106,7 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None) -> 
             if where is not None:
                 item = dataset_at(file, where)
                 image = item.ndim == 2 and kind != FrameKind.PROJECTION
-                stacks.append(Stack(kind, where, item[()][None] if image else item))
+                stacks.append(FrameStack(kind, where, item[()][None] if image else item))
         return StacksSource(path, file, stacks, format="hdf5_stacks", facts={"data": data})
     except BaseException:
         file.close()

@@ -22,7 +22,7 @@ from beamline.core.errors import DataError
 from beamline.core.text import spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
+from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refuse_volume
 from drivers.frame import FrameKind
 
@@ -32,7 +32,7 @@ COUNTED = 100  # numbers between the first and the last file, over their number,
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
-class TiffSeries(ScanReader):
+class TiffSeriesSource(BaseSource):
     """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series.
 
     Attribute `angle_text`: (name, content) of the one file that is named after angles, or None.
@@ -175,8 +175,8 @@ def _gaps(names: list[str]) -> str:
     return spans(sorted(set(range(numbers[0], numbers[-1])) - set(numbers)))
 
 
-FORMAT = Format(
+FORMAT = ScanFormat(
     "a folder or .zip of TIFFs",
     lambda path, opening: path.is_dir() or (path.is_file() and path.suffix.lower() == ".zip"),
-    lambda path, opening: TiffSeries(path),
+    lambda path, opening: TiffSeriesSource(path),
 )

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import Format, Opening
-from beamline.storage.readers.stacks import Stack, StacksSource
+from beamline.storage.readers.base import Opening, ScanFormat
+from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.frame import FrameKind
 
 _SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
@@ -117,14 +117,18 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
     if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
         raise DataError(f"{path} says that it has {n} images of {rows} x {cols} pixels, and is too small for them.")
     _refuse(path, file, n)
-    stacks = [Stack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
+    stacks = [FrameStack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
     reference = _TYPES.get(
         file.number("ReferenceData/DataType") or file.number("ReferenceData/ImageInfo/DataType") or 0
     )
     if reference is not None:
         flat = file.image("ReferenceData/Image", (rows, cols), reference)[None]
         dark = np.zeros_like(flat)  # subtracted by the instrument
-        stacks = [Stack(FrameKind.DARK, "dark", dark), Stack(FrameKind.FLAT, "ReferenceData/Image", flat), *stacks]
+        stacks = [
+            FrameStack(FrameKind.DARK, "dark", dark),
+            FrameStack(FrameKind.FLAT, "ReferenceData/Image", flat),
+            *stacks,
+        ]
     source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
@@ -196,4 +200,4 @@ def _recognises(path: Path, opening: Opening) -> bool:
         return file.read(len(_SIGNATURE)) == _SIGNATURE
 
 
-FORMAT = Format(".txrm (Zeiss)", _recognises, lambda path, opening: open_txrm(path, own_angles=opening.own_angles))
+FORMAT = ScanFormat(".txrm (Zeiss)", _recognises, lambda path, opening: open_txrm(path, own_angles=opening.own_angles))

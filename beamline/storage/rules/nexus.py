@@ -157,7 +157,7 @@ def framestamp_order(places: Places) -> Iterator[Finding]:
     """A camera's counter goes up by one a frame.
 
     It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones, or with
-    another part of a joined file; not always at 0, for the first frame may be lost.
+    another part of a joined file. Not always at 0, for the first frame may be lost.
     """
     stamps, triggers = _column(places, "frame_log/framestamp"), _column(places, "frame_log/trigger")
     key = np.ravel(places.image_key[()])[: stamps.size]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.digest import digest
-from beamline.monitor.references import JudgedGroup, Reference, ReferenceLimits, full_scale, judge
+from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from drivers.frame import FrameKind
@@ -42,7 +42,7 @@ class ReferenceGroups:
         return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)
 
     def lacking(self) -> tuple[JudgedGroup, ...]:
-        """The groups of a kind of which none is good."""
+        """The groups of a kind where all are bad."""
         return tuple(
             group for group in self.judged if all(other.faults for other in self.judged if other.kind is group.kind)
         )
@@ -78,7 +78,7 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
 def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
     """Flats that are lit, whole and even, and darks that are dark; a bad group beside a good one is left out.
 
-    An error for groups of a kind of which none is good, a warning for others that have a fault.
+    An error where all groups of a kind are bad, a warning for others that have a fault.
 
     Args:
         accepted: all are used as they are, so that a fault is a warning.
@@ -111,8 +111,8 @@ def _some(group: Frames) -> Frames:
     return group[np.unique(np.linspace(0, group.size - 1, SAMPLES).astype(int))]
 
 
-def _reference(source: ScanSource, row: int) -> Reference:
+def _reference(source: ScanSource, row: int) -> ReferenceFrame:
     image = source.read([row])[0]
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
     found = digest(image, saturation, BLOCK)
-    return Reference.of(row, FrameKind(int(source.image_key[row])), float(source.exposures[row]), found, BLOCK)
+    return ReferenceFrame.of(row, FrameKind(int(source.image_key[row])), float(source.exposures[row]), found, BLOCK)

@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Level
-from beamline.monitor.motion import Motion
-from beamline.monitor.opposite import Opposite
+from beamline.monitor.motion import MotionCheck
+from beamline.monitor.opposite import OppositeCheck
+from beamline.monitor.view import PixelBox
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
 
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
 MARGIN = 0.25  # of the region's shorter side, on all sides
 
 Mask = NDArray[np.bool_]
-Box = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,8 @@ class Treatment:
 
     Attributes:
         flags: of all frames, those that count.
-        views, left_out, halved, masked: bool [frame of the file]: views; of these those with an alarm, which are left
-            out, those with a warning, which weigh half, and those that are flagged in a part, where rays weigh less.
+        views, left_out, halved, masked: bool [frame of the file]: the views. Of these, those with an alarm, which are
+            left out; those with a warning, which weigh half; those flagged in a part, where rays weigh less.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
     """
 
@@ -55,14 +55,14 @@ class Treatment:
 def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Treatment:
     """What `beamline recon` does with these views, whose frames have this shape, unless it ignores flags.
 
-    A view in which the sample jumped is as good as those after it; and then, what views from opposite sides show of it
-    is no fault of theirs.
+    A view in which the sample jumped is as good as those after it. What views from opposite sides show of the jump is
+    no fault of theirs then.
     """
-    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == Motion.bit]
+    jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])
-    flags = flags.without(Motion.bit)
+    flags = flags.without(MotionCheck.bit)
     if jumped.size:  # what views from the other side show of the jump is corrected with it
-        flags = flags.without(Opposite.bit)
+        flags = flags.without(OppositeCheck.bit)
     local = flagged_in_part(flags, shape)
     left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
     return Treatment(flags, views, left_out, halved, views & local, jumped)
@@ -79,11 +79,13 @@ def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
     return flags.flagged & ~whole
 
 
-def boxes_of(flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]) -> Iterator[tuple[int, Box | None]]:
+def boxes_of(
+    flags: FrameFlags, check: int, entry: FlagBit, shape: tuple[int, int]
+) -> Iterator[tuple[int, PixelBox | None]]:
     """Frames that a check flagged, each with its region and a margin; None: the whole view, or most of it.
 
-    A view that a check marked when it had seen later ones has no region in the file: it takes the one that these lead
-    to, on a straight line.
+    A view that a check marked when it had seen later ones has no region in the file. It takes the region to which these
+    lead on a straight line.
     """
     assert flags.regions is not None
     rows = np.flatnonzero(flags.bits >> entry.bit & 1)

@@ -217,7 +217,7 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
 
 
 def exposures_agree(source: ScanSource) -> Iterator[Finding]:
-    """Darks are exposed as long as the projections, and the projections alike; flats may have an exposure of their own,
+    """Darks are exposed as long as the projections, and the projections alike. Flats may have an exposure of their own,
     for their light is scaled to the projections'."""
     exposures = source.exposures
     views = exposures[(source.image_key == FrameKind.PROJECTION) & np.isfinite(exposures)]

@@ -132,7 +132,7 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
 
 
 def marked(text: str) -> dict[str, Any] | None:
-    """The facts in a description; None where it is none of ours."""
+    """The facts in a description; None where another program wrote it."""
     if VOLUME not in text:
         return None
     try:
@@ -160,7 +160,7 @@ def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
 
 
 def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:
-    """The record of a volume of which nothing else is known; `spacing` (z, y, x) in mm."""
+    """The record of a volume without other facts; `spacing` (z, y, x) in mm."""
     dz, dy, dx = spacing or (1.0, 1.0, 1.0)
     if not math.isclose(dy, dx, rel_tol=1e-3):
         raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be kept.")

@@ -13,16 +13,11 @@ from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import SUFFIXES, read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
-from beamline.storage.volumes.nxtomoproc import NXtomoproc
-from beamline.storage.volumes.ome_zarr import OmeZarr
-from beamline.storage.volumes.plain import Npy, Nrrd
-from beamline.storage.volumes.tiff import TiffFile, TiffFolder
+from beamline.storage.volumes.plain import Npy
+from beamline.storage.volumes.registry import formats
 from beamline.storage.writers.recon_file import ReconRecord
 
 _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
-
-FORMATS: tuple[VolumeFormat, ...] = (NXtomoproc(), TiffFile(), TiffFolder(), Npy(), Nrrd(), OmeZarr())
-"""Every format that volumes are written in."""
 
 
 def format_of(path: Path) -> VolumeFormat:
@@ -34,10 +29,12 @@ def format_of(path: Path) -> VolumeFormat:
     suffix = path.suffix.lower()
     if not path.name or (not suffix and path.name.startswith(".")):
         raise ValueError(f"{str(path)!r} names no file and no folder for a volume; expected such as volume.h5.")
-    found = next((kind for kind in FORMATS if suffix in kind.suffixes), None)
+    found = next((kind for kind in formats() if suffix in kind.suffixes), None)
     if found is None:
-        known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in FORMATS)
-        raise ValueError(f"{str(path)!r}: the suffix names the format of a volume, and {suffix!r} is none of {known}.")
+        known = ", ".join(f"{' '.join(kind.suffixes) or 'no suffix'} ({kind.name})" for kind in formats())
+        raise ValueError(
+            f"{str(path)!r}: the suffix names the format of a volume; {suffix!r} is not known, expected {known}."
+        )
     return found
 
 
@@ -80,7 +77,7 @@ def _compare(kind: VolumeFormat, path: Path, slices: Slices) -> None:
 
 def volume_format(path: Path) -> VolumeFormat | None:
     """The format of a volume that this program wrote, or of an .npy that is no scan; None for scans and all else."""
-    found = next((kind for kind in FORMATS if kind.holds(path)), None)
+    found = next((kind for kind in formats() if kind.holds(path)), None)
     # Voxels alone say nothing of where they come from: a reader of scans goes first.
     if isinstance(found, Npy) and any(scan.recognises(path, Opening()) for scan in SCANS):
         return None

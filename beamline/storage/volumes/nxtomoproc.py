@@ -10,7 +10,8 @@ from pathlib import Path
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.volumes.base import Slices
-from beamline.storage.writers.recon_file import DEFINITION, SUFFIXES, ReconRecord, opened_reconstruction, write_record
+from beamline.storage.volumes.registry import REGISTRY
+from beamline.storage.writers.recon_file import DEFINITION, ReconRecord, opened_reconstruction, write_record
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class NXtomoproc:
     """HDF5, float32, with all settings, figures of merit and the history."""
 
     name: str = "HDF5 (NXtomoproc)"
-    suffixes: tuple[str, ...] = SUFFIXES
+    suffixes: tuple[str, ...] = REGISTRY["hdf5"].suffixes
     greys: bool = False
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:

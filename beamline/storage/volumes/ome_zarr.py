@@ -1,7 +1,7 @@
 """OME-Zarr 0.5: a folder with the volume in several scales, each in raw chunks, for viewers that load what they show.
 
 A Zarr 3 array without a compressor is a zarr.json and a file for each chunk with its voxels in order (Zarr core 3.0,
-zarr-specs.readthedocs.io), which is written here; the axes and scales are those of ngff.openmicroscopy.org/0.5.
+zarr-specs.readthedocs.io). It is written here; the axes and scales are those of ngff.openmicroscopy.org/0.5.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
+from beamline.storage.volumes.registry import REGISTRY
 from beamline.storage.writers.recon_file import ReconRecord
 
 _CHUNK = 16, 256, 256  # voxels
@@ -33,7 +34,7 @@ class OmeZarr:
     """OME-Zarr; every scale halves the one before by means of 2 x 2 x 2; the facts are JSON in `splatline`."""
 
     name: str = "OME-Zarr"
-    suffixes: tuple[str, ...] = (".zarr",)
+    suffixes: tuple[str, ...] = REGISTRY["ome_zarr"].suffixes
     greys: bool = True
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.volumes.base import Slices, bare_record, facts_of, marked, record_of
+from beamline.storage.volumes.registry import REGISTRY
 from beamline.storage.writers.recon_file import ReconRecord
 
 _TYPES = {32: "float", 16: "uint16", 8: "uint8"}
@@ -25,7 +26,7 @@ class Nrrd:
     """NRRD 4 (teem.sourceforge.net/nrrd/format.html), raw, attached header; the facts are JSON under `splatline`."""
 
     name: str = "NRRD"
-    suffixes: tuple[str, ...] = (".nrrd",)
+    suffixes: tuple[str, ...] = REGISTRY["nrrd"].suffixes
     greys: bool = True
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
@@ -69,7 +70,7 @@ class Npy:
     """NumPy's own format: the voxels and their shape, and nothing else."""
 
     name: str = "npy"
-    suffixes: tuple[str, ...] = (".npy",)
+    suffixes: tuple[str, ...] = REGISTRY["npy"].suffixes
     greys: bool = True
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.storage.readers.tiff import UNREADABLE, VOLUME, Complaints
 from beamline.storage.volumes.base import Slices, facts_of, marked, record_of
+from beamline.storage.volumes.registry import REGISTRY
 from beamline.storage.writers.recon_file import ReconRecord
 
 _CLASSIC = 4_000_000_000  # bytes of voxels that a TIFF with offsets of 32 bits holds; more take a BigTIFF
@@ -24,14 +25,14 @@ _UNITS = {"mm": "mm", "px": "pixel"}  # as ImageJ and OME call them
 
 
 @dataclass(frozen=True)
-class TiffFile:
+class TiffVolume:
     """One TIFF, a hyperstack of ImageJ; from 4 GB on, which ImageJ's own cannot hold, a BigTIFF in the way of OME.
 
     Both say the edges of a voxel in x, y and z; the facts are JSON in ImageJ's `Info` or OME's `Description`.
     """
 
     name: str = "TIFF"
-    suffixes: tuple[str, ...] = (".tif", ".tiff")
+    suffixes: tuple[str, ...] = REGISTRY["tiff"].suffixes
     greys: bool = True
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
@@ -62,11 +63,11 @@ class TiffFile:
 
 
 @dataclass(frozen=True)
-class TiffFolder:
+class TiffFolderVolume:
     """A folder of `slice_00000.tif` and so on; every file has the facts, its own number and how many there are."""
 
     name: str = "folder of TIFFs"
-    suffixes: tuple[str, ...] = ("",)
+    suffixes: tuple[str, ...] = REGISTRY["tiff_folder"].suffixes
     greys: bool = True
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:

@@ -56,8 +56,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """The checkpoint that `write_checkpoint` wrote.
 
     Raises:
-        DataError: there is none, the file is something else, or damaged: its content differs from its digest (files of
-            earlier versions have none).
+        DataError: there is none, the file is something else, or damaged: its content differs from its digest.
     """
     if not path.is_file():
         raise DataError(f"{path} is not there; name a checkpoint that recon --checkpoint has made.")
@@ -72,10 +71,10 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 {name: value_of(node) for name, node in file["made_from"].items()},
                 int(file.attrs["steps"]),
             )
-            digest = file.attrs.get("digest")
+            digest = file.attrs["digest"]
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:  # h5py's
         raise DataError(f"{path} is not a readable checkpoint ({error}); recon --checkpoint makes one.") from error
-    if digest is not None and digest != _digest(kept):
+    if digest != _digest(kept):
         raise DataError(
             f"The checkpoint {path} is damaged: its content is not what was written (its digest differs). Resume from "
             "another, or start anew."

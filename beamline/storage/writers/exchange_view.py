@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.journal import Change, Changes
+from beamline.storage.journal import FileChange, FileChanges
 from beamline.storage.overlay import Overlay
 from beamline.storage.writers import layout
 from drivers.frame import FrameKind
@@ -54,7 +54,7 @@ def has_exchange_view(file: h5py.File) -> bool:
     return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
 
 
-def with_exchange_view(path: Path, changes: Sequence[Change] = ()) -> Changes:
+def with_exchange_view(path: Path, changes: Sequence[FileChange] = ()) -> FileChanges:
     """What has to change in a closed file of a scan, beside other changes, for its /exchange view.
 
     That is the group, which frames do not hang on, and the head; all else is added at the end.

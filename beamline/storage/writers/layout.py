@@ -18,9 +18,9 @@
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
 image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind. image_key_control (a link to it),
-field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo, without which its
-programs (nabu) take a file for one of another kind, or leave out its darks and flats.
-Float frames are no NXtomo (its data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
+field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo. Without them its
+programs (nabu) take a file for one of another kind, or leave out its darks and flats. Float frames are no NXtomo (its
+data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from beamline.core.version import version
 from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
+from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
 from drivers.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -197,8 +198,8 @@ def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
     columns = {}
     for path in (*RECORDED, RECORD_CHECKSUM):
         column = file[path]
-        if len(column) < end:  # HDF5 2.0 reads wrong values where a dataset is refreshed that is open twice
-            column.refresh()
+        if len(column) < end:  # a reader has some of them open already, see look_again
+            hdf5.look_again(column)
         columns[path] = column[first:end]
         if columns[path].shape != (end - first,) or column.dtype != COLUMNS[path][0]:
             raise ValueError(f"{path} is {column.dtype} {column.shape}, expected {COLUMNS[path][0]} of {end} rows")

@@ -1,7 +1,7 @@
 """NXtomoWriter: a scan's file while it grows, in a state that a reader can trust after every frame.
 
-The file is written SWMR (single writer, multiple readers): what was flushed can be read by others at once, and
-survives the death of this process; every second it is brought to the disk (fsync), where it survives a loss of power.
+The file is written SWMR (single writer, multiple readers). Others can read flushed frames at once, and these survive
+the death of this process. Every second they are brought to the disk (fsync), where they survive a loss of power.
 `frames_committed` is advanced last, so that it never counts half a row.
 """
 
@@ -118,8 +118,8 @@ class NXtomoWriter:
     def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
         """Write the next row; `frame.index` must be `rows`. `flags`: what the monitor found, in rows before it too.
 
-        DataError for a wrong shape, type or index (nothing is written), or a disk that does not take it (the frames
-        before stay readable; nothing more can be appended).
+        DataError for a wrong shape, type or index; nothing is written then. Also for a disk that does not take the
+        frame; the frames before stay readable, and nothing more can be appended.
         """
         self._check(frame, digest)
         record = layout.Record(
@@ -180,7 +180,7 @@ class NXtomoWriter:
         DataError where the disk does not take it; the frames committed stay readable.
         """
         if status not in STATUSES:
-            raise ValueError(f"Status {status!r} is none of {', '.join(STATUSES)}.")
+            raise ValueError(f"Status {status!r} is not known; expected {', '.join(STATUSES)}.")
         if not self._open:
             return
         self._open = False
@@ -268,6 +268,12 @@ class NXtomoWriter:
 
     def _put_exchange_view(self) -> None:
         """The only thing that SWMR writing cannot do, since it creates datasets: the frames do not hang on it."""
+        if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the view off when that is closed
+            self.remarks.append(
+                f"{self.path} has no /exchange view, as this program has the file open by h5py. Close it there, then "
+                "`beamline recover` adds the view."
+            )
+            return
         try:
             with_exchange_view(self.path).carry_out()
         except DataError as error:

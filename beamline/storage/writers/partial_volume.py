@@ -1,7 +1,7 @@
 """Partial volumes: the slabs of a volume that are finished, in a file that stays readable however its writer ends.
 
 An NXtomoproc file whose places are all allocated when it is made, and written through memory maps, so that nothing of
-its structure changes later. Slices that two slabs share are kept beside while one of them is added: a slab that was
+its structure changes later. Slices that two slabs share are kept beside while one of them is added. A slab that was
 added by half is taken out again when the file is opened.
 """
 
@@ -39,7 +39,7 @@ _MISSING, _ADDING, _DONE = range(3)
 
 @dataclass(frozen=True, eq=False)
 class PartialVolume:
-    """A volume of which some slabs are finished; nobody else opens it so while this value lives.
+    """A volume with some finished slabs; nobody else opens it so while this value lives.
 
     Attributes:
         slabs: all of them.

@@ -24,6 +24,11 @@ from recon.base.volume import Grid, Volume
 DEFINITION = "NXtomoproc"
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
+_UNITS_OF_MODEL = {
+    "centres": "length", "widths": "length", "densities": "1/length", "density_unit": "1/length",
+    "pixel_pitch": "length", "source_distances": "length", "view_angles": "rad", "view_roll": "rad", "view_tilt": "rad",
+    "view_shifts": "px", "axis": "px",
+}  # fmt: skip
 Value = str | int | float | bool | NDArray[Any]
 
 
@@ -40,6 +45,7 @@ class ReconRecord:
         parameters: every setting used, by name; numbers, strings and arrays.
         metrics: figures of merit, by name.
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
+        model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
     """
 
     volume: Volume
@@ -51,6 +57,7 @@ class ReconRecord:
     parameters: Mapping[str, Value]
     metrics: Mapping[str, float] = field(default_factory=dict)
     history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    model: Mapping[str, Any] = field(default_factory=dict)
 
 
 def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
@@ -120,10 +127,15 @@ def _write_facts(entry: h5py.Group, record: ReconRecord) -> None:
     parameters["raw_file"] = record.raw_file
     for name, value in record.parameters.items():
         parameters[name] = value
-    for group, values in (("metrics", record.metrics), ("history", record.history)):
+    groups: dict[str, Mapping[str, Any]] = {"metrics": record.metrics, "history": record.history}
+    if record.model:
+        groups["gaussians"] = record.model
+    for group, values in groups.items():
         node = _group(process, group, "NXcollection")
         for name, value in values.items():
             node[name] = value
+    for name, unit in _UNITS_OF_MODEL.items() if record.model else ():
+        process["gaussians"][name].attrs["units"] = unit.replace("length", record.length_unit)
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
@@ -180,6 +192,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         parameters=parameters,
         metrics={name: float(node[()]) for name, node in process["metrics"].items()},
         history={name: np.asarray(node[()]) for name, node in process["history"].items()},
+        model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
     )
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from contextlib import closing
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from drivers.clock import Clock
-from drivers.protocols import RotationStage, StageLimits
+from drivers.protocols import StageLimits
 from drivers.stages.pi_gcs.train import FirstPulse
 from drivers.stages.settings import StageFigures, Wiring, key
 
@@ -80,16 +78,3 @@ class PiGcsSettings:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
         run_up = 1 if self.first_pulse is FirstPulse.STEP_AFTER else 0
         return figures.limits(figures.acceleration, 2 * self.firmware_pulse, run_up=run_up)
-
-    def connect(self, url: str, clock: Clock) -> RotationStage:
-        from drivers.stages.pi_gcs.stage import PiGcsStage
-
-        return PiGcsStage(url, self, clock)
-
-    def halt(self, url: str, clock: Clock) -> None:
-        """As `drivers.stages.settings.StageSettings` has it."""
-        from drivers.stages.pi_gcs.axis import STOP_ALL
-        from drivers.stages.pi_gcs.line import GcsLine
-
-        with closing(GcsLine(url, self.axis, self.wiring, clock, "stage")) as line:
-            line.stop(STOP_ALL)

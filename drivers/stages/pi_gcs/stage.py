@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from fractions import Fraction
 
 from drivers.clock import Clock
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pi_gcs.axis import AxisStatus, PiGcsAxis
+from drivers.stages.pi_gcs.axis import STOP_ALL, AxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
@@ -38,6 +38,8 @@ class PiGcsStage:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
+    Settings = PiGcsSettings
+
     def __init__(self, url: str, settings: PiGcsSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
         self._clock, self._url, self._settings = clock, url, settings
@@ -56,6 +58,12 @@ class PiGcsStage:
         except BaseException:
             self.close()
             raise
+
+    @staticmethod
+    def halt(url: str, settings: PiGcsSettings, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageDriver` has it."""
+        with closing(GcsLine(url, settings.axis, settings.wiring, clock, "stage")) as line:
+            line.stop(STOP_ALL)
 
     @property
     def limits(self) -> StageLimits:

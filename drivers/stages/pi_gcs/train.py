@@ -32,7 +32,7 @@ class FirstPulse(StrEnum):
 
 @dataclass(frozen=True)
 class TriggerWindow:
-    """In counts: the distance of pulses, where the window begins (which the stage must stand before) and ends; and how
+    """In counts: the distance of pulses, where the window begins and ends. The stage must stand before it. Then how
     much of a count a step may be wrong, as it adds up over the train."""
 
     step: Fraction
@@ -62,8 +62,8 @@ def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
 
 
 def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
-    """Whether a move from `here` to `target` (counts) must not find the train armed: it was emitted, and passing it
-    again would emit it again; or it has begun, and on the way back pulses would come too."""
+    """Whether the train must be disarmed for a move from `here` to `target` (counts). It was emitted, and passing it
+    again would emit it again. Or it has begun, and pulses would come on the way back too."""
     sign = 1 if train.interval > 0 else -1
     started, passed = sign * (here - train.start) >= 0, sign * (here - train.end) >= 0
     return passed or (started and sign * (target - here) < 0)

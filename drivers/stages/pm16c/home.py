@@ -1,7 +1,7 @@
 """The PM16C's search for its home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
 
 Taken from memory and to be checked at an instrument: the direction of the search and the switch's kind are set on the
-controller's panel; the speed is the selected one; a search that has found the switch may end some counts beyond it.
+controller's panel. The speed is the selected one. A search that has found the switch may end some counts beyond it.
 """
 
 from __future__ import annotations

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from contextlib import closing
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from drivers.clock import Clock
-from drivers.protocols import RotationStage, StageLimits
+from drivers.protocols import StageLimits
 from drivers.stages.pm16c.train import FirstPulse, PulseWidths
 from drivers.stages.settings import StageFigures, Wiring, key
 
@@ -110,15 +108,3 @@ class PM16CSettings:
         acceleration = 1e6 / RATES[self.rate_code] * radians
         run_up = 1 if self.first_pulse is FirstPulse.INTERVAL_AFTER else 0
         return figures.limits(acceleration, self.widths.spacing, run_up=run_up)
-
-    def connect(self, url: str, clock: Clock) -> RotationStage:
-        from drivers.stages.pm16c.stage import PM16CStage
-
-        return PM16CStage(url, self, clock)
-
-    def halt(self, url: str, clock: Clock) -> None:
-        """As `drivers.stages.settings.StageSettings` has it."""
-        from drivers.stages.pm16c.channel import PM16CChannel
-
-        with closing(PM16CChannel(url, self.channel, self.wiring, clock, "stage")) as channel:
-            channel.slow_stop()

@@ -34,6 +34,8 @@ class PM16CStage:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
+    Settings = PM16CSettings
+
     def __init__(self, url: str, settings: PM16CSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
         self._clock, self._url, self._settings = clock, url, settings
@@ -52,6 +54,12 @@ class PM16CStage:
         except BaseException:
             self.close()
             raise
+
+    @staticmethod
+    def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageDriver` has it."""
+        with contextlib.closing(PM16CChannel(url, settings.channel, settings.wiring, clock, "stage")) as channel:
+            channel.slow_stop()
 
     @property
     def limits(self) -> StageLimits:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from contextlib import closing
 from dataclasses import dataclass, field
 
-from drivers.clock import Clock
-from drivers.protocols import RotationStage, StageLimits
+from drivers.protocols import StageLimits
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.zaber.train import PulseSettings, TriggerUse
 
@@ -89,15 +87,3 @@ class ZaberSettings:
         _, steepest = self.native_limits
         acceleration = steepest * 1e4 / self.speed_unit * 2 * math.pi / figures.counts_per_turn
         return figures.limits(acceleration, pulses.spacing, interval_unit=2 if pulses.width is None else 1)
-
-    def connect(self, url: str, clock: Clock) -> RotationStage:
-        from drivers.stages.zaber.stage import ZaberStage
-
-        return ZaberStage(url, self, clock)
-
-    def halt(self, url: str, clock: Clock) -> None:
-        """As `drivers.stages.settings.StageSettings` has it."""
-        from drivers.stages.zaber.axis import ZaberAxis
-
-        with closing(ZaberAxis(url, self, clock, "stage")) as axis:
-            axis.stop("stop")

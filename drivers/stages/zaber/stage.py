@@ -31,7 +31,7 @@ class ZaberStage:
 
     `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
     move against a train under way ends the train: the controller counts distance both ways. Where triggers are not
-    `chained`, `arm` itself turns the stage to one step before the first pulse and waits; it then speeds up over the
+    `chained`, `arm` itself turns the stage to one step before the first pulse and waits. It then speeds up over the
     first pulses.
 
     Args:
@@ -40,6 +40,8 @@ class ZaberStage:
     Raises:
         DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
+
+    Settings = ZaberSettings
 
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str = "stage") -> None:
         self.name = name
@@ -62,6 +64,12 @@ class ZaberStage:
             self.close()
             raise
         self._travel = Travel(name, replace(settings.limits(), trigger_output=self._identity.has_triggers))
+
+    @staticmethod
+    def halt(url: str, settings: ZaberSettings, clock: Clock) -> None:
+        """As `drivers.stages.settings.StageDriver` has it."""
+        with contextlib.closing(ZaberAxis(url, settings, clock, "stage")) as axis:
+            axis.stop("stop")
 
     @property
     def limits(self) -> StageLimits:

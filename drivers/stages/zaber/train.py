@@ -1,7 +1,7 @@
 """A pulse train as Zaber triggers: one fires once, at the right place, and enables another that counts distance there.
 
-The starter fires one step before the first pulse, the repeater then each step: so the stage may stand anywhere before
-the train, and the time that firmware needs to act (0.1 to 1 ms, undocumented) delays all pulses alike. Where the stage
+The starter fires one step before the first pulse, the repeater then each step. So the stage may stand anywhere before
+the train. The time that firmware needs to act (0.1 to 1 ms, undocumented) delays all pulses alike. Where the stage
 stands within that step already, the starter gives the first pulse itself. Where an action cannot enable a trigger
 (`chained` false), the repeater alone gives the train; then the stage must stand one step before the first pulse.
 """

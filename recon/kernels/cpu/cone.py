@@ -1,9 +1,9 @@
 """Cone-beam projector and its adjoint: Joseph's interpolation, the detector's rows fastest (numba, threaded).
 
 All rays to one column of the detector lie in one plane parallel to the rotation axis, so they share their path in x and
-y; in every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is
-sampled once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row]; the table of rays is that
-of `cpu.joseph`. The transpose reads the same weights and runs plane by plane: no two threads write to one voxel.
+y. In every plane of voxels that they cross, the detector's rows meet a line of slices at equal steps. A ray is sampled
+once in each plane, bilinearly. Volumes are [y, x, z], projections [view, col, row]; the table of rays is that of
+`cpu.joseph`. The transpose reads the same weights and runs plane by plane: no two threads write to one voxel.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
 from recon.kernels.cpu.activation import F32, OPTIONS
-from recon.kernels.cpu.joseph import F64, Flags, shares
+from recon.kernels.cpu.joseph import CALL, F64, Flags, calls, shares
 
 _f = np.float32
 _PAD = 2  # zeros at both ends of a line of slices
@@ -35,12 +35,12 @@ def _rows(height, climb, middle, n, rows):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def _forward(
     lines: F32, shape: tuple[int, int], rays: F64, steep: Flags, middles: F64, height: float, pitch: float,
-    group: int, out: F32,
+    group: int, start: int, end: int, out: F32,
 ) -> None:  # fmt: skip
+    """Groups of views start to end."""
     nz = lines.shape[1]
     views, cols, rows = out.shape
-    groups = (views + group - 1) // group
-    for job in prange(groups):
+    for job in prange(start, end):
         v0 = job * group
         v1 = min(views, v0 + group)
         out[v0:v1] = _f(0)
@@ -101,50 +101,51 @@ def _weigh(projections: F32, rays: F64, middles: F64, pitch: float, out: F32) ->
 
 @njit(**OPTIONS)
 def _adjoint(
-    weighed: F32, rays: F64, steep: Flags, middles: F64, height: float, shape: tuple[int, int], lines: F32
-) -> None:
+    weighed: F32, rays: F64, steep: Flags, middles: F64, height: float, shape: tuple[int, int], axis: int, start: int,
+    end: int, lines: F32,
+) -> None:  # fmt: skip
+    """Planes start to end across one axis; those across axis 0 come first, and overwrite."""
     nz = lines.shape[1]
     views, cols, rows = weighed.shape
-    for axis in range(2):
-        planes, n = shape[axis], shape[1 - axis]
-        plane_stride, line_stride = (shape[1], 1) if axis == 0 else (1, shape[1])
-        for j in prange(planes):
-            first = j * plane_stride
-            if axis == 0:
-                lines[first : first + n] = _f(0)
-            padded = np.zeros(nz + 2 * _PAD + 1, np.float32)
-            line = padded[_PAD : _PAD + nz]
-            for v in range(views):
-                for col in range(cols):
-                    if steep[v, col] == axis:
-                        continue
-                    at = rays[v, col, 0] + rays[v, col, 1] * j
-                    if not (at > -1.0 and at < n):
-                        continue
-                    climb = rays[v, col, 2] + rays[v, col, 3] * j
-                    row0, row1 = _rows(height, climb, middles[v], nz, rows)
-                    if row1 <= row0:
-                        continue
-                    base = height + climb * (row0 - middles[v]) + _PAD
-                    source = weighed[v, col, row0:row1]
-                    padded[:] = _f(0)
-                    for row in range(row1 - row0):
-                        level = base + climb * row
-                        k = np.uint32(level)
-                        up = _f(level - k) * source[row]
-                        padded[k] += source[row] - up
-                        padded[k + np.uint32(1)] += up
-                    low = math.floor(at)
-                    high_part = _f(at - low)
-                    low_part = _f(1) - high_part
-                    if low >= 0:
-                        target = lines[first + low * line_stride]
-                        for z in range(nz):
-                            target[z] += low_part * line[z]
-                    if low + 1 < n:
-                        target = lines[first + (low + 1) * line_stride]
-                        for z in range(nz):
-                            target[z] += high_part * line[z]
+    n = shape[1 - axis]
+    plane_stride, line_stride = (shape[1], 1) if axis == 0 else (1, shape[1])
+    for j in prange(start, end):
+        first = j * plane_stride
+        if axis == 0:
+            lines[first : first + n] = _f(0)
+        padded = np.zeros(nz + 2 * _PAD + 1, np.float32)
+        line = padded[_PAD : _PAD + nz]
+        for v in range(views):
+            for col in range(cols):
+                if steep[v, col] == axis:
+                    continue
+                at = rays[v, col, 0] + rays[v, col, 1] * j
+                if not (at > -1.0 and at < n):
+                    continue
+                climb = rays[v, col, 2] + rays[v, col, 3] * j
+                row0, row1 = _rows(height, climb, middles[v], nz, rows)
+                if row1 <= row0:
+                    continue
+                base = height + climb * (row0 - middles[v]) + _PAD
+                source = weighed[v, col, row0:row1]
+                padded[:] = _f(0)
+                for row in range(row1 - row0):
+                    level = base + climb * row
+                    k = np.uint32(level)
+                    up = _f(level - k) * source[row]
+                    padded[k] += source[row] - up
+                    padded[k + np.uint32(1)] += up
+                low = math.floor(at)
+                high_part = _f(at - low)
+                low_part = _f(1) - high_part
+                if low >= 0:
+                    target = lines[first + low * line_stride]
+                    for z in range(nz):
+                        target[z] += low_part * line[z]
+                if low + 1 < n:
+                    target = lines[first + (low + 1) * line_stride]
+                    for z in range(nz):
+                        target[z] += high_part * line[z]
 
 
 def forward(
@@ -158,9 +159,11 @@ def forward(
         height: slice at z = 0.
         pitch: detector pixel, mm.
     """
-    group, _ = shares(out.shape[0], 1)
-    lines = volume.reshape(-1, volume.shape[2])
-    _forward(lines, volume.shape[:2], rays, steep, middles, height, pitch, group, out)
+    (views, cols, rows), lines = out.shape, volume.reshape(-1, volume.shape[2])
+    samples = cols * rows * min(volume.shape[:2])
+    group = max(1, min(shares(views, 1)[0], CALL // max(samples * get_num_threads(), 1)))
+    for part in calls(-(-views // group), group * samples):
+        _forward(lines, volume.shape[:2], rays, steep, middles, height, pitch, group, part.start, part.stop, out)
 
 
 def adjoint(
@@ -172,4 +175,7 @@ def adjoint(
     """
     weighed = np.empty_like(projections)
     _weigh(projections, rays, middles, pitch, weighed)
-    _adjoint(weighed, rays, steep, middles, height, out.shape[:2], out.reshape(-1, out.shape[2]))
+    shape, lines = out.shape[:2], out.reshape(-1, out.shape[2])
+    for axis in range(2):
+        for part in calls(shape[axis], projections.size):
+            _adjoint(weighed, rays, steep, middles, height, shape, axis, part.start, part.stop, lines)

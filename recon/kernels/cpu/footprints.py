@@ -1,7 +1,7 @@
 """Footprints of Gaussians on the detector, and gradients back: exact for a parallel beam, affine for a cone (numba).
 
-A ray through the centre t = (tx, ty, tz) of a Gaussian, in the axes (u, v, d) of the view with the source at the
-origin, meets the detector at (ax, ay) = (tx / tz, ty / tz) times the focal length f = sdd / pitch. There the image
+Take a ray through the centre t = (tx, ty, tz) of a Gaussian, in the axes (u, v, d) of the view with the source at the
+origin. It meets the detector at (ax, ay) = (tx / tz, ty / tz) times the focal length f = sdd / pitch. There the image
 moves by the local axes (px per mm, in the object's frame)
 
     Ju = g (u - ax d)        Jv = g (v - ay d)        g = f / tz        ray = ax u + ay v + d
@@ -11,8 +11,8 @@ and a parallel beam is the same with ax = ay = 0, g = 1 / pitch. With a = S Rᵀ
     Σ₂ = [[a·a, a·b], [a·b, b·b]]        det Σ₂ = |a x b|² = (s₁ s₂ s₃ g² |h|)²        μ = sqrt(2π) |ray| / |h|
 
 μ is the central ray's integral sqrt(2π / r̂ᵀΣ⁻¹r̂), equal to the Schur complement's sqrt(2π (f - vᵀΣ₂⁻¹v)) but without
-a subtraction (3DGS's projection, Zwicker et al. 2001, with the factor of Zha et al. 2024). Backward, with the
-moments M of the image gradient under a footprint, in its own directions τ and v (see `cpu.project`):
+a subtraction. (3DGS's projection, Zwicker et al. 2001, with the factor of Zha et al. 2024). Backward, with the moments
+M of the image gradient under a footprint, in its own directions τ and v (see `cpu.project`):
 
     ∂W = M₀,   ∂m = W (k M_τ, l M_v - k r M_τ),   ∂T = W (Σ g D yyᵀ + M₀ hhᵀ / h·h)      W = ρμ
     y = τ A + δv B,   A = (b x h) / (g s₁ s₂ s₃ h·h),   B = l b
@@ -22,12 +22,12 @@ is the gradient on log scales; off it, (s_k / s_j - s_j / s_k) T_jk turns axis j
 that rotation alone: all other components of a gradient on the matrix cancel in the quaternion, and for a needle they
 are aspect² times as large. Gradients on Σ₂ = K⁻¹, as in 3DGS, lose aspect² in accuracy as well.
 
-A cone adds the gradient on the centre through g, ax and ay. These are not clamped: 3DGS clamps them to keep Gaussians
-far off the screen small, which breaks det Σ₂ and the gradient, and moves mass in a wide cone. A Gaussian at or behind
+A cone adds the gradient on the centre through g, ax and ay. These are not clamped. 3DGS clamps them to keep Gaussians
+far off the screen small; that breaks det Σ₂ and the gradient, and moves mass in a wide cone. A Gaussian at or behind
 the source plane has no footprint.
 
-The quadratic form is kept factored, δᵀKδ = k (δu - r δv)² + δv² / Σvv with k = Σvv / det Σ₂ and r = Σuv / Σvv: sums
-of squares stay accurate where the expanded form of a long thin footprint would cancel.
+The quadratic form is kept factored, δᵀKδ = k (δu - r δv)² + δv² / Σvv with k = Σvv / det Σ₂ and r = Σuv / Σvv. Sums of
+squares stay accurate where the expanded form of a long thin footprint would cancel.
 
 The error of the affine approximation is known to first order. The true ray integral differs from it by the factor
 exp((β - α)·δ + δᵀKδ α·δ), with α, β as in `cpu.rays`; over the footprint that is a relative L2 error of
@@ -294,9 +294,10 @@ def footprints(
 ) -> None:
     """Fill table [n, 8]: centre (col, row), k (1/px²), r, 1 / Σvv (1/px²), weight W = ρμ, half widths in px (two).
 
-    Footprints are cut off where they fall below `faint` (in units of the image), and at `cut` standard deviations,
-    those of a compact kernel at its end. Half widths are HIDDEN for a footprint nowhere above `faint`, and INEXACT
-    where a cone's ε is above `exact_above`. A `length` (mm) other than 0 replaces μ: the uncorrected factor.
+    Footprints are cut off where they fall below `faint` (in units of the image). They are also cut off at `cut`
+    standard deviations, those of a compact kernel at its end. Half widths are HIDDEN for a footprint nowhere above
+    `faint`, and INEXACT where a cone's ε is above `exact_above`. A `length` (mm) other than 0 replaces μ: the
+    uncorrected factor.
     """
     fill = _straight_footprints if camera.straight else _footprints
     fill(

@@ -1,10 +1,10 @@
 """Parallel-beam projector and its adjoint: Joseph's interpolation, the slices of a volume fastest (numba, threaded).
 
-A ray is sampled once in every plane of voxels across the axis that is closest to its direction, by linear
-interpolation between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are [y, x, z]
-and projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions read their
-weights from one table of rays, so each is the exact transpose of the other; the transpose runs plane by plane, and no
-two threads write to one voxel.
+A ray is sampled once in every plane of voxels across the axis that is closest to its direction. Samples are
+interpolated linearly between the two nearest lines (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192). Volumes are
+[y, x, z] and projections [view, col, row] here, so one pair of weights serves a whole line of slices. Both directions
+read their weights from one table of rays, so each is the exact transpose of the other. The transpose runs plane by
+plane, and no two threads write to one voxel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Flags = NDArray[np.bool_]
 _f = np.float32
 
 # Columns of the table of rays. A ray crosses plane j at line AT + STEP j, where one detector row is RISE + CLIMB j
-# slices high; it runs PATH mm from plane to plane, and REACH mm from the source to the detector (both in the plane).
+# slices high. It runs PATH mm from plane to plane, and REACH mm from the source to the detector (both in the plane).
 AT, STEP, RISE, CLIMB, PATH, REACH = range(6)
 
 _BLOCK = 64  # slices of one job, at most
@@ -33,6 +33,9 @@ _GROUP = 16  # views that share one pass over the volume
 _TILE = 32  # voxels along each edge of a tile: 74 to 296 KB with its margin
 _EDGE = _TILE + 2
 _FLAT = 1e-9  # lines a plane: such a ray stays on its line
+
+CALL = 2**28
+"""Samples of one call of a kernel, about: between two calls, 0.1 to 0.5 s on two cores, a signal is heard."""
 
 
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
@@ -120,20 +123,23 @@ def _columns(rays, v, low0, low1, j0, j1):  # type: ignore[no-untyped-def]
 
 @njit(inline="always")
 def _tile(axis, y0, y1, x0, x1):  # type: ignore[no-untyped-def]
-    """How rays cross a tile: planes j0..j1 (excluded), lower lines low0..low1 (excluded) of samples that touch it, rows
-    of the tile from plane to plane and from line to line, and the row of the first sample."""
+    """How rays cross a tile. Planes are j0..j1 (excluded), lower lines of samples that touch it low0..low1 (excluded).
+    Then rows of the tile from plane to plane and from line to line, and the row of the first sample."""
     if axis == 0:
         return y0, y1, x0 - 1, x1, _EDGE, 1, _EDGE
     return x0, x1, y0 - 1, y1, 1, _EDGE, 1
 
 
 @njit(**OPTIONS)
-def _forward(volume: F32, rays: F64, steep: Flags, group: int, block: int, out: F32) -> None:
+def _forward(
+    volume: F32, rays: F64, steep: Flags, group: int, block: int, first: int, end: int, out: F32
+) -> None:  # fmt: skip
+    """Jobs first to end, of as many as there are groups of views times blocks of slices."""
     ny, nx, nz = volume.shape
     views, cols, _ = out.shape
     voxels, lines = volume.reshape(ny * nx, nz), out.reshape(views * cols, nz)
-    groups, blocks = (views + group - 1) // group, (nz + block - 1) // block
-    for job in prange(groups * blocks):
+    groups = (views + group - 1) // group
+    for job in prange(first, end):
         z0 = job // groups * block
         z1 = min(nz, z0 + block)
         v0 = job % groups * group
@@ -177,12 +183,13 @@ def _forward(volume: F32, rays: F64, steep: Flags, group: int, block: int, out: 
 
 
 @njit(**OPTIONS)
-def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, volume: F32) -> None:
+def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, end: int, volume: F32) -> None:
+    """Jobs first to end, of as many as there are tiles times blocks of slices."""
     ny, nx, nz = volume.shape
     views, cols, _ = projections.shape
     voxels, lines = volume.reshape(ny * nx, nz), projections.reshape(views * cols, nz)
-    across_y, across_x, blocks = (ny + _TILE - 1) // _TILE, (nx + _TILE - 1) // _TILE, (nz + block - 1) // block
-    for job in prange(across_y * across_x * blocks):
+    across_x, blocks = (nx + _TILE - 1) // _TILE, (nz + block - 1) // block
+    for job in prange(first, end):
         z0 = job % blocks * block
         z1 = min(nz, z0 + block)
         y0, x0 = job // blocks // across_x * _TILE, job // blocks % across_x * _TILE
@@ -225,13 +232,27 @@ def shares(views: int, nz: int) -> tuple[int, int]:
 
 def forward(volume: F32, rays: F64, steep: Flags, out: F32) -> None:
     """Line integrals of volume [y, x, z] into out [view, col, z], in mm times the unit of the volume."""
-    group, block = shares(out.shape[0], out.shape[2])
-    _forward(np.ascontiguousarray(volume), rays, steep, group, _whole_lanes(out.shape[2], block), out)
+    (views, cols, nz), planes = out.shape, min(volume.shape[:2])
+    group, block = shares(views, nz)
+    block, voxels = _whole_lanes(nz, block), np.ascontiguousarray(volume)
+    for part in calls(-(-views // group) * -(-nz // block), min(group, views) * min(block, nz) * cols * planes):
+        _forward(voxels, rays, steep, group, block, part.start, part.stop, out)
 
 
 def adjoint(projections: F32, rays: F64, steep: Flags, out: F32) -> None:
     """The transpose of `forward`: projections [view, col, z] into out [y, x, z] (overwritten)."""
-    _adjoint(np.ascontiguousarray(projections), rays, steep, _whole_lanes(out.shape[2], _BLOCK), out)
+    (ny, nx, nz), views = out.shape, projections.shape[0]
+    block, lines = _whole_lanes(nz, _BLOCK), np.ascontiguousarray(projections)
+    jobs = -(-ny // _TILE) * -(-nx // _TILE) * -(-nz // block)
+    for part in calls(jobs, views * _TILE**2 * min(block, nz)):
+        _adjoint(lines, rays, steep, block, part.start, part.stop, out)
+
+
+def calls(jobs: int, samples: int) -> list[range]:
+    """The jobs of so many samples each, in calls of about `CALL`: as many at least as all threads take, evenly."""
+    threads = get_num_threads()
+    most = max(threads, CALL // max(samples, 1) // threads * threads)
+    return [range(first, min(first + most, jobs)) for first in range(0, jobs, most)]
 
 
 def _whole_lanes(nz: int, most: int) -> int:

@@ -179,8 +179,8 @@ class ProjectionLoss:
     gradient. Each task takes a few rows and blurs them first down, then along one line that stays in its cache. The
     target's blurred maps do not change during a fit, so they are computed once per view.
 
-    With weights w [row, col] >= 0 it is mean w (D(x, y) + λ (1 - SSIM(m x, m y))), m = 1 where w > 0 and 0 elsewhere:
-    for SSIM's windows a pixel of weight 0 counts as outside the image, and its gradient is exactly 0. The mean is over
+    With weights w [row, col] >= 0 it is mean w (D(x, y) + λ (1 - SSIM(m x, m y))), m = 1 where w > 0 and 0 elsewhere.
+    For SSIM's windows a pixel of weight 0 counts as outside the image, and its gradient is exactly 0. The mean is over
     all pixels, so that a ray has the same influence in a masked view as in a complete one.
     """
 

@@ -4,7 +4,7 @@
     M₀ = Σ g G,   M₁ = Σ g D ε,   M₂ = Σ g D εεᵀ,   ε = (τ, δv),   D = ∂G / ∂E, which is G itself for a Gaussian
 
 with δ the offset in pixels and g the gradient of the image: every Gaussian gathers its own gradient, without atomics. τ
-is the offset along a row from the axis of a slanted footprint; in moments of δ itself the thin side of a needle would
+is the offset along a row from the axis of a slanted footprint. In moments of δ itself the thin side of a needle would
 be a small difference of large sums.
 
 E is a parabola along a column, so G follows from the row above by two products, with factors that are the exponentials
@@ -14,14 +14,14 @@ of E's first and second difference:
     Q(δv + 1) = Q(δv) q,       ln q = 2 (k r² + l)
 
 Errors grow with the rows, so G is computed directly after every `ANCHOR` rows. A long slanted footprint may start so
-far down its flank that float32 underflows: where the first row would begin below exp(-DEEPEST), every pixel gets an
-exponential of its own, in the few columns of each row that lie within the footprint.
+far down its flank that float32 underflows: where the first row would begin below exp(-DEEPEST), every pixel within the
+footprint gets an exponential of its own.
 
 A compact kernel (`recon.base.kernel`) has G = t^p with t = (1 + 2 E / R²)₊ and D = 2 p / R² t^(p - 1): p = 2 in an
 image, p = 3/2 in a slice of voxels. It needs no exponential: t follows from the row above by two sums.
 
 Images are summed over threads in a fixed order: the result is equal to the bit for the same number of threads, and
-equal up to rounding for another. Each thread sums in two levels, `MANY` footprints and then these sums: adding equal
+equal up to rounding for another. Each thread sums in two levels, `MANY` footprints and then these sums. Adding equal
 float32 numbers one by one loses a part that grows with their number (half a percent for a million).
 """
 

@@ -5,7 +5,7 @@ With H = S⁻¹Rᵀ, t from the source to the centre and D along the ray of a pi
     V = ρ sqrt(2π) |D| / |H D| exp(-1/2 |H t x H D|² / |H D|²)
 
 Measured in the offset δ of the pixel from the centre's, that is the affine footprint with three numbers more. Taken to
-the depth of the centre, H D = e + y with e = H t and y linear in δ; the part of y across e is what the footprint's
+the depth of the centre, H D = e + y with e = H t and y linear in δ. The part of y across e is what the footprint's
 quadratic form N = δᵀKδ measures, its part along e is α·δ. So
 
     V = W (|D| / |D₀|) / sqrt(Q) exp(-1/2 N / Q),   Q = (1 + α·δ)² + η N,   η = 1 / |e|²,   α = η (e·Hu, e·Hv) tz / f

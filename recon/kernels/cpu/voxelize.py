@@ -11,7 +11,7 @@ A compact kernel is t^(3/2), t = 1 + 2 E / R²: with t_z that of δz alone, the 
 and l / t_z with weight t_z^(3/2).
 
 The gradient needs per Gaussian N₀ = Σ g G, N₁ = Σ g D ε and N₂ = Σ g D εεᵀ with D as in `cpu.project` and
-ε = (τ, δy', δz): δz is measured from the Gaussian's centre, τ and δy' from the centre of its footprint in the slice. In
+ε = (τ, δy', δz). δz is measured from the Gaussian's centre, τ and δy' from the centre of its footprint in the slice. In
 the Gaussian's axes and standard deviations
 
     y = τ A + δy' B + δz C,   A = H e_x,   B = (c x A) sqrt(l) / |c x A|,   C = c / Σzz,   H = S⁻¹ Rᵀ per voxel
@@ -41,8 +41,8 @@ _f = np.float32
 _SLAB = 4  # slices a task: few enough to give all threads work on a 32-voxel cube, enough to keep rows in the cache
 _TASK = 1024  # Gaussians a task of the search
 _SHARE = 16  # Gaussians a task of the backward pass
-# Columns of the table, besides K, SHEAR and KV of the footprints: centre, shift of the centre per slice, 1 / Σzz, half
-# widths of the middle slice over the reach, reach in standard deviations.
+# Columns of the table, besides K, SHEAR and KV of the footprints. They are centre, shift of the centre per slice, 1 /
+# Σzz, half widths of the middle slice over the reach, reach in standard deviations.
 _X, _Y, _Z, _DRIFT_X, _DRIFT_Y, _KZ, _WIDE_X, _WIDE_Y, _REACH = 0, 1, 5, 6, 7, 8, 9, 10, 11
 _FARTHEST = 1e30  # keeps float32 from infinity
 _PER = np.float32(1 / Kernel.COMPACT.radius**2)
@@ -266,8 +266,8 @@ class Layout:
     ) -> None:
         """`origin` is the centre (x, y, z) of voxel [0, 0, 0] in mm, `spacing` the voxels' edge or edges (z, y, x).
 
-        Gaussians are cut off where they fall below `faint` (a density), and at `cut` standard deviations; compact
-        kernels at their own end, if they are above `faint` anywhere.
+        Gaussians are cut off where they fall below `faint` (a density). They are also cut off at `cut` standard
+        deviations; compact kernels at their own end, if they are above `faint` anywhere.
         """
         n, cut = densities.shape[0], kernel.reach(cut)
         self.parameters, self.shape, self._kernel = (means, scales, rotations, densities), shape, kernel

@@ -1,7 +1,7 @@
 """Triton kernels for CUDA devices: the same operations as the CPU kernels; imported only if a GPU is used.
 
-They work on contiguous float32 torch tensors. Sums are gathered, never scattered: an image tile or a brick of voxels
-sums the Gaussians on its list, a Gaussian sums the gradient under it, so there are no atomics and the same input gives
+They work on contiguous float32 torch tensors. Sums are gathered, never scattered. An image tile or a brick of voxels
+sums the Gaussians on its list; a Gaussian sums the gradient under it. So there are no atomics, and the same input gives
 the same bits. With TRITON_INTERPRET=1 in the environment, before the first import, the same kernels run on the CPU,
 slowly, for tests.
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Self
@@ -12,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import difference_weights
-from recon.voxels.voxel_problem import VoxelProblem, density_unit, iteration_trials, iterative_memory
+from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -28,20 +27,19 @@ F32 = NDArray[np.float32]
 class AsdPocs:
     """Adaptive steepest descent of TV between projections onto the data (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
-    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep was;
-    steps shrink by `alpha_decay` where they undo more than `ratio` of the sweep while the data are not yet explained to
+    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep was.
+    Steps shrink by `alpha_decay` where they undo more than `ratio` of the sweep while the data are not yet explained to
     `goal`. Memory: 5 volumes, 3 x the projections.
 
     Attributes:
-        goal: ||A x - p|| / ||p|| to be reached; None: 0.15 of that of filtered back-projection (FBP or FDK), or, for
-            views that it does not take (a cone's short scan), of a sweep of ordered-subset SIRT, which has about
-            the same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
+        goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
+            cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. That has about the
+            same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
         allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "asd-pocs"
     label: ClassVar[str] = "ASD-POCS"
-    colour: ClassVar[str] = "tab:purple"
     traits: ClassVar[Traits] = Traits(halo=8)
 
     iterations: int = 10
@@ -94,15 +92,8 @@ class AsdPocs:
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return iteration_trials({"quick": (10,), "full": (5, 20, 50)}[depth])
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 5.1, 7.8, 4.1 * weighted, filtered=True)
-
-    def work(self, n_views: int, binning: int) -> float:
-        return n_views * self.iterations / binning**3
 
 
 def _share(step: float, norm: float) -> float:

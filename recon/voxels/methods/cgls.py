@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import truediv
@@ -14,12 +13,12 @@ from numpy.typing import NDArray
 
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import VoxelProblem, iteration_trials, iterative_memory
+from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -37,7 +36,6 @@ class Cgls:
 
     name: ClassVar[str] = "cgls"
     label: ClassVar[str] = "CGLS"
-    colour: ClassVar[str] = "tab:cyan"
     traits: ClassVar[Traits] = Traits()
 
     iterations: int = 10
@@ -78,15 +76,8 @@ class Cgls:
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return iteration_trials({"quick": (5, 15), "full": (5, 10, 20, 40)}[depth])
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)
-
-    def work(self, n_views: int, binning: int) -> float:
-        return n_views * self.iterations / binning**3
 
 
 def _weighed_adjoint(projector: Projector, rays: F32, weight: F32 | None, out: F32 | None = None) -> F32:

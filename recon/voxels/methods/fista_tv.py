@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
@@ -21,7 +20,6 @@ from recon.voxels.sweeps import interleaved
 from recon.voxels.voxel_problem import (
     VoxelProblem,
     density_unit,
-    iteration_trials,
     iterative_memory,
     largest_eigenvalue,
 )
@@ -45,7 +43,6 @@ class FistaTv:
 
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
-    colour: ClassVar[str] = "tab:red"
     traits: ClassVar[Traits] = Traits(budget=True, halo=12)
 
     iterations: int = 20
@@ -84,12 +81,5 @@ class FistaTv:
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return iteration_trials({"quick": (5, 20), "full": (5, 10, 20, 40)}[depth])
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 7.3, 3.0, 4.8 * weighted, filtered=True)
-
-    def work(self, n_views: int, binning: int) -> float:
-        return n_views * self.iterations / binning**3

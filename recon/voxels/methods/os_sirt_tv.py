@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Self
@@ -12,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
-from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iteration_trials, iterative_memory
+from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -29,7 +28,7 @@ class OsSirtTv:
     """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
 
     Attributes:
-        tv_weight: None chooses it by the noise of the data and goes on doing so, see `NoiseBalance`; a number is the
+        tv_weight: None chooses it by the noise of the data during the iterations, see `NoiseBalance`; a number is the
             threshold of that step in density units.
         momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
             167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
@@ -39,7 +38,6 @@ class OsSirtTv:
 
     name: ClassVar[str] = "os-sirt-tv"
     label: ClassVar[str] = "OS-SIRT-TV"
-    colour: ClassVar[str] = "tab:orange"
     traits: ClassVar[Traits] = Traits(budget=True, halo=20)
 
     iterations: int = 40
@@ -86,12 +84,5 @@ class OsSirtTv:
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return iteration_trials({"quick": (5, 15), "full": (5, 10, 20, 40)}[depth])
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 8.1 + 2 * self.momentum, 5.2, 8.2 * weighted, filtered=True)
-
-    def work(self, n_views: int, binning: int) -> float:
-        return n_views * self.iterations / binning**3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
@@ -11,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.method import Depth, MethodResult, ReconProblem, RunControl, Traits, TrialSettings
+from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
-from recon.voxels.voxel_problem import VoxelProblem, iteration_trials, iterative_memory
+from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
 
 F32 = NDArray[np.float32]
 
@@ -31,7 +30,6 @@ class Sart:
 
     name: ClassVar[str] = "sart"
     label: ClassVar[str] = "SART"
-    colour: ClassVar[str] = "tab:olive"
     traits: ClassVar[Traits] = Traits()
 
     iterations: int = 20
@@ -55,12 +53,5 @@ class Sart:
     def toy(self) -> Self:
         return replace(self, iterations=1)
 
-    @classmethod
-    def trials(cls, gaussians: int, depth: Depth) -> Sequence[TrialSettings]:
-        return iteration_trials({"quick": (2, 6), "full": (1, 3, 10, 30)}[depth])
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.5, 6.6, 4.1 * weighted)
-
-    def work(self, n_views: int, binning: int) -> float:
-        return n_views * self.iterations / binning**3

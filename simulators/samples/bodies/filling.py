@@ -46,15 +46,11 @@ def add_attenuation(p: Packed, corner: Triple, edges: Triple, supersample: int, 
 
 @njit(**_KERNEL)
 def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Triple, out: NDArray[np.uint8]) -> None:
-    """Write label[solid] where a voxel's centre lies in a solid; later ones replace earlier ones, and a tube's bore
-    is not part of it.
+    """Write label[solid] where a voxel's centre lies in a solid; later ones replace earlier ones.
 
     `out` is uint8 [z, y, x]; corner and edges as for add_attenuation.
     """
     for b in range(p.kind.size):
-        bore, value = p.bore[b], label[p.owner[b]]
-        if bore == -2:
-            continue
         k0, k1, j0, j1 = _box(p, b, corner, edges, out.shape)
         left = corner[2] - p.centre[b, 0]
         for k in range(k0, k1):
@@ -62,14 +58,7 @@ def put_labels(p: Packed, label: NDArray[np.uint8], corner: Triple, edges: Tripl
             for j in range(j0, j1):
                 y = corner[1] + j * edges[1] - p.centre[b, 1]
                 first, stop = _line(p, b, y, z, 0.0, left, edges[2], out.shape[2])
-                hole, over = stop, stop
-                if bore >= 0:
-                    hole, over = _line(p, bore, y, z, 0.0, left, edges[2], out.shape[2])
-                    hole, over = (hole, over) if over > hole else (stop, stop)
-                for i in range(first, min(hole, stop)):
-                    out[k, j, i] = value
-                for i in range(max(over, first), stop):
-                    out[k, j, i] = value
+                out[k, j, first:stop] = label[b]
 
 
 @njit(**_KERNEL)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
-from simulators.samples.bodies import rows
+from simulators.samples.bodies.chords import depths
 from simulators.samples.bodies.filling import add_attenuation, put_labels
 from simulators.samples.bodies.packing import CYLINDER, ELLIPSOID, Packed, pack
 from simulators.samples.bodies.solids import Solid, kind_of
-from simulators.samples.bodies.view import View, view_of
+from simulators.samples.bodies.view import view_of
 
 MOST_NAMES = 255  # labels are uint8, and 0 is air
 
@@ -79,17 +79,8 @@ class Phantom:
         Raises:
             ValueError: a solid that does not lie wholly in front of a cone's source.
         """
-        return rows.depths(self.packed, self._view(angle, detector))
-
-    def counts(
-        self,
-        angle: ArrayLike | Pose,
-        detector: Detector,
-        open_beam: float,
-        rule: Callable[[NDArray[np.float64]], NDArray[np.uint16]],
-    ) -> NDArray[np.uint16]:
-        """See Counted.counts."""
-        return rows.counts(self.packed, self._view(angle, detector), open_beam, rule)
+        pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
+        return depths(self.packed, view_of(self.packed, self.solid_names, pose, detector))
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
         """See Sample.attenuation."""
@@ -98,16 +89,12 @@ class Phantom:
         return out.astype(np.float32)
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
-        """See Sample.labels; where solids overlap, the later one counts; a tube's bore is not part of it."""
+        """See Sample.labels; where solids overlap, the later one counts."""
         out = np.zeros(grid.shape, np.uint8)
         index = {name: i + 1 for i, name in enumerate(self.names)}
         label = np.array([index[name] for name in self.solid_names], dtype=np.uint8)
         put_labels(self.packed, label, *_lattice(grid), out)
         return out
-
-    def _view(self, angle: ArrayLike | Pose, detector: Detector) -> View:
-        pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
-        return view_of(self.packed, self.solid_names, pose, detector)
 
 
 def _lattice(grid: Grid) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

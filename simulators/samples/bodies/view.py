@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from simulators.frame.detector import Detector
@@ -28,10 +27,9 @@ class View(NamedTuple):
         sod: mm, infinite in a parallel beam.
         axes: float64 [pose, 3, 3] and
         origin: float64 [pose, 3], see Pose.frames; one pose for the frame, or one a row.
-        upright: parallel beam and the sample's z is the laboratory's v: a cylinder's shadow is the same in all rows.
+        upright: parallel beam and the sample's z is the laboratory's v.
         first: int64 [row + 1]; the bodies first[j] to first[j + 1] of the next may shadow row j.
         bodies: int64, in their order.
-        first_round, round: the same for upright cylinders, which are in `bodies` where the view is not upright.
     """
 
     u: Reals
@@ -43,8 +41,6 @@ class View(NamedTuple):
     upright: bool
     first: Wholes
     bodies: Wholes
-    first_round: Wholes
-    round: Wholes
 
 
 def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> View:
@@ -73,11 +69,9 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
     above = np.clip(np.ceil(low / detector.pitch + detector.axis_row - 1e-9), 0, rows)
     below = np.clip(np.floor(high / detector.pitch + detector.axis_row + 1e-9) + 1, 0, rows)
     above, below = np.where(ahead, above, 0).astype(np.int64), np.where(ahead, below, rows).astype(np.int64)
-    is_round = (p.kind == CYLINDER) & upright
-    return View(
-        detector.u(), detector.v(), float(detector.pitch), float(detector.sod), axes, origin, bool(upright),
-        *_by_row(above, below, ~is_round, rows), *_by_row(above, below, is_round, rows),
-    )  # fmt: skip
+    first, bodies = _by_row(above, below, rows)
+    pitch, sod = float(detector.pitch), float(detector.sod)
+    return View(detector.u(), detector.v(), pitch, sod, axes, origin, bool(upright), first, bodies)
 
 
 def _one_pose(pose: Pose) -> bool:
@@ -119,26 +113,15 @@ def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, so
         gap = float((np.einsum("ri,ri->r", axis, p.centre[i] - origin) - reach).min() + sod)
         if not gap > 1e-9 * sod:
             raise CannotExposeError(
-                f"solid {p.owner[i]} ({names[p.owner[i]]}) reaches {-gap:.3g} mm behind the source, which is "
+                f"solid {i} ({names[i]}) reaches {-gap:.3g} mm behind the source, which is "
                 f"{sod:g} mm before the rotation axis; it must lie wholly in front: move it, or raise sod. "
                 f"No frame was computed"
             )
 
 
-@njit(cache=True)
-def _by_row(above: Wholes, below: Wholes, wanted: NDArray[np.bool_], rows: int) -> tuple[Wholes, Wholes]:
-    """The wanted bodies that touch each row, and the start of each row's; the work is linear in the entries."""
-    first = np.zeros(rows + 1, np.int64)
-    for b in range(above.size):
-        if wanted[b]:
-            for j in range(above[b], below[b]):
-                first[j + 1] += 1
-    for j in range(rows):
-        first[j + 1] += first[j]
-    filled, bodies = first.copy(), np.empty(first[rows], np.int64)
-    for b in range(above.size):
-        if wanted[b]:
-            for j in range(above[b], below[b]):
-                bodies[filled[j]] = b
-                filled[j] += 1
-    return first, bodies
+def _by_row(above: Wholes, below: Wholes, rows: int) -> tuple[Wholes, Wholes]:
+    """The bodies that touch each row, and the start of each row's; the work is linear in the entries."""
+    height = np.maximum(below - above, 0)
+    bodies = np.repeat(np.arange(above.size), height)
+    row = np.arange(bodies.size) - np.repeat(np.cumsum(height) - height, height) + above[bodies]
+    return np.append(0, np.cumsum(np.bincount(row, minlength=rows))), bodies[np.argsort(row, kind="stable")]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
+from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
+from simulators.samples.builders.grains import octahedron
 
 # Attenuation times the can's radius: for any size of the can the largest line integral is between 1.5 and 3, so that at
 # least 5 % of the beam is transmitted.
@@ -31,6 +33,12 @@ class Battery:
         return battery(np.random.default_rng(self.seed), self.field_of_view, self.n_particles, self.fill)
 
 
+def labels_of(solids: Sequence[Solid]) -> list[str]:
+    """The label of each solid of a battery: "tube" is the can's wall, "cylinder" the electrolyte."""
+    particles = ("octahedron" if isinstance(solid, Polyhedron) else kind_of(solid) for solid in solids[2:])
+    return ["tube", "tube", *particles]
+
+
 def battery(
     rng: np.random.Generator,
     field_of_view: tuple[float, float] = (0.9, 0.9),
@@ -39,8 +47,9 @@ def battery(
 ) -> tuple[Solid, ...]:
     """Solids of a cylindrical cell that fits into the field of view, with air on all sides.
 
-    Half of the particles are ellipsoids, a third octahedra and the rest plates (the habits of LiCoO2 crystals), in any
-    orientation, their sizes spread log-normally. A particle's attenuation is its contrast to the electrolyte.
+    Half of the particles are ellipsoids, a third octahedra and the rest boxes (the habits of LiCoO2 crystals), in any
+    orientation, their sizes spread log-normally. A particle's attenuation is its contrast to the electrolyte. The wall
+    is a cylinder and, with its negative attenuation, its bore.
 
     Args:
         field_of_view: (width, height) in mm.
@@ -61,7 +70,8 @@ def battery(
             f"n_particles must be 0 ... {MOST_PARTICLES}, fill above 0 and 1 at most, got {n_particles} and {fill}"
         )
     radius, inside, tall = 0.44 * width, 0.95 * 0.44 * width, 0.9 * height
-    can = (Tube(radius, inside, tall, WALL / radius), Cylinder(inside, tall, ELECTROLYTE / radius))
+    wall = WALL / radius
+    can = (Cylinder(radius, tall, wall), Cylinder(inside, tall, -wall), Cylinder(inside, tall, ELECTROLYTE / radius))
     if n_particles < 1:
         return can
     median = (fill * inside**2 * tall / (4 / 3 * n_particles)) ** (1 / 3)
@@ -73,7 +83,7 @@ def battery(
     )
 
 
-def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tuple[Ellipsoid | Octahedron | Box, float]:
+def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tuple[Ellipsoid | Polyhedron | Box, float]:
     """A particle at the origin and the radius of the sphere around it; `size` is about its own radius in mm."""
     kind = rng.choice(3, p=(1 / 2, 1 / 3, 1 / 6))
     a, b, c = (size * rng.uniform(0.8, 1.2, 3)).tolist()
@@ -82,7 +92,7 @@ def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tupl
         return Ellipsoid((a, b, c), attenuation, quaternion=(w, x, y, z)), max(a, b, c)
     if kind == 1:
         half = (1.2 * a, 1.2 * b, 1.2 * c)
-        return Octahedron(half, attenuation, quaternion=(w, x, y, z)), max(half)
+        return Polyhedron(octahedron(half), attenuation, quaternion=(w, x, y, z)), max(half)
     edges = (1.7 * a, 1.7 * b, 0.7 * c)
     return Box(edges, attenuation, quaternion=(w, x, y, z)), float(np.linalg.norm(edges)) / 2
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from simulators.samples.bodies.solids import LEAST, MOST, Cylinder, Tube
+from simulators.samples.bodies.solids import LEAST, MOST, Cylinder
 from simulators.samples.builders.arrangement import arrange, bodies_of
 from simulators.samples.builders.grains import HABITS, Sizes, core, crack, grains
 from simulators.samples.builders.piece import Piece, check_roles
@@ -142,7 +142,8 @@ class Cathode:
         radius, bed = self.inner_radius, self.bed_height
         below, above = self.collector_um * 1e-3, self.separator_um * 1e-3
         cell = [
-            Piece(Tube(self.diameter / 2, radius, self.height, 1.0), "wall"),
+            Piece(Cylinder(self.diameter / 2, self.height, 1.0), "wall"),
+            Piece(Cylinder(radius, self.height, -1.0), "wall"),
             Piece(Cylinder(radius, self.height, 1.0), "electrolyte"),
         ]
         if below:

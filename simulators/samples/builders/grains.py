@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from simulators.samples.bodies.solids import Ellipsoid, Octahedron, Plate, Quaternion, TruncatedOctahedron, Vector
+from simulators.samples.bodies.solids import Ellipsoid, Polyhedron, Quaternion, Vector
 
-Grain = Ellipsoid | Octahedron | Plate | TruncatedOctahedron
+Grain = Ellipsoid | Polyhedron
 
 HABITS = ("sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate")
 TAIL = 2.5
@@ -24,7 +25,7 @@ HOLLOW, CRACK = 0.5, (0.95, 0.06)
 MOST = 100_000
 """Largest number of grains in a cell: this many take minutes to arrange."""
 ROUNDEST, FLATTEST = 0.6, 0.85
-"""Least and largest cut of truncated octahedra; see TruncatedOctahedron."""
+"""Least and largest cut of truncated octahedra; see `truncated_octahedron`."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,36 @@ def grain(rng: np.random.Generator, habit: str, diameter: float, irregularity: f
         case "ellipsoid":
             return Ellipsoid(axes(diameter / 2), 1.0, quaternion=turned)
         case "octahedron":
-            return Octahedron(axes((3 * volume / 4) ** (1 / 3)), 1.0, quaternion=turned)
+            return Polyhedron(octahedron(axes((3 * volume / 4) ** (1 / 3))), 1.0, quaternion=turned)
         case "truncated_octahedron":
             cut = rng.uniform(ROUNDEST, FLATTEST)
             size = (volume / 4 / (1 / 3 - (1 - cut) ** 3)) ** (1 / 3)
-            return TruncatedOctahedron(axes(size), 1.0, cut, quaternion=turned)
+            return Polyhedron(truncated_octahedron(axes(size), cut), 1.0, quaternion=turned)
     width = (8 * aspect * volume / 3 / math.sqrt(3)) ** (1 / 3)
-    return Plate(width, width / aspect, 1.0, quaternion=turned)
+    return Polyhedron(plate(width, width / aspect), 1.0, quaternion=turned)
+
+
+def octahedron(half: Vector) -> tuple[Vector, ...]:
+    """Corners of |x|/a + |y|/b + |z|/c <= 1 with (a, b, c) = half, mm."""
+    return _corners(np.vstack([np.eye(3), -np.eye(3)]) * half)
+
+
+def truncated_octahedron(half: Vector, cut: float) -> tuple[Vector, ...]:
+    """Corners of an octahedron with |x|/a, |y|/b, |z|/c <= cut, above 1/2 and below 1; mm."""
+    ends = np.vstack([np.eye(3), -np.eye(3)])
+    corners = np.array([cut * end + side for end in ends for side in (1 - cut) * ends if not (end * side).any()])
+    return _corners(np.unique(np.round(corners, 15), axis=0) * half)
+
+
+def plate(width: float, thickness: float) -> tuple[Vector, ...]:
+    """Corners of a hexagon in x and y with corners on the x axis, `width` mm from corner to corner."""
+    turn = np.arange(6) * np.pi / 3
+    hexagon = np.stack([np.cos(turn), np.sin(turn)], axis=1) * (width / 2)
+    return _corners(np.array([(*corner, z) for corner in hexagon for z in (-thickness / 2, thickness / 2)]))
+
+
+def _corners(points: NDArray[np.float64]) -> tuple[Vector, ...]:
+    return tuple((x, y, z) for x, y, z in points.tolist())
 
 
 def grains(
@@ -114,14 +138,10 @@ def grains(
 
 def core(grain: Grain) -> Grain:
     """The pore of a hollow grain: its own shape, scaled down."""
-    match grain:
-        case Ellipsoid():
-            a, b, c = grain.semi_axes
-            return replace(grain, semi_axes=(HOLLOW * a, HOLLOW * b, HOLLOW * c))
-        case Plate():
-            return replace(grain, width=HOLLOW * grain.width, thickness=HOLLOW * grain.thickness)
-    a, b, c = grain.half_diagonals
-    return replace(grain, half_diagonals=(HOLLOW * a, HOLLOW * b, HOLLOW * c))
+    if isinstance(grain, Ellipsoid):
+        a, b, c = grain.semi_axes
+        return replace(grain, semi_axes=(HOLLOW * a, HOLLOW * b, HOLLOW * c))
+    return replace(grain, vertices=_corners(HOLLOW * np.array(grain.vertices)))
 
 
 def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
@@ -134,10 +154,4 @@ def crack(rng: np.random.Generator, grain: Grain) -> Ellipsoid:
 
 def inner_radius(grain: Grain) -> float:
     """mm, of the largest sphere around a grain's centre that lies inside it."""
-    match grain:
-        case Ellipsoid():
-            return min(grain.semi_axes)
-        case Plate():
-            return min(grain.thickness / 2, math.sqrt(3) / 4 * grain.width)
-    to_face = 1 / math.sqrt(sum(1 / half**2 for half in grain.half_diagonals))
-    return to_face if isinstance(grain, Octahedron) else min(to_face, grain.cut * min(grain.half_diagonals))
+    return min(grain.semi_axes) if isinstance(grain, Ellipsoid) else float(grain.hull().distances.min())

@@ -12,7 +12,7 @@ from simulators.samples.bodies.solids import Solid
 @dataclass(frozen=True)
 class Piece:
     """Attributes:
-    solid: its attenuation is ignored.
+    solid: its attenuation is the share of its volume that the role fills: 1, or -1 for a hole in the same role.
     role: "wall", "particle", ...; also its label.
     instead_of: the role of the piece that it displaces.
     """

@@ -124,7 +124,7 @@ class Resolution:
                 (radius * math.cos(turn + side), radius * math.sin(turn + side)) for side in (-half, half)
             ]
             corners: tuple[Vector, ...] = tuple((x, y, z) for z in (-tall / 2, tall / 2) for x, y in triangle)
-            spokes.append(Polyhedron(1.0, corners))
+            spokes.append(Polyhedron(corners, 1.0))
         return spokes
 
 
@@ -142,7 +142,7 @@ def _reach(solid: Box | Ellipsoid | Polyhedron) -> float:
             return math.hypot(abs(x) + solid.edges[0] / 2, abs(y) + solid.edges[1] / 2)
         case Ellipsoid():
             return math.hypot(x, y) + max(solid.semi_axes)
-    return max(math.hypot(px, py) for px, py, _ in solid.vertices or ())
+    return max(math.hypot(px, py) for px, py, _ in solid.vertices)
 
 
 def _raised(solid: Box | Ellipsoid | Polyhedron, z: float) -> Box | Ellipsoid | Polyhedron:

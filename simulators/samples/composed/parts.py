@@ -32,7 +32,7 @@ class Part:
     """A solid and its material.
 
     Attributes:
-        solid: without a material its attenuation is in 1/mm; with one it is the share of the solid's volume that the
+        solid: without a material its attenuation is in 1/mm. With one it is the share of the solid's volume that the
             material fills, 1 for all of it.
         material: None: grey.
         instead_of: the material that it displaces; None: nothing.
@@ -79,8 +79,8 @@ class Constituent:
 class Mixture:
     """Constituents under a spectrum: each one's chords are computed once for any number of energies.
 
-    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam: the initial
-    slope of the effective depth. Thicker matter appears to attenuate less: beam hardening.
+    Its truth is the attenuation in the thin limit, the mean over the photons detected in the open beam. That is the
+    initial slope of the effective depth. Thicker matter appears to attenuate less: beam hardening.
 
     Attributes:
         constituents: of the sample.

@@ -37,9 +37,10 @@ def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = N
 
 
 def _battery(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    from simulators.samples.builders.battery import Battery
+    from simulators.samples.builders.battery import Battery, labels_of
 
-    return Phantom.of(build(Battery, where, mapping).solids())
+    solids = build(Battery, where, mapping).solids()
+    return Phantom.of(solids, labels_of(solids))
 
 
 def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
@@ -77,10 +78,10 @@ def _pieces(cls: str) -> _Builder:
 
 def _grey(pieces: Sequence[Piece], attenuation: Mapping[str, float]) -> Sample:
     """The pieces with an attenuation (1/mm) for each role, for any beam."""
-    solids = [
-        replace(piece.solid, attenuation=attenuation[piece.role] - attenuation.get(piece.instead_of or "", 0.0))
-        for piece in pieces
-    ]
+    solids = []
+    for piece in pieces:
+        contrast = attenuation[piece.role] - attenuation.get(piece.instead_of or "", 0.0)
+        solids.append(replace(piece.solid, attenuation=contrast * piece.solid.attenuation))
     return Phantom.of(solids, [piece.role for piece in pieces])
 
 
@@ -96,7 +97,7 @@ def _of_materials(
     found = {role: palette(material_of[role]) for role in sorted(used)}
     parts = [
         Part(
-            replace(piece.solid, attenuation=1.0),
+            piece.solid,
             found[piece.role],
             found[piece.instead_of] if piece.instead_of else None,
             piece.role,

@@ -1,7 +1,7 @@
 """Voxel projector: kernels for line integrals through a volume by Joseph's method.
 
 The volume is the function that its voxels' centres interpolate linearly, falling to 0 one voxel beyond the outermost.
-A ray is sampled where it meets the planes of centres across its main axis, and interpolated in each plane (Joseph,
+A ray is sampled where it meets the planes of centres across its main axis, and interpolated in each plane. (Joseph,
 "An improved algorithm for reprojecting rays through pixel images", IEEE Trans. Med. Imaging 1, 1982). In a parallel
 beam through an upright sample each row lies in one slice, with one interpolation a plane.
 """

@@ -129,7 +129,7 @@ class Voxels:
         if not nearest > -sod:
             raise CannotExposeError(
                 f"the volume begins {-nearest:.3g} mm before the rotation axis, the source {sod:g} mm before it; "
-                "it must lie wholly in front of the source: raise sod, or make voxel_mm smaller. No frame was computed"
+                "it must lie wholly in front of the source. Raise sod, or make voxel_mm smaller. No frame was computed"
             )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:

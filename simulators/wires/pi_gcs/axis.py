@@ -1,6 +1,6 @@
 """Simulated PI GCS 2.0 (C-863 class), the axis behind the wire: servo, reference, moves, stops, limits, trigger line.
 
-Inside, positions are encoder counts from the reference switch ("true"); on the wire they are degrees from the axis'
+Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis'
 own zero, which before a reference move is wherever it was switched on. Nothing runs in the background: what a move
 will do at its end is done when somebody next looks. Strict where a manual is silent: a move during a move is refused.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from simulators.devices.motion import Phase, TrapezoidMove
+from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.output import Firmware, Output, WiredOutput
 from simulators.wires.pi_gcs.trigger import FirstPulse
@@ -179,15 +179,7 @@ class GcsAxis:
     def brake(self) -> None:
         """HLT: slow down to a whole count and stand."""
         if self.moving():
-            now, move = self._clock.now(), self.move
-            position, velocity = move.position(now), move.velocity(now)
-            stand = position + move.direction * velocity**2 / (2 * self.deceleration * self.per_degree)
-            last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
-            if move.direction * (last - position) <= 0:
-                self._stand_at(self._counts(now))
-            else:
-                braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
-                self._cut(TrapezoidMove(braked.begin, braked.start, last, braked.phases))
+            self._cut(self.move.slowed(self._clock.now(), self.deceleration * self.per_degree))
         self.error = 10
 
     def halt(self) -> None:
@@ -212,18 +204,12 @@ class GcsAxis:
     def _counts(self, time: float) -> int:
         """True encoder counts: the last edge passed on the way."""
         move = next((move for move in reversed(self._moves) if move.begin <= time), self._moves[0])
-        exact = move.position(time)
-        return math.floor(exact) if move.direction >= 0 else math.ceil(exact)
+        return move.counts(time)
 
     def _begin(self, counts: int, velocity: float) -> None:
-        move = profile(
-            self._counts(self._clock.now()),
-            counts,
-            velocity * self.per_degree,
-            self.acceleration * self.per_degree,
-            self.deceleration * self.per_degree,
-            self._clock.now(),
-        )
+        now, scale = self._clock.now(), self.per_degree
+        rates = (velocity * scale, self.acceleration * scale, now, self.deceleration * scale)
+        move = TrapezoidMove.between(self._counts(now), counts, *rates)
         self._hit = 0
         self._moves.append(move)
         self._wired.begin(move, self._zero, move.begin)
@@ -255,19 +241,3 @@ class GcsAxis:
         else:
             self._zero, self.referenced = 0, True
         self._target = (self.move.target - self._zero) / self.per_degree
-
-
-def profile(start: int, target: int, speed: float, up: float, down: float, begin: float) -> TrapezoidMove:
-    """From standing to standing with an acceleration and a deceleration of their own (counts, s)."""
-    sign, distance = (1 if target > start else -1), abs(target - start)
-    if distance == 0:
-        return TrapezoidMove(begin, start, target, ())
-    peak = min(speed, math.sqrt(2 * distance * up * down / (up + down)))
-    rise, fall = peak / up, peak / down
-    cruise = max(0.0, (distance - peak * (rise + fall) / 2) / peak)
-    phases = (
-        Phase(0.0, rise, start, 0.0, sign * up),
-        Phase(rise, cruise, start + sign * peak * rise / 2, sign * peak, 0.0),
-        Phase(rise + cruise, fall, target - sign * peak * fall / 2, sign * peak, -sign * down),
-    )
-    return TrapezoidMove(begin, start, target, tuple(phase for phase in phases if phase.duration > 0))

@@ -1,7 +1,7 @@
 """Simulated PI GCS 2.0, an output line with a cable in it: its CTO settings, and the pulses of the move under way.
 
-A move is a closed form of time, so its pulses go on the cable with their exact times the moment it begins, and those
-still to come are taken away when it is cut short.
+A move is a closed form of time. So its pulses go on the cable with their exact times the moment it begins. Those still
+to come are taken away when it is cut short.
 """
 
 from __future__ import annotations

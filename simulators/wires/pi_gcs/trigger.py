@@ -2,7 +2,7 @@
 
 One pulse each step travelled. A start threshold below the stop threshold lets pulses begin on a positive way only, one
 above on a negative way only; equal thresholds switch the window off. A way that turns round inside the window goes on
-giving pulses, each a step from the one before; it ends beyond either threshold (C-863 and E-727 manuals).
+giving pulses, each a step from the one before. It ends beyond either threshold (C-863 and E-727 manuals).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Simulated Tsuji PM16C-04XD, one channel's home switch: the search for it, and where the search found it.
 
-The manual names the commands; how the search runs is from memory: it starts towards the switch, which tells the side,
+The manual names the commands. The run of the search is from memory: it starts towards the switch, which tells the side,
 passes it, slows down and stands beyond. A preset of the counter leaves the remembered place as it was: strict, since
 the manual does not say that it follows.
 """

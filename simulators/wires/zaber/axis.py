@@ -79,8 +79,7 @@ class ZaberAxis:
         return now < self.move.end
 
     def position(self, now: float) -> int:
-        exact = self.move.position(now)
-        return math.floor(exact) if self.move.direction >= 0 else math.ceil(exact)
+        return self.move.counts(now)
 
     def angle_at(self, time: float) -> float:
         """True angle in radians at any time since the oldest move remembered."""
@@ -100,39 +99,29 @@ class ZaberAxis:
         standing = self.flags | (set() if self.homed else {"WR"}) | (set() if self.enabled else {"FO"})
         return sorted(standing, key=PRIORITY.index)
 
-    def start(self, now: float, target: int, speed: float | None = None) -> None:
-        """Move to `target`, with `speed` (microsteps/s) where one is given, or to where it is blocked on the way."""
+    def start(self, now: float, target: int) -> None:
+        """Move to `target`, or to where it is blocked on the way."""
         self._ready(now)
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
             raise Rejected("BADDATA")
-        move, ending = self._planned(now, target, speed), self._nothing
+        move, ending = self._planned(now, target), self._nothing
         for blocked, flags in ((self.stall_at, {"FS"}), (self.switch_at, {"WL", "FE"})):
             if blocked is not None and min(move.start, move.target) < blocked < max(move.start, move.target):
                 move, ending = move.halted(blocked), partial(self.flags.update, flags)
         self._begin(move, ending)
 
-    def drive(self, now: float, speed: float) -> None:
-        """Turn at `speed` (microsteps/s, signed) until stopped or at the end of the travel."""
-        self.start(now, self.settings["limit.max" if speed > 0 else "limit.min"], abs(speed))
-
     def home(self, now: float) -> None:
         """Turn to the reference, count 0, from which on the position is known."""
         self._ready(now)
-        self._begin(self._planned(now, 0, None), self._found_home)
+        self._begin(self._planned(now, 0), self._found_home)
 
     def stop(self, now: float) -> None:
         """Slow down to the last microstep that still comes on the way."""
         if not self.moving(now):
             return
-        move, deceleration = self.move, self.settings["motion.decelonly"] / ACCELERATION_UNIT
-        position, velocity = move.position(now), move.velocity(now)
-        stand = position + move.direction * velocity**2 / (2 * deceleration)
-        last = math.floor(stand) if move.direction > 0 else math.ceil(stand)
-        if move.direction * (last - position) <= 0:
-            self._moves[-1] = move.halted(self.position(now))
-        elif move.direction * (move.target - last) > 0:  # otherwise it stands by itself before that
-            braked = move.braked(now, velocity**2 / (2 * abs(last - position)))
-            self._moves[-1] = TrapezoidMove(braked.begin, braked.start, last, braked.phases)
+        slowed = self.move.slowed(now, self.settings["motion.decelonly"] / ACCELERATION_UNIT)
+        if self.move.direction * (self.move.target - slowed.target) > 0:  # otherwise it stands by itself before that
+            self._moves[-1] = slowed
         self._interrupt()
 
     def halt(self, now: float) -> None:
@@ -147,8 +136,8 @@ class ZaberAxis:
         if not self.enabled:
             raise Rejected("DRIVERDISABLED")
 
-    def _planned(self, now: float, target: int, speed: float | None) -> TrapezoidMove:
-        speed = self.settings["maxspeed"] / SPEED_UNIT if speed is None else speed
+    def _planned(self, now: float, target: int) -> TrapezoidMove:
+        speed = self.settings["maxspeed"] / SPEED_UNIT
         acceleration = min(self.settings["motion.accelonly"], self.settings["motion.decelonly"]) / ACCELERATION_UNIT
         return TrapezoidMove.between(self.position(now), target, speed, acceleration, begin=now)
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 
 from drivers.clock import Clock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber.axis import SPEED_UNIT, AxisBuild, Rejected, ZaberAxis
-from simulators.wires.zaber.conditions import INPUTS, OUTPUTS, is_output, number_in
-from simulators.wires.zaber.triggers import ACTIONS, TRIGGERS, Edge, Triggers
+from simulators.wires.zaber.axis import AxisBuild, Rejected, ZaberAxis
+from simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in
 
 LOOK_AHEAD = 10.0
 """s beyond the end of a move for which edges are predicted."""
@@ -61,7 +60,7 @@ class ZaberDevice:
     def __init__(self, clock: Clock, line: TriggerLine, build: DeviceBuild) -> None:
         now, counts_per_turn = clock.now(), build.axis.counts_per_turn
         self.axis = ZaberAxis(now, build.axis)
-        self.triggers = Triggers(self.axis.move, self.axis.settings, build.latency, build.fires_when_enabled, now)
+        self.triggers = Triggers(self.axis.move, build.latency, build.fires_when_enabled, now)
         self.alerts, self.checksums = False, False
         self._clock, self._line, self._lost = clock, line, build.lost
         self._output, self._active = build.output - 1, int(build.active_high)
@@ -119,10 +118,6 @@ class ZaberDevice:
                 return str(self.triggers.outputs[int(channel) - 1])
             case ["io", "get", "do"]:
                 return " ".join(map(str, self.triggers.outputs))
-            case ["io", "info"]:
-                return f"0 {OUTPUTS} 0 {INPUTS}"
-            case ["tools", "echo", *text]:
-                return " ".join(text) or NOTHING
         self._change(axis, words)
         self._predict()
         return NOTHING
@@ -165,10 +160,6 @@ class ZaberDevice:
                 self.axis.start(now, _whole(position))
             case ["move", "rel", distance]:
                 self.axis.start(now, self.axis.position(now) + _whole(distance))
-            case ["move", "vel", speed]:
-                self._drive(now, _whole(speed))
-            case ["move", ("min" | "max") as end]:
-                self.axis.start(now, self.axis.settings[f"limit.{end}"])
             case ["stop"]:
                 self.axis.stop(now)
             case ["estop"]:
@@ -188,12 +179,6 @@ class ZaberDevice:
             case _:
                 raise Rejected("BADCOMMAND")
         self.triggers.move = self.axis.move
-
-    def _drive(self, now: float, speed: int) -> None:
-        if self.axis.moving(now):
-            raise Rejected("STATUSBUSY")
-        if speed:
-            self.axis.drive(now, speed / SPEED_UNIT)
 
     def _set(self, axis: int, setting: str, value: int) -> None:
         if setting in ("comm.alert", "comm.checksum"):

@@ -1,7 +1,7 @@
-"""Zaber ASCII packets as a device reads and writes them: prefix numbers, checksums, packets in parts, replies, alerts.
+"""Zaber ASCII packets as a device reads and writes them: prefix numbers, checksums, replies, alerts.
 
 From what the vendor's own library sends and accepts, and the test vectors of zproto; nothing is shared with the driver.
-From memory, not confirmed: a wrong checksum gets no answer, a part of a command none of its own.
+From memory, not confirmed: a wrong checksum gets no answer.
 """
 
 from __future__ import annotations
@@ -53,8 +53,6 @@ class PacketReader:
 
     def __init__(self) -> None:
         self._bytes = bytearray()
-        self._incomplete: Command | None = None
-        self._parts = 0
 
     def feed(self, data: bytes) -> list[Command | Malformed]:
         self._bytes += data
@@ -75,31 +73,17 @@ class PacketReader:
         if colon and checksum.decode("ascii").upper() != lrc(body):
             return None
         text = body.decode("ascii")
-        command = _command(text.rstrip("\\"))
+        command = _command(text)
         if command.id and not (command.id == "--" or int(command.id) <= 99):
             return Malformed(Command(command.address, command.axis, "", command.words), "BADMESSAGEID")
         if any(len(word) > LONGEST_WORD for word in command.words):
             return Malformed(command, "LONGWORD")
-        return self._join(command, unfinished=text.endswith("\\"))
-
-    def _join(self, command: Command, unfinished: bool) -> Command | Malformed | None:
-        """Put a command in parts together; the parts after the first begin with `cont 1`, `cont 2`, ..."""
-        first, self._incomplete = self._incomplete, None
-        if command.words[:1] == ("cont",):
-            if first is None or command.words[1:2] != (str(self._parts),):
-                return Malformed(command, "BADSPLIT")
-            command = Command(first.address, first.axis, first.id, first.words + command.words[2:])
-        else:
-            self._parts = 0
-        if unfinished:
-            self._incomplete, self._parts = command, self._parts + 1
-            return None
         return command
 
 
 def _command(text: str) -> Command:
-    """Numbers at the start are address, axis and id, as many as there are; the first word that is none begins the
-    command. "--" in the third place is no id."""
+    """Numbers at the start are address, axis and id, as many as there are. The first other word begins the command.
+    "--" in the third place is no id."""
     words = text.split()
     numbers: list[str] = []
     while words and len(numbers) < 3 and (words[0].isdigit() or (len(numbers) == 2 and words[0] == "--")):

@@ -1,9 +1,10 @@
 """Simulated Zaber triggers and digital outputs: conditions on a moving axis, two actions each, edges with their times.
 
 Nothing runs in the background: `advance` goes from event to event up to a time, and a copy that is advanced beyond it
-predicts the edges still to come. As the vendor's library has it, a trigger fires when its condition turns true, at
-once where it is true when enabled, and COUNT fires disable it. From memory, not confirmed: a distance is counted, in
-both directions, from where the trigger was enabled or last fired; a new value of an output cancels its schedule.
+predicts the edges still to come. A trigger fires when its condition turns true, as in the vendor's library. It fires at
+once if the condition is true when it is enabled; COUNT fires disable it. From memory, not confirmed: a distance is
+counted, in both directions, from where the trigger was enabled or last fired. A new value of an output cancels its
+schedule.
 """
 
 from __future__ import annotations
@@ -15,24 +16,32 @@ from dataclasses import dataclass, field, replace
 
 from simulators.devices.motion import TrapezoidMove
 from simulators.wires.zaber.axis import Rejected
-from simulators.wires.zaber.conditions import (
-    INPUTS,
-    OPERATORS,
-    OUTPUTS,
-    Compare,
-    Condition,
-    Distance,
-    Every,
-    Input,
-    condition_of,
-    is_output,
-    number_in,
-)
 
-TRIGGERS, ACTIONS = 6, 2
+OUTPUTS, TRIGGERS, ACTIONS = 4, 6, 2
 UNLIMITED = -1
 DEEPEST = 2 * TRIGGERS
 """Triggers that set each other off at one moment, before it is taken for a circle."""
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Each `step` microsteps of travel."""
+
+    step: int
+
+
+@dataclass(frozen=True)
+class Compare:
+    """The position compared with a value: `>=`, or `<=` where `below`."""
+
+    below: bool
+    value: int
+
+    def holds(self, position: float) -> bool:
+        return position <= self.value if self.below else position >= self.value
+
+
+Condition = Distance | Compare
 
 
 @dataclass(frozen=True)
@@ -47,7 +56,7 @@ class Edge:
 
 @dataclass
 class Trigger:
-    """What is set up, and how it stands. `left` fires remain; `origin` is the position, or the time, counted from."""
+    """What is set up, and how it stands. `left` fires remain; `origin` is the position counted from."""
 
     text: str = "none"
     condition: Condition | None = None
@@ -65,17 +74,14 @@ class Triggers:
     Attributes:
         latency: s from a condition to its actions.
         fires_when_enabled: a distance trigger fires at the very point of enabling, too.
-        settings: of the axis, for actions that change one.
     """
 
     move: TrapezoidMove
-    settings: dict[str, int]
     latency: float = 0.0
     fires_when_enabled: bool = False
     now: float = -math.inf
     triggers: list[Trigger] = field(default_factory=lambda: [Trigger() for _ in range(TRIGGERS)])
     outputs: list[int] = field(default_factory=lambda: [0] * OUTPUTS)
-    inputs: list[int] = field(default_factory=lambda: [0] * INPUTS)
     edges: list[Edge] = field(default_factory=list)
     queue: list[tuple[float, int, str]] = field(default_factory=list)
     """Commands for later, the next one first."""
@@ -102,22 +108,13 @@ class Triggers:
         if trigger.condition is None:
             raise Rejected("BADDATA")
         trigger.left = trigger.total = count or UNLIMITED
-        trigger.origin = self.now if isinstance(trigger.condition, Every) else position
-        trigger.met = self._holds(trigger.condition, position)
+        trigger.origin = position
+        trigger.met = isinstance(trigger.condition, Compare) and trigger.condition.holds(position)
         if trigger.met or (self.fires_when_enabled and isinstance(trigger.condition, Distance)):
             self._fire(trigger, position)
 
     def disable(self, number: int) -> None:
         self.triggers[number].left = 0
-
-    def set_input(self, channel: int, value: int) -> None:
-        """Somebody else's signal on a digital input (from 0)."""
-        self.inputs[channel] = value
-        for trigger in self.triggers:
-            if isinstance(trigger.condition, Input) and trigger.left:
-                was, trigger.met = trigger.met, self._holds(trigger.condition, 0.0)
-                if trigger.met and not was:
-                    self._fire(trigger, self.move.position(self.now))
 
     # time
 
@@ -133,7 +130,7 @@ class Triggers:
                 if trigger.met:
                     self._fire(trigger, position)
             else:
-                trigger.origin = time if isinstance(trigger.condition, Every) else position
+                trigger.origin = position
                 self._fire(trigger, position)
         self.now = max(self.now, to)
 
@@ -141,7 +138,6 @@ class Triggers:
         """The edges from now to `until` if nobody does anything."""
         coming = replace(
             self,
-            settings=dict(self.settings),
             triggers=[replace(trigger, actions=list(trigger.actions)) for trigger in self.triggers],
             outputs=list(self.outputs),
             queue=list(self.queue),
@@ -167,12 +163,9 @@ class Triggers:
                 self.enable(int(number) - 1, int(count[0]) if count else 0, position)
             case ["trigger", number, "disable"]:
                 self.disable(int(number) - 1)
-            case [_, setting, sign, value]:
-                old = self.settings[setting]
-                self.settings[setting] = {"=": 0, "+=": old, "-=": old}[sign] + int(value) * (-1 if sign == "-=" else 1)
 
     def _known(self, words: list[str]) -> bool:
-        """An action that this stand-in can do: outputs, other triggers, settings of the axis."""
+        """An action that this stand-in can do: outputs and other triggers."""
         match words:
             case ["0", *rest] if rest and not rest[0].isdigit():
                 return self._known(rest)
@@ -182,8 +175,6 @@ class Triggers:
                 return number_in(number, TRIGGERS) and (not count or (len(count) == 1 and count[0].isdigit()))
             case ["trigger", number, "disable"]:
                 return number_in(number, TRIGGERS)
-            case [("0" | "1"), setting, ("=" | "+=" | "-="), value]:
-                return setting in self.settings and value.lstrip("-").isdigit()
         return False
 
     def _later(self, seconds: float, command: str) -> None:
@@ -204,13 +195,6 @@ class Triggers:
                 self.act(words, position)
         self.depth -= 1
 
-    def _holds(self, condition: Condition, position: float) -> bool:
-        if isinstance(condition, Compare):
-            return condition.holds(position)
-        if isinstance(condition, Input):
-            return OPERATORS[condition.sign](self.inputs[condition.channel], condition.value)
-        return False
-
     def _next(self) -> tuple[float, float, Trigger | None] | None:
         """(time, position, trigger) of the next event; no trigger where it is a command for later."""
         found: list[tuple[float, float, Trigger | None]] = []
@@ -224,16 +208,47 @@ class Triggers:
     def _change(self, trigger: Trigger) -> tuple[float, float] | None:
         """When and where an enabled trigger's condition changes next."""
         condition, move, here = trigger.condition, self.move, self.move.position(self.now)
-        if isinstance(condition, Every):
-            time = trigger.origin + condition.seconds
-            return time, move.position(time)
         points: list[float] = []
         if isinstance(condition, Distance):
             points = [trigger.origin + move.direction * condition.step]
         elif isinstance(condition, Compare):
-            around = {at + by for at in (condition.value, -condition.value) for by in (-1, 0, 1)}
-            points = sorted(around, key=lambda at: move.direction * at)
+            points = [condition.value + move.direction * by for by in (-1, 0, 1)]
             points = [at for at in points if condition.holds(at) != trigger.met and move.direction * (at - here) > -0.5]
         if not points or self.now >= move.end or move.direction * (move.target - points[0]) < 0:
             return None
         return max(move.time_at(points[0]), self.now), points[0]
+
+
+def number_in(text: str, most: int) -> bool:
+    """1 to `most`."""
+    return text.isdigit() and 1 <= int(text) <= most
+
+
+def is_output(channel: str, value: str, schedule: Sequence[str]) -> bool:
+    """`N 0|1|t`, or with `schedule MS 0|1`."""
+    good = number_in(channel, OUTPUTS) and value in ("0", "1", "t")
+    if not schedule:
+        return good
+    try:
+        return (
+            good
+            and len(schedule) == 3
+            and schedule[0] == "schedule"
+            and float(schedule[1]) > 0
+            and schedule[2] in "01t"
+        )
+    except ValueError:
+        return False
+
+
+def condition_of(words: Sequence[str]) -> Condition:
+    """What `when` says: a distance, or >= or <= of the position, as commanded or by the encoder, which are the same."""
+    try:
+        match list(words):
+            case [("0" | "1"), "dist", step] | [("0" | "1"), "encoder", "dist", step] if int(step) > 0:
+                return Distance(int(step))
+            case [("0" | "1"), ("pos" | "encoder.pos"), (">=" | "<=") as sign, value]:
+                return Compare(sign == "<=", int(value))
+    except ValueError:
+        pass
+    raise Rejected("BADDATA")

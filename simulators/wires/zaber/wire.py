@@ -16,9 +16,9 @@ from drivers.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.zaber.axis import AxisBuild, Rejected
-from simulators.wires.zaber.conditions import OUTPUTS
 from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
 from simulators.wires.zaber.packets import Command, Malformed, PacketReader, frame
+from simulators.wires.zaber.triggers import OUTPUTS
 
 
 class Fault(StrEnum):

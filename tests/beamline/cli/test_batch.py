@@ -14,7 +14,7 @@ import pytest
 from beamline.cli import batch as command
 from beamline.cli import recon_worker
 from beamline.reconstruct import batch
-from beamline.reconstruct.batch import BatchOptions, Row, Worker, names_of, run_batch
+from beamline.reconstruct.batch import BatchOptions, BatchRow, Worker, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.clock import SystemClock
@@ -189,7 +189,7 @@ def test_names_tell_files_apart(paths: tuple[str, ...], names: list[str]) -> Non
 
 
 def test_rows_of_an_earlier_call_keep_their_names() -> None:
-    known = [Row("scan", "/x/run1/scan.h5", "done")]
+    known = [BatchRow("scan", "/x/run1/scan.h5", "done")]
     rows = batch._rows([Path("/x/run1/scan.h5"), Path("/x/run2/scan.h5")], known)
     assert [row.name for row in rows] == ["scan", "run2_scan"]
     assert command.batch.name == "batch"

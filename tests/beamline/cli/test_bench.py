@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.core.machine import machine_line
-from beamline.scan.rate import STAGES
+from beamline.doctor.rate import STAGES
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = ("--gaussians", "200", "--side", "32", "--no-volumes")

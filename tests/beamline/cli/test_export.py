@@ -58,7 +58,7 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "code", "said"),
     [
-        (["-o", "v.png"], 2, "'.png' is none of"),
+        (["-o", "v.png"], 2, "'.png' is not known"),
         (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
         (["-o", "no/v.tif"], 5, "does not exist"),
         (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of the middle slice lie in"),

@@ -108,7 +108,7 @@ def test_unknown_words_are_usage(arguments: list[str]) -> None:
     assert "nonsense" in result.stderr
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["recon", "-h"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["recon", "--help-all"]])
 def test_help_imports_nothing_heavy(arguments: list[str]) -> None:
     code = (
         "import sys; from click.testing import CliRunner; from beamline.cli.main import main;"
@@ -184,5 +184,5 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
 
     assert completed("doctor", "--se") == ["--session", "--set"]
     monkeypatch.setattr(module, "import_module", None)
-    assert completed("re") == ["resume", "recon", "recover"]
+    assert completed("re") == ["resume", "recon", "recover", "render"]
     assert completed("--v") == ["--version"]

@@ -147,3 +147,16 @@ def test_an_option_of_two_values_stands_once(folder: Path) -> None:
     context = segment.make_context("segment", ["scan.h5", "--percentiles", "1", "99"])
     line = shlex.split(repeating(context, Path("scan.h5"), Path("t")))
     assert " ".join(line).count("--percentiles 1 99") == 1
+
+
+def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> None:
+    short = ("--preset", "published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
+    settings = ("--set", "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2]", "--set", "fit.policy.every=50")
+    first = _made(folder, "recon", "scan.h5", *short, *settings, "--plain-splatting", "-o", "v.h5")
+    assert first.parameters["method"] == "r2-published" and first.parameters["start"] == "published"
+    assert 'set: "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2] fit.policy.every=50"' in str(first.parameters["recipe"])
+    _same(first, _made(folder, "recon", "scan.h5", "--config", "v.h5", "--no-report", "-o", "w.h5"))
+    _, *line = shlex.split(str(first.parameters["command"]))
+    _same(first, _made(folder, *line))
+    rectified = _made(folder, "recon", "scan.h5", *short, *settings, "-o", "x.h5")
+    assert not np.array_equal(first.volume.data, rectified.volume.data)

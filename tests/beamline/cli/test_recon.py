@@ -231,25 +231,6 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     assert left(folder) == {"scan.h5", "scan_fbp.h5"}
 
 
-def test_a_logbook_page_beside_the_volume(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = beamline("recon", "scan.h5", "-m", "fbp", "--pdf", "--no-report")
-    assert result.exit_code == 0, result.output
-    assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.pdf"}
-    assert "pdf       scan_fbp.pdf" in result.stdout and "report" not in result.stdout
-    assert (folder / "scan_fbp.pdf").read_bytes().startswith(b"%PDF")
-    (folder / "scan_fbp.h5").unlink()
-    refused = beamline("recon", "scan.h5", "-m", "fbp", "--pdf")
-    assert refused.exit_code == 5 and "scan_fbp.pdf" in refused.stderr
-    (folder / "scan_fbp.pdf").unlink()
-
-    def full(*_: object, **__: object) -> None:
-        raise DataError("scan_fbp.pdf could not be written (No space left on device).")
-
-    monkeypatch.setattr("beamline.reconstruct.result.write_logbook", full)
-    assert beamline("recon", "scan.h5", "-m", "fbp", "--pdf").exit_code == 5
-    assert left(folder) == {"scan.h5"}
-
-
 def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None:
     lens = "xcenter = 20.0\nycenter = 0.5\nfactor0 = 1.0\nfactor1 = 1e-5\n"
     (folder / "lens.txt").write_text(lens, encoding="utf-8")
@@ -285,7 +266,7 @@ def test_hardening_is_corrected_recorded_and_told(folder: Path) -> None:
     for options, error in (
         (("--hardening", "Al:80"), "80 is neither a tube such as 60kV,Al=1 nor a table"),
         (("--hardening", "bone:60kV"), "'bone' is neither a material"),
-        (("--hardening", "Al"), "is none of none, fit, MATERIAL:BEAM"),
+        (("--hardening", "Al"), "expected none, fit or MATERIAL:BEAM"),
         (("--hardening", "fit", "--follow"), "--hardening is for a finished scan"),
     ):
         result = beamline("recon", "scan.h5", *options, "-o", "other.h5")

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.reconstruct import budget
+from beamline.core.errors import DataError
+from beamline.reconstruct import budget, checkpoints
 from beamline.reconstruct import finished as offline
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
@@ -159,6 +160,20 @@ def test_a_terminal_that_closes_does_not_end_what_nohup_keeps(folder: Path, monk
     finally:
         signal.signal(signal.SIGHUP, before)
     assert result.exit_code == 0, result.output
+
+
+def test_a_fit_whose_last_checkpoint_is_lost_writes_its_volume_and_says_so(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, checkpoint: object) -> None:
+        raise DataError(f"{path} could not be written (No space left on device).")
+
+    monkeypatch.setattr(checkpoints, "write_checkpoint", refuse)
+    options = ("--steps", "6", "--gaussians", "50", "--axis", "20.7", "--finish", "0", "--no-report")
+    result = beamline("recon", "scan.h5", *options, "-o", "out.h5", "--checkpoint", "fit.h5")
+    assert (result.exit_code, left(folder)) == (5, {"scan.h5", "out.h5"}), result.output
+    assert "last checkpoint was left out: fit.h5 could not be written" in result.stderr
+    assert read_reconstruction(folder / "out.h5").volume.data.any()
 
 
 def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,6 +58,13 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "truth missing": ({}, ["--truth", "truth.npz"], 2, "truth.npz"),
     "truth of another shape": ({}, ["--truth", "scan.npy"], 2, "shape"),
     "of the other method": ({}, ["--gaussians", "5"], 2, "r2"),
+    "a setting without a value": ({}, ["-m", "r2", "--set", "fit.decay"], 2, "expected NAME=VALUE"),
+    "a setting that there is not": ({}, ["-m", "r2", "--set", "fit.magic=1"], 2, "no setting 'fit.magic'"),
+    "a setting of another kind": ({}, ["-m", "r2", "--set", "fit.policy.every=often"], 2, "not of the kind of 100"),
+    "a setting out of range": ({}, ["-m", "r2", "--set", "fit.decay=-1"], 2, "decay must be finite and above 0"),
+    "a part of settings": ({}, ["-m", "r2", "--set", "fit=3"], 2, "not of the kind of FitSettings"),
+    "a preset of another method": ({}, ["-m", "fbp", "--preset", "published"], 2, "--preset published is of r2"),
+    "plain splatting of fbp": ({}, ["-m", "fbp", "--plain-splatting"], 2, "--plain-splatting is of r2"),
     "a loss of fbp": ({}, ["--loss", "l2"], 2, "--loss is of r2"),
     "a checkpoint of fbp": ({}, ["--checkpoint", "fit.h5"], 2, "--checkpoint is of r2"),
     "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of sirt, sart, cgls, asd-pocs"),
@@ -93,9 +100,9 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "a nameless checkpoint": ({}, ["-m", "r2", "--checkpoint", ""], 2, "fit.checkpoint.h5"),
     "no file": ({}, ["-o", "."], 2, "names no file"),
     "nameless": ({}, ["-o", ""], 2, "names no file"),
-    "a page": ({}, ["-o", "out.html"], 2, "'.html' is none of .h5"),
-    "a format that is not written": ({}, ["-o", "out.vtk"], 2, "'.vtk' is none of .h5"),
-    "a version for a suffix": ({}, ["-o", "out_v1.2"], 2, "'.2' is none of"),
+    "a page": ({}, ["-o", "out.html"], 2, "'.html' is not known, expected .h5"),
+    "a format that is not written": ({}, ["-o", "out.vtk"], 2, "'.vtk' is not known, expected .h5"),
+    "a version for a suffix": ({}, ["-o", "out_v1.2"], 2, "'.2' is not known"),
     "a file for a folder": ({}, ["-o", "scan.npy"], 5, "never overwritten"),
     "method misspelt": ({}, ["--method", "r3"], 2, "r3"),
     "folder missing": ({}, ["-o", "no/out.h5"], 5, "does not exist"),
@@ -141,7 +148,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
     assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
-OTHER_TAKERS = {"--device": "auto, r2", "--budget": "auto, r2, fista-tv, os-sirt-tv"}
+OTHER_TAKERS = {"--quality": "r2", "--device": "auto, r2, r2-published", "--budget": "auto, r2, fista-tv, os-sirt-tv"}
 
 
 @pytest.mark.parametrize(
@@ -153,7 +160,7 @@ OTHER_TAKERS = {"--device": "auto, r2", "--budget": "auto, r2, fista-tv, os-sirt
 def test_options_of_the_fit_are_refused_by_name_with_another_method(folder: Path, option: str, method: str) -> None:
     result = beamline("recon", "scan.h5", "-m", method, *option.split())
     assert result.exit_code == 2 and result.stdout == ""
-    takers = OTHER_TAKERS.get(option.split()[0], "r2")
+    takers = OTHER_TAKERS.get(option.split()[0], "r2, r2-published")
     assert f"{option.split()[0]} is of {takers}; it does not go with --method {method}." in result.stderr
     assert left(folder) == {"scan.h5"}
 

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
 from beamline.study import run as study_run
-from beamline.study.figures import Slices
+from beamline.study.figures import SliceSheet
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.trials import Outcome, Trial
 from recon.base.volume import Grid
@@ -130,7 +130,7 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
 
 def test_of_repeated_draws_the_first_is_shown_for_each_method() -> None:
     volume = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
-    slices = Slices()
+    slices = SliceSheet()
     slices.add("FBP of all views", volume)
     for method in ("r2", "fbp"):
         for draw in (1, 2):

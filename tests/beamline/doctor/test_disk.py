@@ -17,18 +17,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.doctor import disk
-from beamline.doctor.check import Verdict
+from beamline.doctor.check import Grade
 from beamline.doctor.examine import memory
-from beamline.doctor.needs import Needs
+from beamline.doctor.needs import ScanNeeds
 from drivers.clock import SystemClock
 from simulators.devices.clock import VirtualClock
 
 MB, GB = 1_000_000, 1_000_000_000
 
 
-def need(rate: float, seconds: float = 100.0, waiting: int = GB) -> Needs:
+def need(rate: float, seconds: float = 100.0, waiting: int = GB) -> ScanNeeds:
     size = round(rate * seconds)
-    return Needs(stretches=((size, seconds),), waiting_bytes=waiting, ring_bytes=2 * GB, file_bytes=size)
+    return ScanNeeds(stretches=((size, seconds),), waiting_bytes=waiting, ring_bytes=2 * GB, file_bytes=size)
 
 
 class Slow(io.BytesIO):
@@ -82,27 +82,27 @@ def test_the_rate_is_the_disk_s(synced: list[int], rate: float, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("rate", "verdict"),
     [
-        (130 * MB, Verdict.OK),
-        (120 * MB, Verdict.WARNING),  # faster than the need, by little
-        (97 * MB, Verdict.WARNING),  # 300 MB wait at the end, of 1 GB
-        (80 * MB, Verdict.FAILED),  # 2 GB would have to wait
+        (130 * MB, Grade.OK),
+        (120 * MB, Grade.WARNING),  # faster than the need, by little
+        (97 * MB, Grade.WARNING),  # 300 MB wait at the end, of 1 GB
+        (80 * MB, Grade.FAILED),  # 2 GB would have to wait
     ],
 )
 def test_the_verdict_is_what_would_have_to_wait(
-    synced: list[int], room: object, tmp_path: Path, rate: float, verdict: Verdict
+    synced: list[int], room: object, tmp_path: Path, rate: float, verdict: Grade
 ) -> None:
     clock = VirtualClock()
     check = disk.speed(tmp_path, need(100 * MB), clock, lambda folder: Slow(clock, rate))
     assert check.verdict is verdict
     assert check.expected == "100 MB/s, with previews, at the highest frame rate"
     assert check.values["backlog"] == pytest.approx(max(0, (100 * MB - rate) * 100), rel=0.01, abs=MB)
-    assert (check.advice == "") == (verdict is Verdict.OK)
+    assert (check.advice == "") == (verdict is Grade.OK)
 
 
 @given(st.lists(st.tuples(st.integers(1, 10**9), st.floats(0.1, 100)), min_size=1), st.floats(1e3, 1e9))
 def test_backlog_against_small_steps(stretches: list[tuple[int, float]], rate: float) -> None:
     """Bytes that come evenly and leave evenly, in 50 steps a stretch."""
-    needs = Needs(tuple(stretches), 0, 0, 0)
+    needs = ScanNeeds(tuple(stretches), 0, 0, 0)
     waiting = most = 0.0
     for size, seconds in stretches:
         for _ in range(50):
@@ -115,7 +115,7 @@ def test_a_real_folder_is_left_as_it_was(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(disk, "MOST", disk.LEAST)
     (tmp_path / "scan.h5").write_bytes(b"precious")
     check = disk.speed(tmp_path / "runs" / "today", None, SystemClock())  # not there yet, and not made
-    assert check.verdict is Verdict.OK
+    assert check.verdict is Grade.OK
     assert check.values["written"] == disk.LEAST
     assert [path.name for path in tmp_path.iterdir()] == ["scan.h5"]
     assert (tmp_path / "scan.h5").read_bytes() == b"precious"
@@ -151,14 +151,14 @@ def test_the_file_has_no_name_or_leaves_with_its_handle(tmp_path: Path) -> None:
 def test_a_disk_that_fills_up_or_refuses(synced: list[int], room: object, tmp_path: Path) -> None:
     clock = VirtualClock()
     check = disk.speed(tmp_path, None, clock, lambda folder: Slow(clock, GB, fails_at=20 * MB))
-    assert check.verdict is Verdict.FAILED
+    assert check.verdict is Grade.FAILED
     assert "No space left" in check.found
 
     def refuses(folder: Path) -> IO[bytes]:
         raise PermissionError(errno.EACCES, "Permission denied")
 
     check = disk.speed(tmp_path, need(MB), clock, refuses)
-    assert check.verdict is Verdict.FAILED
+    assert check.verdict is Grade.FAILED
     assert "Permission denied" in check.found and "storage.folder" in check.advice
 
 
@@ -168,25 +168,25 @@ def test_a_disk_without_room_is_not_filled(room: Callable[[int], None], tmp_path
     def untouched(folder: Path) -> IO[bytes]:
         raise AssertionError("it was written to")
 
-    assert disk.speed(tmp_path, None, VirtualClock(), untouched).verdict is Verdict.CANNOT_CHECK
+    assert disk.speed(tmp_path, None, VirtualClock(), untouched).verdict is Grade.CANNOT_CHECK
 
 
-@pytest.mark.parametrize(("free", "verdict"), [(25, Verdict.OK), (15, Verdict.WARNING), (9, Verdict.FAILED)])
-def test_room(room: Callable[[int], None], tmp_path: Path, free: int, verdict: Verdict) -> None:
+@pytest.mark.parametrize(("free", "verdict"), [(25, Grade.OK), (15, Grade.WARNING), (9, Grade.FAILED)])
+def test_room(room: Callable[[int], None], tmp_path: Path, free: int, verdict: Grade) -> None:
     room(free * GB)
     assert disk.room(tmp_path / "runs", need(100 * MB)).verdict is verdict
-    assert disk.room(tmp_path, None).verdict is Verdict.OK
+    assert disk.room(tmp_path, None).verdict is Grade.OK
 
 
 @pytest.mark.parametrize(
     ("free", "verdict"),
-    [(7 * GB, Verdict.OK), (4 * GB, Verdict.WARNING), (2 * GB, Verdict.FAILED), (None, Verdict.CANNOT_CHECK)],
+    [(7 * GB, Grade.OK), (4 * GB, Grade.WARNING), (2 * GB, Grade.FAILED), (None, Grade.CANNOT_CHECK)],
 )
-def test_memory(free: int | None, verdict: Verdict) -> None:
+def test_memory(free: int | None, verdict: Grade) -> None:
     check = memory(free, need(100 * MB))  # 1 GB of waiting frames and 2 GB of ring
     assert check.verdict is verdict
     assert "1 GB for frames that wait for the disk and 2 GB for the camera's ring" in check.expected
 
 
 def test_memory_without_a_plan() -> None:
-    assert memory(GB, None).verdict is Verdict.OK
+    assert memory(GB, None).verdict is Grade.OK

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from beamline.config.stages import StageSection
 from beamline.core.stop import ScanAborted
 from beamline.instrument import connect as devices
 from drivers.dcam.options import DcamOptions
 from drivers.frame_memory import FrameMemory
-from drivers.stages.pm16c.settings import PM16CSettings
 from tests.beamline.ball_scan import shipped
 from tests.beamline.closable import Closable
 
@@ -37,7 +37,7 @@ def test_every_camera_option_reaches_the_driver(
             progress(-19.5, "busy")
 
     made: list[Camera] = []
-    monkeypatch.setattr(PM16CSettings, "connect", lambda *args: Closable())
+    monkeypatch.setattr(StageSection, "connect", lambda *args: Closable())
     monkeypatch.setattr("drivers.dcam.camera.DcamCamera", Camera)
     said = {
         "library": "/opt/libdcamapi.so",
@@ -82,7 +82,7 @@ def test_a_stop_ends_the_wait_for_a_cold_sensor(monkeypatch: pytest.MonkeyPatch)
             raise ScanAborted("Interrupted")
 
     camera = Camera()
-    monkeypatch.setattr(PM16CSettings, "connect", lambda *args: stage)
+    monkeypatch.setattr(StageSection, "connect", lambda *args: stage)
     monkeypatch.setattr(devices, "make_camera", lambda *args: camera)
     with pytest.raises(ScanAborted):
         devices.connect(shipped("instrument", "devices.camera.cool_s=900"), check_stop=check_stop)

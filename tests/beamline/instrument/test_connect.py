@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from beamline.config import load as config
+from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
 from drivers.dcam.options import DcamOptions
 from drivers.errors import DeviceError
 from drivers.manual import ManualSampleMover, ManualShutter
 from drivers.protocols import TriggerSource
-from drivers.stages.pm16c.settings import PM16CSettings
 from tests.beamline.ball_scan import STAGES, shipped, small
 from tests.beamline.closable import Closable
 
@@ -79,7 +79,7 @@ def test_settings_that_a_device_would_refuse() -> None:
 def test_instrument_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stage is freed where the camera does not open; shutter and sample are the operator's."""
     stage, made = Closable(), []
-    monkeypatch.setattr(PM16CSettings, "connect", lambda *args: stage)
+    monkeypatch.setattr(StageSection, "connect", lambda *args: stage)
     with pytest.raises(DeviceError, match="camera"):
         devices.connect(shipped("instrument", "devices.camera.library=/nowhere/libdcamapi.so"))
     assert stage.closed == 1

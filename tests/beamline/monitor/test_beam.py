@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.monitor.beam import PATIENCE, Beam
-from beamline.monitor.change import Change
+from beamline.monitor.beam import PATIENCE, BeamCheck
+from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.digest import digest as frame_digest
 from beamline.monitor.view import grid_of, view_of
@@ -22,7 +22,7 @@ def only(flags: list[Flag]) -> list[Flag]:
 
 
 def drifting(light: Any, views: int = 120, **more: Any) -> list[Flag]:
-    return Blobs(views, counts=lambda view, image: image * light(view), **more).flags([Beam()])
+    return Blobs(views, counts=lambda view, image: image * light(view), **more).flags([BeamCheck()])
 
 
 @pytest.mark.parametrize("rate", [-5e-4, 5e-4])
@@ -86,17 +86,17 @@ def test_without_flats_dips_are_seen(fake: Any) -> None:
 
 def test_limits_can_be_set() -> None:
     scan = Blobs(80, counts=lambda view, light: light * (1 - 5e-4 * view))
-    assert scan.flags([Beam(drift=0.08)]) == []
+    assert scan.flags([BeamCheck(drift=0.08)]) == []
 
 
 def told(gains: Iterable[float], light: Iterable[float]) -> list[int]:
     """Views with a dip, where the fit says these gains and the image has this light."""
     flat = np.full((8, 16), 1000.0, np.float32)
-    grid, check, rows = grid_of(flat.shape, 4, 0 * flat, flat), Beam(), list[int]()
+    grid, check, rows = grid_of(flat.shape, 4, 0 * flat, flat), BeamCheck(), list[int]()
     state, digest = check.start(), frame_digest(np.ones((32, 64), np.uint16), 65535, 4)
     for row, (gain, left) in enumerate(zip(gains, light, strict=True)):
         view = view_of(flat * np.float32(0.5 * left), grid, row, row * STEP, 1.0)
-        change = Change(gain, 0.0, 0.0, 0.0, 0 * flat, 0.01) if row else None
+        change = SampleChange(gain, 0.0, 0.0, 0.0, 0 * flat, 0.01) if row else None
         frame = Frame(np.ones((32, 64), np.uint16), FrameKind.PROJECTION, row, row, row, row * STEP, row, 0.05)
         look = check.look(state, frame, digest, ScanContext(65535, 2048, grid=grid, view=view, change=change))
         state, rows = look.state, rows + ([row] if look.flag and look.flag.level is Level.ALARM else [])

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf as erf_of
 
 from beamline.monitor import watch
-from beamline.monitor.blur import FAR, STRIP, Blur, sharpness
+from beamline.monitor.blur import FAR, STRIP, BlurCheck, sharpness
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.digest import digest
 from drivers.frame import Frame, FrameKind
@@ -53,7 +53,7 @@ def scan(change: Change, views: int = 60, seed: int = 1, photons: float = OPEN) 
     radius, phase, size = rng.uniform(0, 55, 40), rng.uniform(0, 2 * pi, 40), rng.uniform(2, 6, 40)
     height = rng.uniform(0, ROWS, 40)
     row, col = np.mgrid[:ROWS, :COLS].astype(float)
-    monitor, found = watch.start(ScanContext(65535, ROWS * COLS, 0.1), [Blur()]), list[Flag]()
+    monitor, found = watch.start(ScanContext(65535, ROWS * COLS, 0.1), [BlurCheck()]), list[Flag]()
     for i in range(views + 6):
         light = np.zeros((ROWS, COLS))
         kind = FrameKind.DARK if i < 3 else FrameKind.FLAT if i < 6 else FrameKind.PROJECTION

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.monitor.change import SPAN, Change, change_of
-from beamline.monitor.view import View, grid_of, view_of
+from beamline.monitor.change import SPAN, SampleChange, change_of
+from beamline.monitor.view import CellView, grid_of, view_of
 from tests.beamline.monitor.blobs import BLOCK, COLS, OPEN, ROWS, STEP, Blobs
 
 SHAPE = (ROWS, COLS)
 GRID = grid_of(SHAPE, BLOCK, None, np.full(SHAPE, OPEN, np.float32))
 
 
-def view(i: float, gain: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -> View:
+def view(i: float, gain: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -> CellView:
     light = OPEN * (1 + gain) * np.exp(-Blobs().line_integrals(i, shift))  # type: ignore[arg-type]
     return view_of(light.astype(np.float32), GRID, int(i), round(i) * STEP, 1.0)
 
@@ -23,7 +23,7 @@ def view(i: float, gain: float = 0.0, shift: tuple[float, float] = (0.0, 0.0)) -
 BEFORE = [view(i) for i in range(SPAN)]
 
 
-def change(**of_view: Any) -> Change:
+def change(**of_view: Any) -> SampleChange:
     found = change_of(view(of_view.pop("i", SPAN), **of_view), BEFORE, GRID)
     assert found is not None
     return found

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level, ScanContext
-from beamline.monitor.dark import Dark
+from beamline.monitor.dark import DarkCheck
 from beamline.monitor.digest import digest
 from drivers.frame import Frame, FrameKind
 
@@ -49,9 +49,9 @@ def small_darks(n: int, rng: np.random.Generator) -> list[Frame]:
 
 
 def flags_of(frames: list[Frame], preview_bin: int) -> list[Flag]:
-    state, found = Dark().start(), []
+    state, found = DarkCheck().start(), []
     for frame in frames:
-        look = Dark().look(state, frame, digest(frame.counts, 65535, preview_bin), ScanContext(65535, 32 * 48))
+        look = DarkCheck().look(state, frame, digest(frame.counts, 65535, preview_bin), ScanContext(65535, 32 * 48))
         state = look.state
         found += [] if look.flag is None else [look.flag]
     return found

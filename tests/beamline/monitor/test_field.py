@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.field import FieldOfView
+from beamline.monitor.field import FieldOfViewCheck
 from drivers.frame import FrameKind
 from tests.beamline.monitor.blobs import BLOCK, COLS, ROWS, Blobs
 from tests.beamline.monitor.conftest import COLS as FAKE_COLS
@@ -16,7 +16,7 @@ from tests.beamline.monitor.conftest import ROWS as FAKE_ROWS
 
 
 def only(scan: Blobs) -> list[Flag]:
-    return scan.flags([FieldOfView()])
+    return scan.flags([FieldOfViewCheck()])
 
 
 @pytest.mark.parametrize(
@@ -31,14 +31,14 @@ def test_a_shadow_in_the_flats_is_said_once_with_its_place(fake: Any, shadow: An
     light = fake.expected(None)
     light[shadow] = 0
     flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
-    (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfView()])
+    (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfViewCheck()])
     assert (flag.level, flag.frame, flag.region) == (Level.WARN, flats[0].index, region)
     assert flag.score == pytest.approx(light[light == 0].size / light.size)
     assert named in flag.advice
 
 
 def test_flats_without_beam_are_said_in_a_sentence_and_not_by_bands(fake: Any) -> None:
-    (flag,) = fake.flags([*fake.darks(), *fake.flats(5, light=0.0)], checks=[FieldOfView()])
+    (flag,) = fake.flags([*fake.darks(), *fake.flats(5, light=0.0)], checks=[FieldOfViewCheck()])
     assert (flag.level, flag.score) == (Level.WARN, 1.0)
     assert "shutter" in flag.advice and "rows" not in flag.advice
 
@@ -48,7 +48,7 @@ def test_of_many_shadows_four_are_named(fake: Any) -> None:
     for first in range(0, FAKE_COLS, 16):
         light[:, first : first + 4] = 0
     flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
-    (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfView()])
+    (flag,) = fake.flags([*fake.darks(), *flats], checks=[FieldOfViewCheck()])
     assert "columns 48 ... 51, and 2 more" in flag.advice
 
 
@@ -56,7 +56,7 @@ def test_a_profile_and_a_line_in_the_shadow_of_a_slit_are_no_shadow(fake: Any) -
     light = fake.expected(None) * np.linspace(0.3, 1.0, FAKE_COLS)
     light[0] = 0
     flats = [fake.frame(FrameKind.FLAT, light) for _ in range(5)]
-    assert fake.flags([*fake.darks(), *flats], checks=[FieldOfView()]) == []
+    assert fake.flags([*fake.darks(), *flats], checks=[FieldOfViewCheck()]) == []
 
 
 @pytest.mark.parametrize(("first", "sides"), [(0, "left"), (COLS - 8, "right")])

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.floater import Floater
+from beamline.monitor.floater import FloaterCheck
 from tests.beamline.monitor.blobs import BLOCK, COLS, STEP, Blobs, blob
 
 BEGINS = 40
 
 
 def only(scan: Blobs) -> list[Flag]:
-    return scan.flags([Floater()])
+    return scan.flags([FloaterCheck()])
 
 
 def crossing(speed: float, depth: float = 0.05, row: float = 12.0, size: float = 0.75) -> Any:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.gain import Gain
+from beamline.monitor.gain import GainCheck
 from tests.beamline.monitor.blobs import COLS, Blobs
 
 
 def only(scan: Blobs) -> list[Flag]:
-    return scan.flags([Gain()])
+    return scan.flags([GainCheck()])
 
 
 @pytest.mark.parametrize(("share", "level"), [(0.02, Level.WARN), (-0.02, Level.WARN), (0.3, Level.ALARM)])

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.ghost import Ghost
+from beamline.monitor.ghost import GhostCheck
 from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs, blob
 
 BEGINS = 50
 
 
 def only(scan: Blobs) -> list[Flag]:
-    return scan.flags([Ghost()])
+    return scan.flags([GhostCheck()])
 
 
 def fog(gain: float, speed: float, half_width: float = 30.0) -> Any:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level, Policy
-from beamline.monitor.lost import Lost
+from beamline.monitor.lost import LostCheck
 from tests.beamline.monitor.blobs import Blobs
 
 
 def only(scan: Blobs) -> list[Flag]:
-    return scan.flags([Lost()])
+    return scan.flags([LostCheck()])
 
 
 @pytest.mark.parametrize("left", [0.0, 0.02, 0.4])

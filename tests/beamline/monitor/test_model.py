@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.model import CALIBRATION, Model
+from beamline.monitor.model import CALIBRATION, ModelCheck
 from tests.beamline.monitor.blobs import BLOCK, COLS, ROWS, Blobs, blob
 
 MISFIT = blob(8, 100, 3.0, 0.3)
@@ -21,7 +21,7 @@ def flags(scan: Blobs) -> list[Flag]:
         asked.append(cell)
         return (scan.line_integrals(round(angle / scan.step)) - MISFIT + 0.02).astype(np.float32)
 
-    found = scan.flags([Model()], model=model)
+    found = scan.flags([ModelCheck()], model=model)
     assert set(asked) == {BLOCK}
     return found
 
@@ -49,5 +49,5 @@ def test_less_absorption_is_said_as_such() -> None:
 
 def test_without_a_volume_and_in_the_first_views_it_says_nothing() -> None:
     there = np.ones((ROWS, COLS)) * blob(20, 50, 1.5, 0.5)
-    assert Blobs(30, depth=lambda view, image: image + there * (view == 20)).flags([Model()]) == []
+    assert Blobs(30, depth=lambda view, image: image + there * (view == 20)).flags([ModelCheck()]) == []
     assert flags(Blobs(30, depth=lambda view, image: image + there * (view == CALIBRATION - 2))) == []

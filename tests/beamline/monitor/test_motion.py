@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.motion import Motion
+from beamline.monitor.motion import MotionCheck
 from tests.beamline.monitor.blobs import BLOCK, Blobs
 from tests.beamline.monitor.test_ghost import fog
 
 
 def only(scan: Blobs) -> list[Flag]:
-    return scan.flags([Motion()])
+    return scan.flags([MotionCheck()])
 
 
 def jumping(down: float, across: float, slip: int = 0) -> Blobs:

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.opposite import Opposite
+from beamline.monitor.opposite import OppositeCheck
 from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs
 
 STEP = np.radians(2)
@@ -35,7 +35,7 @@ class Moved(Blobs):
 
 
 def only(scan: Blobs, **known: object) -> list[Flag]:
-    return scan.flags([Opposite()], **known)
+    return scan.flags([OppositeCheck()], **known)
 
 
 @pytest.mark.parametrize("axis", [0.0, 6.8, -31.0])

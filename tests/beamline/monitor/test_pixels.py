@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.pixels import Pixels
+from beamline.monitor.pixels import PixelsCheck
 from drivers.frame import Frame
 
 
 def only(fake: Any, frames: list[Frame]) -> list[Flag]:
-    return fake.flags(frames, checks=[Pixels()])  # type: ignore[no-any-return]
+    return fake.flags(frames, checks=[PixelsCheck()])  # type: ignore[no-any-return]
 
 
 def scan(fake: Any, dead: list[tuple[int, int]], flats: int = 5) -> list[Frame]:

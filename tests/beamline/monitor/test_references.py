@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from beamline.monitor.digest import digest
-from beamline.monitor.references import JudgedGroup, Reference, ReferenceLimits, full_scale, judge
+from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from drivers.frame import FrameKind
 
 SHAPE = (64, 80)
@@ -34,18 +34,18 @@ def frames(n: int, photons: float | NDArray[np.float64], seed: int, gain: float 
     ]
 
 
-def group(images: Images, kind: FrameKind, first: int = 0, exposure: float = 0.1) -> list[Reference]:
+def group(images: Images, kind: FrameKind, first: int = 0, exposure: float = 0.1) -> list[ReferenceFrame]:
     return [
-        Reference.of(first + i, kind, exposure, digest(image.astype(np.uint16), FULL), 4)
+        ReferenceFrame.of(first + i, kind, exposure, digest(image.astype(np.uint16), FULL), 4)
         for i, image in enumerate(images)
     ]
 
 
-def darks(photons: float = 0.0, n: int = 5) -> list[Reference]:
+def darks(photons: float = 0.0, n: int = 5) -> list[ReferenceFrame]:
     return group(frames(n, photons, 1), FrameKind.DARK)
 
 
-def flats(images: Images, first: int = 10) -> list[Reference]:
+def flats(images: Images, first: int = 10) -> list[ReferenceFrame]:
     return group(images, FrameKind.FLAT, first)
 
 

@@ -11,8 +11,8 @@ import pytest
 from beamline.monitor import watch as scan
 from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import digest
-from beamline.monitor.stuck import Stuck
-from beamline.monitor.timing import Timing
+from beamline.monitor.stuck import StuckCheck
+from beamline.monitor.timing import TimingCheck
 from drivers.frame import Frame, FrameKind
 
 CONTEXT = ScanContext(saturation=65535, pixels=100)
@@ -97,12 +97,12 @@ def test_no_check_fails_on_scans_without_light_or_with_far_too_much(
 
 
 def test_a_check_that_raises_names_itself_and_the_others_go_on(fake: Any) -> None:
-    class Broken(Stuck):
+    class Broken(StuckCheck):
         def look(self, *_: object) -> Any:
             raise ZeroDivisionError
 
     frame = fake.darks(1)[0]
-    monitor = scan.start(CONTEXT, (Broken(), Timing()))
+    monitor = scan.start(CONTEXT, (Broken(), TimingCheck()))
     with pytest.raises(scan.CheckError, match="the check stuck failed"):
         scan.look(monitor, frame, digest(frame.counts, CONTEXT.saturation, 4))
     after, _ = scan.look(scan.without(monitor, "stuck"), frame, digest(frame.counts, CONTEXT.saturation, 4))

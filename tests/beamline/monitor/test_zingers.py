@@ -11,7 +11,7 @@ import pytest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
 from beamline.monitor.spots import Spots, spots_of
-from beamline.monitor.zingers import VIEWS, Zingers
+from beamline.monitor.zingers import VIEWS, ZingersCheck
 from drivers.frame import Frame
 
 SATURATION, BIN = 65535, 4
@@ -62,7 +62,7 @@ def only(fake: Any, frames: Sequence[Frame]) -> list[Flag]:
 def test_they_are_said_once_and_warned_of_where_there_are_many_and_never_saturation(
     fake: Any, rng: np.random.Generator
 ) -> None:
-    limit = Zingers().warn * 64 * 96  # less than one
+    limit = ZingersCheck().warn * 64 * 96  # less than one
     frames = fake.references() + fake.views(VIEWS + 3)
     struck(frames[-2], 30, 60_000, rng)
     flags = only(fake, frames)
@@ -74,6 +74,6 @@ def test_a_few_are_a_fact(fake: Any, rng: np.random.Generator) -> None:
     frames = fake.references() + fake.views(VIEWS + 5)
     struck(frames[14], 2, 20_000, rng)
     struck(frames[19], 3, 20_000, rng)
-    flags = fake.flags(frames, checks=[Zingers(warn=1.0)])
+    flags = fake.flags(frames, checks=[ZingersCheck(warn=1.0)])
     assert [(flag.level, flag.frame) for flag in flags] == [(Level.INFO, 9 + VIEWS)]
     assert flags[0].score == pytest.approx(5 / VIEWS / (64 * 96)) and "have 5 bright spots" in flags[0].advice

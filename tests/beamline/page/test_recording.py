@@ -10,14 +10,14 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.page.recording import Recording
-from beamline.page.tiles import Region
+from beamline.page.tiles import TileRegion
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()
-WHOLE = Region(0, 4, 0, 40)
+WHOLE = TileRegion(0, 4, 0, 40)
 
 
 def test_a_view_over_the_flats_is_the_transmission(tmp_path: Path) -> None:
@@ -30,7 +30,7 @@ def test_a_view_over_the_flats_is_the_transmission(tmp_path: Path) -> None:
 
 def test_without_correction_a_view_is_counts(tmp_path: Path) -> None:
     recording = Recording(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}))
-    values, *_ = recording.picture(10, Region(1, 3, 5, 20), corrected=False)
+    values, *_ = recording.picture(10, TileRegion(1, 3, 5, 20), corrected=False)
     recording.close()
     np.testing.assert_array_equal(values, SCAN.counts()[6, 1:3, 5:20])
 
@@ -46,7 +46,7 @@ def test_the_sinogram_is_a_row_of_the_views_alone(tmp_path: Path) -> None:
 def test_a_region_s_trace_is_its_mean_in_each_frame(tmp_path: Path) -> None:
     frames = frames_of(SCAN)
     recording = Recording(write_flagged(tmp_path / "scan.h5", frames, {}))
-    trace = recording.trace(Region(0, 4, 8, 16), first=3)
+    trace = recording.trace(TileRegion(0, 4, 8, 16), first=3)
     recording.close()
     np.testing.assert_allclose(trace, [frame.counts[:, 8:16].mean() for frame in frames[3:]], rtol=1e-5)
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.page.tiles import MOST, Region, bin_mean, pack
+from beamline.page.tiles import MOST, TileRegion, bin_mean, pack
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 4), st.integers(1, 4))
@@ -37,11 +37,11 @@ def test_a_picture_of_one_value_is_packed(value: float) -> None:
 
 @given(*[st.integers(0, 10**9)] * 4)
 def test_any_region_has_a_pixel_inside_the_picture(a: int, b: int, c: int, d: int) -> None:
-    inside = Region(a, b, c, d).inside((7, 5))
+    inside = TileRegion(a, b, c, d).inside((7, 5))
     assert 0 <= inside.first_row < inside.last_row <= 7
     assert 0 <= inside.first_col < inside.last_col <= 5
 
 
 def test_no_tile_is_larger_than_a_screen() -> None:
-    whole = Region(0, 2304, 0, 4096)
+    whole = TileRegion(0, 2304, 0, 4096)
     assert bin_mean(np.zeros(whole.shape), (whole.binning(),) * 2).shape == (576, MOST)

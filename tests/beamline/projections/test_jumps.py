@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
-from beamline.monitor.motion import Motion
-from beamline.monitor.opposite import Opposite
+from beamline.monitor.motion import MotionCheck
+from beamline.monitor.opposite import OppositeCheck
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
@@ -39,8 +39,8 @@ def scan(path: Path, views: NDArray[np.float32], *jumps: int) -> Path:
     with NXtomoWriter(path / "scan.h5", ScanInfo("jump", pixel_size_mm=1.0), SHAPE, clock=SystemClock()) as writer:
         for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
             frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
-            said = [Flag(Motion.name, Level.ALARM, i, 1.0, 0.5, "")] if i in rows else []
-            said += [Flag(Opposite.name, Level.WARN, i, 1.0, 0.5, "")] if i - 3 in rows else []
+            said = [Flag(MotionCheck.name, Level.ALARM, i, 1.0, 0.5, "")] if i in rows else []
+            said += [Flag(OppositeCheck.name, Level.WARN, i, 1.0, 0.5, "")] if i - 3 in rows else []
             writer.append(frame, digest(frame.counts), said)
     return path / "scan.h5"
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from beamline.cli.main import main
 from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
-from beamline.monitor.model import Model
+from beamline.monitor.model import ModelCheck
 from beamline.projections.rendered import rendered
 from beamline.projections.replay import replay
 from beamline.storage.readers.base import ScanSource
@@ -96,7 +96,7 @@ def test_a_view_that_the_volume_does_not_explain_is_flagged_with_its_place(share
         model = rendered(tmp_path / "v.h5", source)
         changed = Changed(source, speck)
         for scan, expected in ((source, []), (changed, [52, 53, 54])):
-            found = [flag for judged in replay(scan, [Model()], model=model) for flag in judged.flags]  # type: ignore[arg-type]
+            found = [flag for judged in replay(scan, [ModelCheck()], model=model) for flag in judged.flags]  # type: ignore[arg-type]
             assert [flag.frame for flag in found] == expected
         for flag in found:
             assert flag.region is not None

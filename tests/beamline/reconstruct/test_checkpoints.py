@@ -81,17 +81,6 @@ def test_fewer_views_are_told_by_number(prepared: PreparedProjections) -> None:
     assert "n_views (20, 30 in the file)" in found
 
 
-def test_a_checkpoint_that_names_no_kernel_is_of_gaussians(tmp_path: Path, prepared: PreparedProjections) -> None:
-    origin = origin_of(prepared, replace(SETTINGS, kernel=Kernel.GAUSSIAN), OTHERS)
-    older = {name: value for name, value in origin.items() if name != "setting kernel"}
-    state = {name: values for name, values in _state().items() if name != "kernel_exponent"}
-    write_checkpoint(tmp_path / "fit.h5", Checkpoint(state, older, 100))
-    resumed = CheckpointOptions(None, tmp_path / "fit.h5")
-    assert resumed.begin(origin, 100, lambda said: None) is not None
-    with pytest.raises(DataError, match=r"kernel \(compact:1.5, gaussian in the file\)"):
-        resumed.begin(origin_of(prepared, replace(SETTINGS, kernel=Kernel.COMPACT), OTHERS), 100, lambda said: None)
-
-
 def test_views_held_out_do_not_matter(prepared: PreparedProjections) -> None:
     spoilt = replace(prepared, held_out=(np.zeros((1, 2, 40), np.float32), prepared.geometry.select([0])))
     assert not differences(origin_of(spoilt, SETTINGS, OTHERS), origin_of(prepared, SETTINGS, OTHERS))

@@ -48,7 +48,7 @@ def _report(**changes: object) -> Report:
 def test_page_nests_is_self_contained_and_escapes() -> None:
     page = to_html(_report())
     parsed = parsed_page(page)
-    assert page.startswith("<!DOCTYPE html>")
+    assert page.startswith("<!DOCTYPE html>") and "@media print" in page
     text = "".join(parsed.text)
     for said in ("battery <1>", "31 dB & more", "beamline recon 'my scan.h5' --axis 85.75", "90 of 180", "110/110"):
         assert said in text

@@ -18,6 +18,7 @@ from beamline.scan.ledger import LedgerError
 from drivers.frame import Frame, FrameKind
 from drivers.protocols import CameraSettings, Devices, TriggerSource
 from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures
 from simulators.devices.camera import SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
@@ -45,7 +46,7 @@ class FaultyInstrument:
         self.line = TriggerLine(self.clock)
         box = PM16CBuild(BoxBuild(counts_per_turn=36000, lost=pulses_lost)).controller(self.clock, self.line)
         figures = StageFigures(36000, math.radians(60), math.radians(60), math.radians(-90), math.radians(270))
-        self.stage = PM16CSettings(figures).connect(register(f"acquire-{uuid4().hex}", box), self.clock)
+        self.stage = PM16CStage(register(f"acquire-{uuid4().hex}", box), PM16CSettings(figures), self.clock)
         self.shutter, self.sample = SimulatedShutter(), SimulatedSampleMover()
         self.camera = SimulatedOrcaQuest(
             load_scene(SCENE), self.line, self.clock, 0, self.shutter, self.sample, lost=lost, ignored=ignored

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.scan.braking import Braking, by_motion, by_nothing, by_number, placing
-from beamline.scan.ledger import EXTRA, Exposed, Ledger, Train, assign, enter
+from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, assign, enter
 
 PERIOD, FIRST, N = 0.05, 1_795_152_000.0, 200
 STEADY, TOLD = 20, 20.3
@@ -56,7 +56,7 @@ class Stage:
 def confirmed(braking: Braking, times: Sequence[float], last: int = STEADY) -> tuple[object, list[int]]:
     """What confirms frames at these times, and their triggers; up to the `last` they were entered as they came."""
     ledger = Ledger(Train(np.arange(float(N)), PERIOD, FIRST))
-    frames = [Exposed(stamp, time) for stamp, time in enumerate(times)]
+    frames = [DeliveredFrame(stamp, time) for stamp, time in enumerate(times)]
     for frame in frames[: last + 1]:
         ledger, _ = assign(ledger, frame.framestamp, frame.time)
     left, found = frames[last + 1 :], []
@@ -124,4 +124,4 @@ def test_a_stage_that_braked_before_it_was_told_confirms_nothing() -> None:
 def test_where_the_start_is_vague_and_no_frame_came_before_nothing_is_confirmed() -> None:
     ledger = Ledger(Train(np.arange(float(N)), PERIOD, FIRST, tolerance=PERIOD))
     braking = Braking(FIRST - 0.3 * PERIOD, 2.7, 1 / (PERIOD * PERIOD * 6))
-    assert placing(ledger, braking, [Exposed(0, FIRST), Exposed(1, FIRST + 1.2 * PERIOD)]) is by_nothing
+    assert placing(ledger, braking, [DeliveredFrame(0, FIRST), DeliveredFrame(1, FIRST + 1.2 * PERIOD)]) is by_nothing

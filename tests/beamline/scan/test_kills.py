@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.config.models import Storage
+from beamline.config.models import StorageSection
 from beamline.core.errors import ConfigError, DataError
 from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
@@ -91,7 +91,7 @@ def kills(folder: Path, n: int, seed: int) -> dict[str, int]:
             found["none"] += 1
             continue
         assert run is not None
-        assert done[0].dropped <= Storage().flush_every  # frames come faster than they are written
+        assert done[0].dropped <= StorageSection().flush_every  # frames come faster than they are written
         assert _assert_frames(done[0].path) == done[0].frames
         found["recovered" if done[0].changed else "whole"] += 1
         found["frames"] += done[0].frames

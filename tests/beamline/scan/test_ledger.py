@@ -16,9 +16,9 @@ from beamline.scan.ledger import (
     EXTRA,
     LOOK,
     Account,
-    Entry,
-    Exposed,
+    DeliveredFrame,
     Ledger,
+    LedgerEntry,
     LedgerError,
     Train,
     assign,
@@ -56,11 +56,11 @@ def camera(
     return sent
 
 
-def book(train: Train, sent: list[Sent]) -> tuple[list[Entry], Account]:
+def book(train: Train, sent: list[Sent]) -> tuple[list[LedgerEntry], Account]:
     """Frames one after the other, as they come; the last ones when there will be no more."""
-    ledger, entries, waiting = Ledger(train), list[Entry](), list[Exposed]()
+    ledger, entries, waiting = Ledger(train), list[LedgerEntry](), list[DeliveredFrame]()
     for frame in sent:
-        waiting.append(Exposed(frame.framestamp, frame.time))
+        waiting.append(DeliveredFrame(frame.framestamp, frame.time))
         assert len(waiting) <= LOOK
         while waiting and (entered := enter(ledger, waiting, last=frame is sent[-1])):
             ledger, entry = entered

@@ -31,7 +31,7 @@ from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import JOINED, joined_file_of
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.overlay import Overlay
+from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
 from beamline.storage.writer_lock import WriterLock
@@ -191,8 +191,8 @@ def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypat
         with open_scan(path) as source, h5py.File(run / "scan.h5") as part:
             frames = int(part[layout.COMMITTED][()])
             assert source.part_starts.tolist() == [0, frames]
-            assert Overlay(source, darks=images).part_starts.tolist() == [0, frames + 2]
-            assert Overlay(source, flats=images).part_starts.tolist() == [0]
+            assert OverlaidSource(source, darks=images).part_starts.tolist() == [0, frames + 2]
+            assert OverlaidSource(source, flats=images).part_starts.tolist() == [0]
     with open_scan(run / "joined.h5") as source:
         selection = Selection(axis_col=5.5, steps=(Air("none"), Flags("ignore")))
         prepared = prepare_projections(source, selection, lambda said: None)

@@ -22,7 +22,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import connect
 from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.mass import Mass
+from beamline.monitor.mass import MassCheck
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
@@ -297,7 +297,7 @@ def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.Mo
     def broken(*_: object) -> None:
         raise ZeroDivisionError("defect")
 
-    monkeypatch.setattr(Mass, "look", broken)
+    monkeypatch.setattr(MassCheck, "look", broken)
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
     (warning,) = ran.of("warning")
     assert "the check mass failed at frame 0 and is off, the other checks go on" in warning.data["message"]

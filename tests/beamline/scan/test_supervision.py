@@ -16,7 +16,7 @@ import pytest
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import Cause, PauseRequest, StopRequest
-from beamline.instrument.connect import Instrument
+from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
 from beamline.scan.states import State
@@ -143,7 +143,7 @@ def test_a_scan_without_beam_at_its_start_waits_for_it(tmp_path: Path) -> None:
         def close(self) -> None: ...
 
     class Guarded(FakeInstrument):
-        def connected(self) -> Instrument:
+        def connected(self) -> ConnectedDevices:
             return replace(super().connected(), beam_monitor=Returning())
 
     beam = (

@@ -1,4 +1,4 @@
-"""docs/file_layout.md names every path, file and key that is written, and none that is not."""
+"""docs/file_layout.md, scan_layout.md and volume_layout.md name what is written, and nothing else."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ from tests.beamline.ran import Ran
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 from tests.beamline.storage.conftest import StandingClock
 
-PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = "\n".join((DOCS / f"{name}_layout.md").read_text(encoding="utf-8") for name in ("file", "scan", "volume"))
 SCAN = TwoCylinders(shape=(4, 40), pixel_size_mm=0.5)
 NOT_OF_EVERY_RUN = {
     "scan.labels.json", "recon.h5", "recon.snapshot.h5", "recon.live.png", "recon.log", "report.html", "watchdog.log",

@@ -12,13 +12,13 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage import journal
-from beamline.storage.journal import Changes, finish, journal_of, pending
+from beamline.storage.journal import FileChanges, finish, journal_of, pending
 from beamline.storage.overlay import Overlay
 
 OLD = bytes(range(256)) * 40
 
 
-def _changed(path: Path) -> tuple[Changes, bytes]:
+def _changed(path: Path) -> tuple[FileChanges, bytes]:
     """A byte in one page, bytes over the edge of two others, and a longer file; and the file as it shall be."""
     overlay, expected = Overlay(path), bytearray(OLD)
     for at, new in ((5, b"\xff"), (8190, b"abcd"), (len(OLD) - 2, b"longer than before")):
@@ -38,7 +38,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "s.h5"
 
 
-def _begun(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Changes, bytes]:
+def _begun(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[FileChanges, bytes]:
     """The journal is there, and the program was stopped."""
     changes, expected = _changed(path)
 
@@ -69,7 +69,7 @@ def test_beyond_its_end_a_file_is_zero(path: Path) -> None:
     overlay.seek(len(OLD) - 1)
     assert overlay.read(101) == OLD[-1:] + bytes(100)
     overlay.truncate(10)
-    assert overlay.changes() == Changes(path, len(OLD), ())  # never shorter than it is
+    assert overlay.changes() == FileChanges(path, len(OLD), ())  # never shorter than it is
 
 
 def test_changes_that_were_begun_are_seen_and_ended(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,12 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.projections.replay import replay
+from beamline.storage.archive import archive
 from beamline.storage.describe import describe
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import views_in
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recover import recover
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from drivers.frame import Frame, FrameKind
@@ -47,6 +49,21 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(write: Write, frames
         assert len(views_in(file)) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
     with pytest.raises(DataError, match=rf"differs from the checksum written with it: {ROW}\..* Nothing was written"):
         ingest(path, path.with_name("copy.h5"))
+
+
+def test_recover_and_archive_say_it(write: Write, frames: list[Frame]) -> None:
+    path = write(frames)
+    _flip(path, layout.ANGLE, ROW, 3)
+    before, small = path.read_bytes(), path.with_name("small.h5")
+    done = recover(path)
+    assert (done.changed, done.altered) == (False, (ROW,))
+    assert f"cannot be mended, with {len(frames)} frames: what it says of frames {ROW} is not as it was" in done.said()
+    with pytest.raises(DataError, match=rf"written with it: {ROW}\..*--keep-damaged. Nothing was written"):
+        archive(path, small)
+    assert path.read_bytes() == before and not small.exists()
+    assert archive(path, small, keep_damaged=True).altered == (ROW,)
+    with open_scan(small) as source:
+        assert source.altered == {ROW}
 
 
 def test_a_view_that_was_taken_again_keeps_its_checksum(write: Write, frames: list[Frame]) -> None:

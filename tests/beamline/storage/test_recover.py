@@ -110,6 +110,19 @@ def test_a_file_that_just_changed_is_left_alone_where_no_lock_tells(
         recover(died)
 
 
+def test_what_a_dead_writers_file_says_otherwise_of_a_frame_is_named(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame]
+) -> None:
+    _written(tmp_path / "s.h5", frames[:10], clock).close()
+    with h5py.File(tmp_path / "s.h5", "r+", libver=layout.LIBVER) as file:
+        file[layout.TIME][4] += 1
+        file.flush()
+        shutil.copy(tmp_path / "s.h5", tmp_path / "died.h5")
+    done = recover(_aged(tmp_path / "died.h5"))
+    assert (done.changed, done.altered) == (True, (4,))
+    assert "10 frames recovered; what it says of frames 4 is not as it was" in done.said()
+
+
 @pytest.mark.parametrize("ahead", [1e3, 1e6])
 def test_a_file_of_a_clock_that_is_ahead_is_recovered(
     tmp_path: Path, clock: StandingClock, frames: list[Frame], ahead: float

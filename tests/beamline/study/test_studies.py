@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from beamline.study.studies import STUDIES, Row, ViewSet, averaged
+from beamline.study.studies import STUDIES, StudyRow, ViewSet, averaged
 
 HALF_TURN = np.radians(np.arange(1800) * 0.1)
 
 
-def rows(name: str, angles: np.ndarray = HALF_TURN, draws: int = 3) -> dict[str, Row]:
+def rows(name: str, angles: np.ndarray = HALF_TURN, draws: int = 3) -> dict[str, StudyRow]:
     return {row.label: row for row in STUDIES[name].rows(ViewSet(angles, np.pi, draws=draws))}
 
 
-def degrees(row: Row, angles: np.ndarray = HALF_TURN) -> np.ndarray:
+def degrees(row: StudyRow, angles: np.ndarray = HALF_TURN) -> np.ndarray:
     assert row.groups is not None
     return np.degrees(angles[row.groups[:, 0]])
 

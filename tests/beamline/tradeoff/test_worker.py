@@ -114,12 +114,6 @@ def test_iterations(data: Data, method: str) -> None:
     assert len(more["curve"]) == 4 and more["curve_of"] == "views used" and more["gaussians"] is None
 
 
-def test_the_two_precisions(data: Data) -> None:
-    found = run(Trial("precision", "r2", 27), data, 0, _silent)
-    assert found["details"]["difference"] < 0.1
-    assert found["seconds"] == found["details"]["seconds_float32"]
-
-
 def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
     fine = Geometry.parallel([0.0], (8, 12), 0.5)
     coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.xafs.contrast import Curve
+from beamline.xafs.contrast import XafsCurve
 from beamline.xafs.measured import AbsorptionTable, FileOptions, Radiographs, open_measured, open_series
 from beamline.xafs.series import Series
 
@@ -133,7 +133,7 @@ def test_a_series_is_of_the_range_and_regions_asked_for(tmp_path: Path) -> None:
 def test_a_table_is_a_curve_already(tmp_path: Path) -> None:
     (tmp_path / "mu.txt").write_text("8.32 3\n8.30 1\n8.31 2\n8.4 9", encoding="utf-8")
     with open_series(tmp_path / "mu.txt", FileOptions(high=8.35)) as curve:
-        assert isinstance(curve, Curve)
+        assert isinstance(curve, XafsCurve)
         assert (curve.energies.tolist(), curve.absorption.tolist()) == ([8.30, 8.31, 8.32], [1.0, 2.0, 3.0])
     with (
         pytest.raises(ConfigError, match="has no frames"),

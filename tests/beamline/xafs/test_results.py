@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.xafs.contrast import Curve
-from beamline.xafs.edge import Edge
+from beamline.xafs.contrast import XafsCurve
+from beamline.xafs.edge import AbsorptionEdge
 from beamline.xafs.results import XafsResult, lines, refuse_existing_results, table, write
 
 pytestmark = pytest.mark.usefixtures("real_pictures")
 
 ENERGIES = np.linspace(8.30, 8.40, 11)
 ABSORPTION = np.linspace(1.0, 2.0, 11)
-SEEN = Edge(True, "", 8.3437, 8.3485, 0.2, 0.01)
-FOUND = XafsResult("NMC811", Curve(ENERGIES, ABSORPTION, 0.1 * ABSORPTION, np.full(11, 0.01), "1/mm"), SEEN)
+SEEN = AbsorptionEdge(True, "", 8.3437, 8.3485, 0.2, 0.01)
+FOUND = XafsResult("NMC811", XafsCurve(ENERGIES, ABSORPTION, 0.1 * ABSORPTION, np.full(11, 0.01), "1/mm"), SEEN)
 
 
 def test_people_are_told_edge_line_and_best() -> None:
@@ -30,12 +30,12 @@ def test_people_are_told_edge_line_and_best() -> None:
         "best        8.4000 keV: highest contrast-to-noise of 20 a pixel at this thickness "
         "(95 % of it from 8.3900 to 8.4000 keV)",
     ]
-    bare = replace(FOUND, edge=replace(SEEN, white_line=None), curve=Curve(ENERGIES, ABSORPTION))
+    bare = replace(FOUND, edge=replace(SEEN, white_line=None), curve=XafsCurve(ENERGIES, ABSORPTION))
     assert lines(bare)[2:] == [
         "white line  none above the edge within the range",
         "best        8.4000 keV: highest absorption (95 % of it from 8.3900 to 8.4000 keV)",
     ]
-    none = replace(FOUND, edge=Edge(False, "it is smooth", None, None, 0.0, 0.0))
+    none = replace(FOUND, edge=AbsorptionEdge(False, "it is smooth", None, None, 0.0, 0.0))
     assert lines(none)[1] == "no edge     it is smooth"
     dark = replace(FOUND, curve=replace(FOUND.curve, left_out=np.array([8.41, 8.42])))
     assert lines(dark)[1] == (
@@ -65,7 +65,7 @@ def test_the_table_has_a_row_an_energy() -> None:
     assert list(rows[0]) == ["energy_kev", "absorption (1/mm)", "contrast", "noise", "contrast_to_noise"]
     np.testing.assert_allclose([float(row["energy_kev"]) for row in rows], ENERGIES)
     np.testing.assert_allclose([float(row["contrast_to_noise"]) for row in rows], 10 * ABSORPTION, rtol=1e-6)
-    assert table(Curve(ENERGIES, ABSORPTION)).splitlines()[0] == "energy_kev,absorption (line integral)"
+    assert table(XafsCurve(ENERGIES, ABSORPTION)).splitlines()[0] == "energy_kev,absorption (line integral)"
 
 
 def test_picture_and_table_are_written_and_never_overwritten(tmp_path: Path) -> None:

@@ -12,11 +12,12 @@ from types import TracebackType
 from typing import Self
 from uuid import uuid4
 
-from beamline.instrument.connect import Instrument
+from beamline.instrument.connect import ConnectedDevices
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
 from drivers.protocols import Devices
 from drivers.stages.pm16c.settings import PM16CSettings
+from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
@@ -51,12 +52,12 @@ class FlyRig:
         build = PM16CBuild(BoxBuild(counts_per_turn=COUNTS, lost=lost_pulses, stall_at=stall_at))
         box = build.controller(self.clock, self.line)
         figures = StageFigures(COUNTS, math.radians(30), math.radians(60))
-        self.stage = PM16CSettings(figures).connect(register(f"fly-{uuid4().hex}", box), self.clock)
+        self.stage = PM16CStage(register(f"fly-{uuid4().hex}", box), PM16CSettings(figures), self.clock)
         self.camera: DcamCamera = world.connect(options)
 
-    def connected(self) -> Instrument:
+    def connected(self) -> ConnectedDevices:
         devices = Devices(self.stage, self.camera, SimulatedShutter(), SimulatedSampleMover())
-        return Instrument(devices, self.clock, None, self.close)
+        return ConnectedDevices(devices, self.clock, None, self.close)
 
     def close(self) -> None:
         self.stage.close()

@@ -25,7 +25,7 @@ import serial
 from beamline.config.load import Config, config_folder, load
 from beamline.core.events import Emit, Event
 from beamline.core.stop import Cause, PauseRequest, StopRequest
-from beamline.instrument.connect import Instrument, connect
+from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.scan import run as run_module
 from beamline.scan.control import verbs_taken
 from beamline.scan.recorder import Recorder
@@ -435,7 +435,7 @@ class Rig:
         (self.in_pause.pop(0) if self.in_pause else self.go_on)()
         return False
 
-    def _connect(self, config: Config, **how: Any) -> Instrument:
+    def _connect(self, config: Config, **how: Any) -> ConnectedDevices:
         bench = connect(config, **{**how, "clock": self.clock})
         self.after_connecting()
         return bench

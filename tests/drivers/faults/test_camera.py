@@ -10,7 +10,7 @@ import pytest
 
 from beamline.config.devices import DcamOrca
 from beamline.doctor import camera as doctor
-from beamline.doctor.check import Verdict
+from beamline.doctor.check import Grade
 from beamline.scan.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.codes import Error, Property
@@ -215,7 +215,7 @@ def test_setting_refused(rig: Rig, when: str, tmp_path: Path) -> None:
 def test_slow_link(rig: Rig, tmp_path: Path) -> None:
     """The doctor says so before; a scan all the same loses the frames that the link does not carry, and names them."""
     check = doctor.link(DcamOrca(kind="dcam"), Bus(Descriptor(speed=3)))
-    assert check.verdict is Verdict.FAILED
+    assert check.verdict is Grade.FAILED
     assert "480 Mbit/s" in check.found and "USB 3 cable" in check.advice
     odd = list(range(1, VIEWS - 1, 2))
     rig.world.lose(*odd)

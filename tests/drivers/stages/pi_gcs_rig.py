@@ -10,11 +10,11 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
+from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
 from simulators.wires.serial_url import register
-from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages.flat_settings import flat
 
 NAMES = (f"pi-gcs-test-{number}" for number in itertools.count())

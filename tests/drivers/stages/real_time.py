@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 
 from drivers.clock import Clock, SystemClock
-from drivers.stages.pi_gcs.settings import PiGcsSettings
-from drivers.stages.pm16c.settings import PM16CSettings
-from drivers.stages.settings import StageSettings
-from drivers.stages.zaber.settings import ZaberSettings
+from drivers.stages.pi_gcs.stage import PiGcsStage
+from drivers.stages.pm16c.stage import PM16CStage
+from drivers.stages.settings import StageDriver
+from drivers.stages.zaber.stage import ZaberStage
+from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import ScaledClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
@@ -25,7 +26,6 @@ from simulators.wires.serial_url import register
 from simulators.wires.wire import Wire
 from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers import zaber_rig
-from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.stages.flat_settings import flat
 from tests.simulators.wires.transports import serve_pty, serve_tcp
@@ -56,7 +56,7 @@ class Kind:
     """A driver and its stand-in.
 
     Attributes:
-        settings: of the driver.
+        driver: its class.
         usual: values of them.
         wire: makes the stand-in.
         unreferenced: settings of the stand-in that has not found its reference yet, where there is such a state.
@@ -67,7 +67,7 @@ class Kind:
         farewell: a part of what it sends last.
     """
 
-    settings: type[StageSettings]
+    driver: StageDriver
     usual: Mapping[str, Any]
     wire: Callable[..., Any]
     garbage: tuple[bytes, ...]
@@ -95,7 +95,7 @@ def _zaber(clock: Clock, line: TriggerLine, **faults: Any) -> ZaberController:
 
 KINDS = {
     "pm16c": Kind(
-        PM16CSettings,
+        PM16CStage,
         QUICK
         | {"counts_per_turn": 36_000, "low": math.radians(-5), "high": math.radians(100), "home": math.radians(0.5)},
         _pm16c,
@@ -107,7 +107,7 @@ KINDS = {
         home=50,
     ),
     "pi_gcs": Kind(
-        PiGcsSettings,
+        PiGcsStage,
         pi_gcs_rig.USUAL | QUICK,
         pi_gcs_rig.controller,
         garbage=(*GARBAGE, b"1=0.0", b"2=0.000000\n"),
@@ -117,7 +117,7 @@ KINDS = {
         unreferenced={"referenced": False, "found_at": 0.5},
     ),
     "zaber": Kind(
-        ZaberSettings,
+        ZaberStage,
         zaber_rig.USUAL | QUICK,
         _zaber,
         garbage=(*GARBAGE, b"@01 1 ", b"@01 1 00 OK IDLE -- 7\r\n"),
@@ -166,6 +166,6 @@ class Real:
         self.unplug = plugged.close
         url = plugged.enter_context(serve(self.wire))
         timeout = PATIENCE * SPEEDS[serve] if serve is not serve_sim else PATIENCE
-        chosen = flat(kind.settings, **(kind.usual | {"timeout": timeout} | (settings or {})))
-        self.stage = chosen.connect(url, clock)
+        chosen = flat(kind.driver.Settings, **(kind.usual | {"timeout": timeout} | (settings or {})))
+        self.stage = kind.driver(url, chosen, clock)
         self.bench = StageBench(self.stage, clock, line)

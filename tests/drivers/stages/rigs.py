@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import pytest
 
 from drivers.protocols import RotationStage
+from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from tests.drivers import pm16c_rig, zaber_rig
-from tests.drivers.stage_bench import StageBench
 from tests.drivers.stages import pi_gcs_rig
 
 

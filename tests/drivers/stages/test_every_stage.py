@@ -12,8 +12,7 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceRefused
 from drivers.protocols import TriggerTrain
-from tests.drivers.stage_bench import LONG, SPEED
-from tests.drivers.stages.motion import start_move_by
+from drivers.testing.stages.bench import LONG, SPEED, start_move_by
 from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
 from tests.simulators.wires.transports import serve_pty
 

@@ -16,9 +16,9 @@ from drivers.clock import SystemClock
 from drivers.errors import DeviceError
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
+from drivers.testing.stages.bench import start_move_by
 from simulators.wires.serial_url import SCHEME
 from tests.drivers.stages.flat_settings import flat
-from tests.drivers.stages.motion import start_move_by
 from tests.drivers.stages.pi_gcs_rig import USUAL
 from tests.drivers.stages.real_time import FAST, KINDS, PLUGS, SOON, TRANSPORTS, Kind, Real, Serve
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+import recon
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
+from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
 from recon.splatting import stream
+from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
@@ -84,6 +88,23 @@ def test_the_same_seed_gives_the_same_volume(data: np.ndarray) -> None:
     order = np.argsort((np.arange(40) * 0.618) % 1)
     first, second = (_stream(data, order, seed=3).snapshot().data for _ in range(2))
     np.testing.assert_array_equal(first, second)
+
+
+def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phantom) -> None:
+    mine = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
+    method = recon.R2(gaussians=1500, fit=FitSettings(**mine))  # type: ignore[arg-type]
+    model = method.stream(VIEWS, 0, StepClock())
+    assert model.settings == replace(WHILE_VIEWS_COME, **mine)
+    assert recon.R2().stream(VIEWS, 0, StepClock()).settings == WHILE_VIEWS_COME
+    for first in range(0, 40, 8):
+        model.add_views(data[first : first + 8], ANGLES[first : first + 8])
+        model.advance(0.5)
+    model.finish(2.0)
+    found = model.gaussians
+    assert found is not None and found.kernel is Kernel.GAUSSIAN
+    assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 20
+    with pytest.raises(ValueError, match="Set `coarse` to 1 here"):
+        recon.R2(fit=FitSettings(coarse=2)).stream(VIEWS, 0, StepClock())
 
 
 def test_it_waits_for_views_that_are_apart(data: np.ndarray) -> None:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.kernels.cpu import cone as cone_kernels
+from recon.kernels.cpu import joseph
+from recon.voxels.fdk import fdk
 from recon.voxels.projector import Projector, data_residual, project
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -98,6 +101,33 @@ def test_the_transpose_is_exact_at_a_working_size(cone: bool, rng: np.random.Gen
     assert left == pytest.approx(np.vdot(volume.astype(np.float64), projector.adjoint(views)), rel=1e-7)
     np.testing.assert_array_equal(projector.forward(volume), forward)  # no race: the same bits again
     np.testing.assert_array_equal(projector.subset([30, 2]).forward(volume), forward[[30, 2]])
+
+
+@pytest.mark.parametrize("cone", [False, True])
+def test_many_calls_of_a_kernel_give_the_bits_of_one(
+    cone: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel returns every few tenths of a second, so that signals are heard."""
+    angles, shape = np.linspace(0, 2 * np.pi, 37, endpoint=False), (20, 70)
+    views = Geometry.cone(angles, shape, 0.05, 40.0, 60.0) if cone else Geometry.parallel(angles, shape)
+    projector = Projector(views, Grid.matching(views))
+    volume = rng.random(projector.grid.shape, dtype=np.float32)
+    found = []
+    for most in (2**62, 1):
+        monkeypatch.setattr(joseph, "CALL", most)
+        monkeypatch.setattr(cone_kernels, "CALL", most)
+        lines = projector.forward(volume)
+        found.append((lines, projector.adjoint(lines), *([fdk(lines, views)] if cone else [])))
+    for once, often in zip(*found, strict=True):
+        np.testing.assert_array_equal(once, often)
+
+
+def test_calls_hold_all_jobs_once_and_few_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(joseph, "get_num_threads", lambda: 4)
+    parts = joseph.calls(103, joseph.CALL // 10)
+    assert [job for part in parts for job in part] == list(range(103))
+    assert {len(part) for part in parts[:-1]} == {8}  # whole rounds of all threads
+    assert [len(part) for part in joseph.calls(6, 10 * joseph.CALL)] == [4, 2]  # all threads work
 
 
 def test_tiles_make_no_difference(rng: np.random.Generator) -> None:

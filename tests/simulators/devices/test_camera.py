@@ -14,13 +14,14 @@ import pytest
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import Camera, CameraFrame, TriggerSource
+from drivers.testing.camera import CameraBench, CameraConformance
 from simulators.devices.camera import SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.frame.sensor import CONVERSION
 from simulators.scenes.scene import load_scene
-from tests.drivers.camera_conformance import SETTINGS, CameraBench, CameraConformance
+from tests.drivers.orca_bench import SETTINGS, orca_bench, says_what_an_orca_says
 from tests.simulators import chance
 
 FLUX = 4e5
@@ -71,9 +72,10 @@ class TestConformance(CameraConformance):
     @pytest.fixture
     def bench(self) -> CameraBench:
         made = _Bench()
-        return CameraBench(
-            made.camera, made.clock, lambda times: made.line.schedule(Pulse(t, 0.0) for t in times)
-        )  # fmt: skip
+        return orca_bench(made.camera, made.clock, lambda times: made.line.schedule(Pulse(t, 0.0) for t in times))
+
+    def test_its_conversion_is_that_of_an_orca(self, bench: CameraBench) -> None:
+        says_what_an_orca_says(bench)
 
 
 def test_is_a_camera() -> None:

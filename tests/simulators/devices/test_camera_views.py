@@ -11,7 +11,7 @@ from simulators.devices.camera import SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 from simulators.devices.trigger_line import TriggerLine
-from tests.drivers.camera_conformance import SETTINGS
+from tests.drivers.orca_bench import SETTINGS
 from tests.simulators import shots
 
 

@@ -62,4 +62,4 @@ def test_what_is_unused_is_said() -> None:
     assert {name for name, _ in found.unused} == set(CATALOGUE) - {"offset"}
     assert dict(found.unused)["photon_noise"] == CATALOGUE["photon_noise"].summary
     bare = explain(_scene(), shot(), _Ticks(), repeats=1)
-    assert [cost.name for cost in bare.costs] == ["ideal"]
+    assert [cost.name for cost in bare.costs] == ["line_integrals", "beer_lambert", "digitise"]

@@ -127,7 +127,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         (_with(phantom={"kind": "solids", "solids": {"a": 1}}), "scene.phantom (solids).solids must be a list"),
         (
             _with(phantom={"kind": "solids", "solids": [{"kind": "cone"}]}),
-            "scene.phantom (solids).solids[0]: kind 'cone' is unknown; legal: cylinder, tube, ellipsoid",
+            "scene.phantom (solids).solids[0]: kind 'cone' is unknown; legal: cylinder, ellipsoid, box",
         ),
         (
             _with(phantom={"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 0], "attenuation": 1}]}),

@@ -17,7 +17,7 @@ from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
-from beamline.storage.readers.overlay import Overlay
+from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import INFO, StandingClock
@@ -147,7 +147,7 @@ def test_the_ring_current_of_each_frame(tmp_path: Path) -> None:
     with open_scan(path) as source:
         np.testing.assert_array_equal(source.currents, [np.nan, 199.5, 200.0, 190.0, 180.0, np.nan])
     with open_scan(path) as source:
-        over = Overlay(source, darks=np.zeros((2, 4, 5), np.uint16))
+        over = OverlaidSource(source, darks=np.zeros((2, 4, 5), np.uint16))
         np.testing.assert_array_equal(over.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
 
 

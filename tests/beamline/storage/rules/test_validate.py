@@ -418,10 +418,6 @@ def test_frames_of_big_endian_files_are_as_written_when_ingested(tmp_path: Path)
         return [hit.message for hit in validate(tmp_path / "ours.h5", lambda n, of: None) if hit.rule == "checksums"]
 
     assert differ() == []
-    with h5py.File(tmp_path / "ours.h5", "r+") as file:  # as earlier versions wrote it
-        frames = file[f"{DETECTOR}/data"][()]
-        file["entry/digest/checksum"][:] = [zlib.crc32(frame.astype(">u2").tobytes()) for frame in frames]
-    assert differ() == []
 
 
 def test_a_damaged_scan_is_not_ingested(write: Write, frames: list[Frame], tmp_path: Path) -> None:

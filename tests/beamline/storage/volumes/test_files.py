@@ -16,7 +16,8 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate
 from beamline.storage.volumes import files, tiff
 from beamline.storage.volumes.base import Pixels, Slices
-from beamline.storage.volumes.files import FORMATS, format_of, opened_volume, volume_format, write_volume
+from beamline.storage.volumes.files import format_of, opened_volume, volume_format, write_volume
+from beamline.storage.volumes.registry import formats, suffixes_text
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
 
@@ -36,9 +37,9 @@ NAMES = ("v.h5", "v.tif", "v", "v.npy", "v.nrrd", "v.ome.zarr")
 
 
 def test_the_suffix_names_the_format() -> None:
-    suffixes = [suffix for kind in FORMATS for suffix in kind.suffixes]
+    suffixes = [suffix for kind in formats() for suffix in kind.suffixes]
     assert len(suffixes) == len(set(suffixes))
-    assert [format_of(Path(name)) for name in NAMES] == list(FORMATS)
+    assert [format_of(Path(name)) for name in NAMES] == list(formats())
     assert format_of(Path("V.TIFF")) is format_of(Path("v.tif"))
     for name in ("v.zip", "v.png", "v.html", "scan_v1.2", ".h5", ""):
         with pytest.raises(ValueError, match=r"volume"):
@@ -244,3 +245,9 @@ def test_a_tiff_of_a_slice_or_a_column_comes_back(tmp_path: Path, shape: tuple[i
     write_volume(tmp_path / "v.tif", replace(RECORD, volume=Volume(values, Grid(shape, 0.25))))
     with opened_volume(tmp_path / "v.tif") as read:
         np.testing.assert_array_equal(read.volume.data[:], values)
+
+
+def test_help_names_the_usual_suffix_of_every_format() -> None:
+    text = ".h5 (with all settings), .tif, .npy, .nrrd, .zarr, or no suffix: a folder of TIFFs"
+    assert suffixes_text() == text
+    assert all(kind.suffixes[0] in text for kind in formats())

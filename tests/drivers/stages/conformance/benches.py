@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from drivers.testing.stages import Build, StageBench, StageKind
 from simulators.wires.serial_url import register
 from tests.drivers import pm16c_rig, zaber_rig
-from tests.drivers.stage_bench import Build, StageBench
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.stages.rigs import AnyRig
 from tests.simulators.wires.transports import serve_pty
@@ -22,35 +22,19 @@ RigOf = Callable[[dict[str, Any]], AnyRig]
 """A fresh controller for a driver with these settings."""
 
 
-@dataclass(frozen=True)
-class Kind:
+@dataclass(frozen=True, kw_only=True)
+class Kind(StageKind):
     """A stage under test.
 
     Attributes:
         rig: what makes the controller.
         usual: settings of the driver's constructor.
-        width: a pulse width (s) that the output has, at most 1 ms; None where it has no choice.
-        no_width: one that it has not, or has not beside others.
-        inverts: its pulses may be active low.
-        homes: it has a reference, within its limits.
-        stops_are_told: `status` tells that the last move was stopped.
-        turning_back_ends: a train ends where the stage turns back inside it; elsewhere its rest comes later.
-        disarms_moving: a train can be ended while the stage moves.
-        relative_moves: how many of them make the long way; fewer where bytes cost time and the law is tested elsewhere.
         terminal: its bytes go through a pseudo-terminal. Time is virtual all the same: they take their own time, the
             clock stands meanwhile.
     """
 
     rig: RigOf
     usual: dict[str, Any]
-    width: float | None = 100e-6
-    no_width: float = 0.0
-    inverts: bool = False
-    homes: bool = True
-    stops_are_told: bool = True
-    turning_back_ends: bool = True
-    disarms_moving: bool = True
-    relative_moves: int = 1000
     terminal: bool = False
 
     def build(self, plugged: ExitStack) -> Build:
@@ -88,14 +72,14 @@ def _zaber(**device: Any) -> RigOf:
 
 
 _PM16C = Kind(
-    lambda _: pm16c_rig.Rig(home_at=500),
-    {"home": math.radians(2.0)},
+    rig=lambda _: pm16c_rig.Rig(home_at=500),
+    usual={"home": math.radians(2.0)},
     no_width=50e-6,
     turning_back_ends=False,
     disarms_moving=False,
 )
-_PI_GCS = Kind(_pi_gcs, {}, width=None, inverts=True)
-_ZABER = Kind(_zaber(), {}, width=1e-3, no_width=0.5e-3, inverts=True)
+_PI_GCS = Kind(rig=_pi_gcs, usual={}, width=None, inverts=True)
+_ZABER = Kind(rig=_zaber(), usual={}, width=1e-3, no_width=0.5e-3, inverts=True)
 KINDS = {
     "pm16c": _PM16C,
     "pm16c, a width for all trains and no home switch": replace(

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import DeviceError
 from drivers.protocols import TriggerTrain
-from tests.drivers.stages.motion import start_move_by
+from drivers.testing.stages.bench import start_move_by
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
 
 

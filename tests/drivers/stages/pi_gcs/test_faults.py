@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import TriggerTrain
-from tests.drivers.stage_bench import LONG, SPEED
+from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 

@@ -12,7 +12,7 @@ from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.settings import StageFigures
-from tests.drivers.stage_bench import LONG, SPEED
+from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
 
 

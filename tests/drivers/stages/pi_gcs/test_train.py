@@ -8,8 +8,8 @@ import pytest
 
 from drivers.errors import DeviceRefused
 from drivers.protocols import TriggerTrain
+from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.pi_gcs.trigger import FirstPulse
-from tests.drivers.stage_bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 

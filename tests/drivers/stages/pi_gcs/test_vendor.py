@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from drivers.clock import SystemClock
+from drivers.testing.stages.bench import emitted
 from simulators.devices.trigger_line import TriggerLine
 from tests.drivers.stages.pi_gcs_rig import controller
-from tests.simulators.cable import emitted
 from tests.simulators.wires.transports import serve_pty
 
 pytest.importorskip("pipython", reason="PIPython, the vendor's host library (Python 3.12 or newer), is not installed")

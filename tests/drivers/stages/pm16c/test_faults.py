@@ -8,8 +8,8 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.protocols import TriggerTrain
+from drivers.testing.stages.bench import SPEED
 from tests.drivers.pm16c_rig import QUERIES_TO_OPEN, Rig
-from tests.drivers.stage_bench import SPEED
 
 
 @pytest.fixture

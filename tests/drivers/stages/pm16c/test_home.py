@@ -9,8 +9,8 @@ import pytest
 
 from drivers.errors import DeviceError, DeviceTimeout
 from drivers.protocols import TriggerTrain
+from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.pm16c_rig import Rig
-from tests.drivers.stage_bench import LONG, SPEED
 
 SWITCH = 2500
 """Pulses since power-on: 10 degrees of the sample's true angle."""

@@ -12,8 +12,8 @@ from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage, TriggerTrain
 from drivers.stages.pm16c.settings import RATES, PM16CSettings, steepest_code
 from drivers.stages.settings import StageFigures
+from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.pm16c_rig import COUNTS, Rig
-from tests.drivers.stage_bench import LONG, SPEED
 
 
 @pytest.fixture

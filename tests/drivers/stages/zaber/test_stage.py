@@ -14,8 +14,8 @@ from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.protocols import RotationStage
 from drivers.stages.settings import StageFigures
 from drivers.stages.zaber.settings import ZaberSettings
+from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.zaber.wire import Fault
-from tests.drivers.stage_bench import LONG, SPEED
 from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig
 
 

@@ -15,7 +15,7 @@ from drivers.protocols import TriggerTrain
 from drivers.stages.settings import StageFigures, Wiring
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.train import PulseSettings, TriggerUse, remaining, set_up
-from tests.drivers.stage_bench import LONG, SPEED, StageBench
+from drivers.testing.stages.bench import LONG, SPEED, StageBench
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_rig import Rig
 

@@ -148,7 +148,7 @@ def test_triggers_give_a_train_and_tell_what_is_left(vendor: Vendor) -> None:
     assert not any(state.enabled for state in triggers.get_enabled_states())
 
 
-def test_other_conditions_and_actions(vendor: Vendor) -> None:
+def test_the_encoder_s_distance_and_an_action_taken_away(vendor: Vendor) -> None:
     fast(vendor)
     trigger = vendor.device.triggers.get_trigger(3)
     trigger.fire_when_encoder_distance_travelled(1, 500, NATIVE)
@@ -158,5 +158,3 @@ def test_other_conditions_and_actions(vendor: Vendor) -> None:
     trigger.disable()
     assert vendor.pulses() == [500, 1500]
     trigger.clear_action(TriggerAction.A)
-    trigger.fire_when_absolute_setting(1, "pos", TriggerCondition.LT, 100, NATIVE)
-    trigger.fire_at_interval(5, NATIVE)

@@ -13,8 +13,9 @@ from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Octahedron, Solid, Tube
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
 from simulators.samples.bodies.view import view_of
+from simulators.samples.builders.grains import octahedron
 from tests.simulators.bodies import SOLIDS, TURNABLE, chords, rays, turned
 
 
@@ -94,8 +95,8 @@ def test_many_solids_in_the_same_shadow_cost_as_much_as_few() -> None:
         (Box((0.2, 0.2, 0.2), 1.0, (0.0, -3.0, 0.0)), "reaches 2.1 mm behind the source, which is 1 mm before"),
         (Ellipsoid((0.1, 0.5, 0.1), 1.0, (0.3, -0.5, 0.0)), "solid 0 .ellipsoid. reaches"),
         (Cylinder(1.0, 0.2, 1.0), "raise sod. No frame was computed"),
-        (Tube(1.2, 1.1, 0.2, 1.0), r"solid 0 \(tube\) reaches 0.2 mm behind"),
-        (Octahedron((0.1, 0.4, 0.1), 1.0, (0.0, -0.7, 0.0)), r"solid 0 \(octahedron\) reaches 0.1 mm"),
+        (Cylinder(1.2, 0.2, 1.0), r"solid 0 \(cylinder\) reaches 0.2 mm behind"),
+        (Polyhedron(octahedron((0.1, 0.4, 0.1)), 1.0, (0.0, -0.7, 0.0)), r"solid 0 \(polyhedron\) reaches 0.1 mm"),
     ],
 )
 def test_bodies_at_or_behind_the_source_are_refused(solid: Solid, words: str) -> None:
@@ -107,7 +108,7 @@ def test_bodies_at_or_behind_the_source_are_refused(solid: Solid, words: str) ->
 @pytest.mark.parametrize(
     "solid",
     [
-        Octahedron((0.3, 0.3, 0.3), 1.0, (0.55, -0.55, 0.0)),  # its box reaches behind the source, it does not
+        Polyhedron(octahedron((0.3, 0.3, 0.3)), 1.0, (0.55, -0.55, 0.0)),  # its box is behind the source
         Ellipsoid((0.5, 0.1, 0.1), 1.0, (0.5, -0.5, 0.0), (0.924, 0.0, 0.0, -0.383)),
         Box((0.2, 0.2, 0.2), 1.0, (0.0, -0.85, 0.0)),
         Cylinder(0.7, 1.4, 1.0, (0.0, -0.2, 0.0)),

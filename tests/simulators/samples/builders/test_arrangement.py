@@ -15,6 +15,7 @@ from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
 from simulators.samples.builders.arrangement import _near, arrange, bodies_of
 from simulators.samples.builders.grains import HABITS, grain
+from tests.simulators.bodies import volume
 
 
 def corners(solid: Solid) -> np.ndarray:
@@ -70,7 +71,7 @@ def _loose(rng: np.random.Generator, n: int = 120) -> list[Solid]:
 
 def test_no_two_bodies_overlap_and_all_are_inside(rng: np.random.Generator) -> None:
     loose = _loose(rng)
-    height = radius = (sum(solid.volume for solid in loose) / 0.36 / math.pi) ** (1 / 3)
+    height = radius = (sum(volume(solid) for solid in loose) / 0.36 / math.pi) ** (1 / 3)
     placed = _placed(loose, arrange(rng, bodies_of(loose), radius, height))
     assert overlapping(placed) == []
     for solid in placed:
@@ -141,4 +142,4 @@ def test_what_cannot_be_is_refused(rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match="only ellipsoids and polyhedra"):
         bodies_of([Cylinder(0.1, 0.1, 1.0)])
     with pytest.raises(ValueError, match="symmetric about its centre"):
-        bodies_of([Polyhedron(1.0, ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)))])
+        bodies_of([Polyhedron(((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)), 1.0)])

@@ -8,15 +8,16 @@ import pytest
 from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
-from simulators.samples.bodies.solids import Box, Ellipsoid, Octahedron
+from simulators.samples.bodies.solids import Box, Ellipsoid, Polyhedron
 from simulators.samples.builders.battery import ELECTROLYTE, PARTICLE, battery
+from tests.simulators.bodies import volume
 
 
 @pytest.mark.parametrize("field", [(0.9, 0.9), (0.72, 0.3), (2.0, 5.0)])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_battery_is_dense_inside_the_field_and_lets_light_through(field: tuple[float, float], seed: int) -> None:
     solids = battery(np.random.default_rng(seed), field)
-    assert len(solids) == 152
+    assert len(solids) == 153
     phantom = Phantom.of(solids)
     detector = Detector.centred((120, 120), max(field) / 120)
     views = np.stack([phantom.line_integrals(a, detector) for a in np.linspace(0, np.pi, 20, endpoint=False)])
@@ -24,27 +25,27 @@ def test_battery_is_dense_inside_the_field_and_lets_light_through(field: tuple[f
     outside = (np.abs(detector.u()) > field[0] * 0.45)[None, :] | (np.abs(detector.v()) > field[1] * 0.455)[:, None]
     assert outside[60, 0] or outside[0, 60]
     assert not views[:, outside].any()
-    particles = solids[2:]
-    share = sum(p.volume for p in particles) / solids[1].volume
+    particles = solids[3:]
+    share = sum(volume(p) for p in particles) / volume(solids[1])
     assert 0.08 < share < 0.16
-    assert {type(p) for p in particles} == {Ellipsoid, Octahedron, Box}
-    sizes = np.cbrt([p.volume for p in particles])
+    assert {type(p) for p in particles} == {Ellipsoid, Polyhedron, Box}
+    sizes = np.cbrt([volume(p) for p in particles])
     assert sizes.max() > 1.8 * sizes.min()
 
 
 def test_battery_s_particles_do_not_overlap() -> None:
     solids = battery(np.random.default_rng(5), (1.0, 1.0))
-    truth = Phantom.of(solids[1:]).attenuation(Grid((110, 110, 110), 1 / 110))
+    truth = Phantom.of(solids[2:]).attenuation(Grid((110, 110, 110), 1 / 110))
     one = (ELECTROLYTE + PARTICLE) / 0.44
     assert truth.max() == pytest.approx(one)  # two particles in a voxel would make nearly twice that
-    alone = Phantom.of(solids[2:]).attenuation(Grid((110, 110, 110), 1 / 110)).sum(dtype=np.float64) / 110**3
-    assert alone == pytest.approx(sum(p.attenuation * p.volume for p in solids[2:]), rel=2e-3)
+    alone = Phantom.of(solids[3:]).attenuation(Grid((110, 110, 110), 1 / 110)).sum(dtype=np.float64) / 110**3
+    assert alone == pytest.approx(sum(p.attenuation * volume(p) for p in solids[3:]), rel=2e-3)
 
 
 def test_battery_repeats_with_its_seed_and_refuses_what_does_not_fit() -> None:
     assert battery(np.random.default_rng(4)) == battery(np.random.default_rng(4))
     assert battery(np.random.default_rng(4)) != battery(np.random.default_rng(5))
-    assert len(battery(np.random.default_rng(4), n_particles=0)) == 2
+    assert len(battery(np.random.default_rng(4), n_particles=0)) == 3
     with pytest.raises(ValueError, match=r"only \d+ of 50 particles find room .* lower fill"):
         battery(np.random.default_rng(4), n_particles=50, fill=0.9)
     with pytest.raises(ValueError, match="field_of_view must be"):

@@ -66,7 +66,7 @@ def test_tables_are_loaded_only_where_a_material_is_named() -> None:
         ([BATH | {"material": "mud"}], {"energy_kev": 8}, r"solids\[0\]: material 'mud' is unknown"),
         ([BATH | {"material": 5}], {"energy_kev": 8}, r"solids\[0\]: material must be text"),
         ([BATH, GREY | {"instead_of": "Al"}], {"energy_kev": 8}, "instead_of 'Al' needs a material"),
-        ([BATH, "tube"], {"energy_kev": 8}, r"solids\[1\] \(tube\): key 'outer_radius' is missing"),
+        ([BATH, "box"], {"energy_kev": 8}, r"solids\[1\] \(box\): key 'edges' is missing"),
         ([BATH | {"colour": 1}], {"energy_kev": 8}, r"solids\[0\] \(cylinder\): key 'colour' is unknown"),
         ([BATH], {"energy_kev": 900}, "tabulated from 0.1 to 800 keV"),
         ([BATH], {"tube": {"kv": 60, "filters": {"mud": 1}}}, r"scene.phantom \(solids\): material 'mud' is unknown"),

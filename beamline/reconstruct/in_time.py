@@ -1,0 +1,94 @@
+"""In time: of the seconds that a whole call was given, what its fit gets, and what still fits in after it."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from beamline.projections.correction import Warn
+from beamline.projections.prepare import PreparedProjections
+from beamline.reconstruct.measure import residual_share
+from beamline.reconstruct.result import OutputPaths
+from drivers.clock import Clock
+from recon.assess.time_model import duration_text
+from recon.base.volume import Grid
+from recon.methods import with_settings
+from recon.splatting.fit_method import FitMethod
+from recon.splatting.in_time import first_sweep_seconds
+from recon.splatting.initialise import sweeps_of_start
+
+_REPORT = 5.0  # s, its pictures
+_BYTES = 1e8  # of a volume, written and read back in a second
+_BUSIEST = 4.0  # times as long as alone, at most, what others' work makes of that
+_FORWARD = 0.5  # of a sweep
+_LEAST = 0.1  # of a sweep, what a fit takes that starts from coarse views and makes a step
+
+
+@dataclass(frozen=True, eq=False)
+class Deadline:
+    """When a call should end.
+
+    Attributes:
+        end: by the clock; inf where nobody asked for it.
+        after: s that the report and writing take, about.
+        now: the clock.
+    """
+
+    end: float = math.inf
+    after: float = 0.0
+    now: Callable[[], float] = time.perf_counter
+
+    def leaves(self, seconds: float) -> bool:
+        """Whether there is time for so much more before the report."""
+        return self.now() + seconds + self.after <= self.end
+
+
+def fit_within(
+    method: FitMethod,
+    prepared: PreparedProjections,
+    target: OutputPaths,
+    started: tuple[float, float],
+    clock: Clock,
+    warn: Warn,
+) -> tuple[FitMethod, Deadline]:
+    """The fit with the seconds that its call leaves it, before measuring, report and writing; and when the call ends.
+
+    Where they are too few, `warn` is told before the fit how long the call will take.
+
+    Args:
+        method: `seconds` are those of the call.
+        started: when the call began, by the clock and in seconds of this process's work.
+    """
+    assert method.seconds is not None
+    geometry, grid = prepared.geometry, Grid.matching(prepared.geometry)
+    sweep = first_sweep_seconds(geometry, grid, clock.now)
+    if not math.isfinite(sweep):  # rolled or tilted: as straight ones take
+        sweep = first_sweep_seconds(geometry.straightened(), grid, clock.now)
+    spent = clock.now() - started[0]
+    busy = min(max(spent / max(time.process_time() - started[1], 1e-3), 1.0), _BUSIEST)
+    pages = target.report is not None
+    after = busy * (_REPORT * pages + 4 * math.prod(grid.shape) / _BYTES)
+    measuring = _FORWARD * sweep * residual_share(geometry, grid, prepared.held_out)
+    left, least = method.seconds - spent - measuring - after, _LEAST * sweep
+    if left < least:
+        start = sweeps_of_start(geometry, method.start) * sweep
+        warn(
+            f"{duration_text(method.seconds)} do not suffice for this scan: reading and correcting it took "
+            f"{duration_text(spent)}, measuring the volume, the report and writing take about "
+            f"{duration_text(measuring + after)}, the start of a fit of all pixels {duration_text(start)}. With a "
+            f"start from coarse pixels the end is in about {duration_text(least + measuring + after)}."
+        )
+    deadline = Deadline(started[0] + method.seconds, after, clock.now)
+    return with_settings(method, {"seconds": max(left, 0.0)}), deadline
+
+
+@contextmanager
+def warnings_told(warn: Warn) -> Iterator[None]:
+    """Within the context what Python warns of is told as a sentence, without file and line."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: warn(str(message))
+        yield

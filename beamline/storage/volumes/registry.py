@@ -1,0 +1,71 @@
+"""The registry of formats that volumes are written in; it imports none of them, so that help texts can go by it.
+
+Adding one takes its class (`base.VolumeFormat`) in a module of this folder, and its line in REGISTRY.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from drivers.plugins import plugins
+
+if TYPE_CHECKING:
+    from beamline.storage.volumes.base import VolumeFormat
+
+
+@dataclass(frozen=True)
+class FormatEntry:
+    """A format of volume files.
+
+    Attributes:
+        module, cls: of its class.
+        suffixes: that a file's name ends in, the usual one first; "" for a folder.
+        note: what help says of it.
+    """
+
+    module: str
+    cls: str
+    suffixes: tuple[str, ...]
+    note: str = ""
+
+
+_HERE = "beamline.storage.volumes."
+REGISTRY = {
+    "hdf5": FormatEntry(_HERE + "nxtomoproc", "NXtomoproc", (".h5", ".hdf5", ".nxs"), "with all settings"),
+    "tiff": FormatEntry(_HERE + "tiff", "TiffVolume", (".tif", ".tiff")),
+    "tiff_folder": FormatEntry(_HERE + "tiff", "TiffFolderVolume", ("",), "a folder of TIFFs"),
+    "npy": FormatEntry(_HERE + "plain", "Npy", (".npy",)),
+    "nrrd": FormatEntry(_HERE + "plain", "Nrrd", (".nrrd",)),
+    "ome_zarr": FormatEntry(_HERE + "ome_zarr", "OmeZarr", (".zarr",)),
+}
+
+
+@cache
+def entries() -> dict[str, FormatEntry]:
+    """Ours, and those of other packages, by name."""
+    taken = {suffix for entry in REGISTRY.values() for suffix in entry.suffixes}
+
+    def made(name: str, kind: type[Any]) -> FormatEntry:
+        suffixes = tuple(kind().suffixes)
+        if not suffixes or taken & set(suffixes) or any(suffix[:1] != "." for suffix in suffixes):
+            raise ValueError(f"its suffixes are {suffixes}; expected such as '.xyz', none of {sorted(taken)}")
+        taken.update(suffixes)
+        return FormatEntry(kind.__module__, kind.__name__, suffixes)
+
+    return {**REGISTRY, **plugins("volume_format", REGISTRY, made)}
+
+
+@cache
+def formats() -> tuple[VolumeFormat, ...]:
+    """Every format that volumes are written in."""
+    return tuple(getattr(import_module(entry.module), entry.cls)() for entry in entries().values())
+
+
+def suffixes_text() -> str:
+    """The usual suffixes, for help."""
+    named = [entry for entry in entries().values() if entry.suffixes[0]]
+    folders = [f"or no suffix: {entry.note}" for entry in entries().values() if not entry.suffixes[0]]
+    return ", ".join([e.suffixes[0] + (f" ({e.note})" if e.note else "") for e in named] + folders)

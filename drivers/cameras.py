@@ -1,0 +1,33 @@
+"""The registry of cameras of other packages; `drivers.dcam` and the simulated ORCA-Quest have sections of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+from drivers.clock import Clock
+from drivers.plugins import plugins
+from drivers.protocols import Camera, CameraSettings, CameraTiming
+
+
+class CameraDriver(Protocol):
+    """A driver's class, which the entry point of a package names.
+
+    Attributes:
+        Settings: a frozen dataclass of what it is opened with; its fields say with `drivers.stages.settings.key` how a
+            configuration writes them.
+    """
+
+    Settings: type[Any]
+
+    def __call__(self, settings: Any, clock: Clock) -> Camera:
+        """The driver, connected. Raises DeviceError where there is no such camera."""
+        ...
+
+    def timing_of(self, settings: Any, wanted: CameraSettings) -> CameraTiming:
+        """What the camera will say of its timing, before it is connected. ValueError for what it would refuse."""
+        ...
+
+
+CAMERAS: Mapping[str, CameraDriver] = plugins("camera", ("dcam", "simulated_orca"))
+"""Kind, as a configuration names it -> the driver."""

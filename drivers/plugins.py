@@ -1,0 +1,54 @@
+"""Plug-ins: what other installed packages add to a registry, by entry points of the group `splatline.KIND`.
+
+KIND is method, correction, reader, volume_format, stage, wire, camera, check or effect; the entry point's name is the
+name of what it adds. A registry asks when it is first used, so that a program which needs none of them starts quickly.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Collection
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+_PREFIX = "splatline."
+
+
+def plugins(
+    kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, found: found
+) -> dict[str, Any]:
+    """What other packages add to a registry, by name, in the order of the names.
+
+    Args:
+        kind: of the registry, as above.
+        taken: names that the registry has itself.
+        made: entry of the registry for a name and what its entry point loads; ValueError where it does not fit.
+
+    Warns:
+        UserWarning: for each plug-in that is left out: its name is taken, or it cannot be loaded, or it does not fit.
+    """
+    announced = sorted(point for point in _announced() if point.group == _PREFIX + kind)
+    times, found = Counter(point.name for point in announced), dict[str, Any]()
+    for point in announced:
+        try:
+            if point.name in taken or times[point.name] > 1:
+                by = "splatline" if point.name in taken else "another plug-in"
+                raise ValueError(f"the name is taken by {by}; expected a name of its own")
+            found[point.name] = made(point.name, point.load())
+        except (Exception, SystemExit) as error:  # another package's fault must not stop a scan
+            package = f" of the package {point.dist.name}" if point.dist is not None else ""
+            warnings.warn(
+                f"The {kind.replace('_', ' ')} {point.name!r}{package} ({point.value}) was left out: "
+                f"{type(error).__name__}: {error}. Mend or uninstall that package; all else works without it.",
+                stacklevel=2,
+            )
+    return found
+
+
+@cache
+def _announced() -> tuple[EntryPoint, ...]:
+    """Of all installed packages; reading them takes a tenth of a second, once a process."""
+    found = entry_points()
+    return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))

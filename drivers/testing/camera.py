@@ -1,0 +1,224 @@
+"""What every camera does, real or simulated: the suite that each camera's tests subclass.
+
+A subclass gives `bench`, a fixture that makes a CameraBench anew for each test. Frames are small and exposures short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.protocols import Camera, CameraFrame, CameraSettings, TriggerSource
+
+
+@dataclass(frozen=True)
+class CameraBench:
+    """A camera and what goes with it.
+
+    Attributes:
+        pulse: put rising edges on the camera's trigger input, at these times on the clock.
+        settings: that it takes: externally triggered, a small region, 10 ms or so.
+        refused: changes of them that it refuses, and a pattern for its words.
+        binnings: beside 1 that it has.
+    """
+
+    camera: Camera
+    clock: Clock
+    pulse: Callable[[Sequence[float]], None]
+    settings: CameraSettings
+    refused: Sequence[tuple[Mapping[str, Any], str]]
+    binnings: Sequence[int] = ()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        assert self.settings.roi is not None
+        return self.settings.roi[2:]
+
+
+class CameraConformance:
+    """Laws of drivers.protocols.Camera."""
+
+    @pytest.fixture
+    def bench(self) -> CameraBench:
+        raise NotImplementedError
+
+    def _pulses(self, bench: CameraBench, n: int, period: float | None = None, delay: float = 0.05) -> list[float]:
+        step = 1.05 * bench.camera.timing.min_period if period is None else period
+        times = [bench.clock.now() + delay + k * step for k in range(n)]
+        bench.pulse(times)
+        return times
+
+    def _take(self, bench: CameraBench, n: int) -> list[CameraFrame]:
+        return [bench.camera.next_frame(timeout=5.0) for _ in range(n)]
+
+    def test_configure_reads_back_and_timing_follows(self, bench: CameraBench) -> None:
+        accepted = bench.camera.configure(bench.settings)
+        assert accepted.exposure == pytest.approx(bench.settings.exposure, rel=0.01)
+        assert (accepted.trigger, accepted.roi, accepted.binning) == (bench.settings.trigger, bench.settings.roi, 1)
+        timing = bench.camera.timing
+        assert timing.shape == bench.shape
+        assert timing.min_period >= accepted.exposure
+        assert timing.readout > 0
+        assert timing.row_period * bench.shape[0] <= timing.readout * 1.01
+        longer = bench.camera.configure(replace(bench.settings, exposure=2 * bench.settings.exposure))
+        assert bench.camera.timing.min_period - timing.min_period == pytest.approx(longer.exposure - accepted.exposure)
+        for binning in bench.binnings:
+            bench.camera.configure(replace(bench.settings, binning=binning))
+            assert bench.camera.timing.shape == (bench.shape[0] // binning, bench.shape[1] // binning)
+
+    def test_refuses_what_it_cannot_and_stays_as_it_was(self, bench: CameraBench) -> None:
+        assert bench.refused
+        bench.camera.configure(bench.settings)
+        before = bench.camera.timing
+        for changes, words in bench.refused:
+            with pytest.raises(DeviceRefused, match=words):
+                bench.camera.configure(replace(bench.settings, **changes))
+            assert bench.camera.timing == before
+
+    def test_every_pulse_is_a_frame_in_order(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        bench.camera.arm(6)
+        times = self._pulses(bench, 6)
+        frames = self._take(bench, 6)
+        assert [frame.framestamp for frame in frames] == list(range(6))
+        assert [frame.time for frame in frames] == pytest.approx(times, abs=2e-4)
+        assert {(frame.counts.shape, frame.counts.dtype) for frame in frames} == {(bench.shape, np.dtype(np.uint16))}
+        # A frame cannot be there before it is exposed and read out.
+        assert bench.clock.now() >= times[-1] + bench.settings.exposure + bench.camera.timing.readout - 1e-6
+
+    def test_pulses_that_come_too_early_are_ignored(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        bench.camera.arm(6)
+        times = self._pulses(bench, 9, period=0.6 * bench.camera.timing.min_period)
+        frames = self._take(bench, 5)  # every other pulse
+        assert [frame.framestamp for frame in frames] == list(range(5))
+        assert [frame.time for frame in frames] == pytest.approx(times[::2], abs=2e-4)
+        with pytest.raises(DeviceTimeout):
+            bench.camera.next_frame(timeout=0.2)
+
+    def test_an_overrun_ring_is_one_error_and_the_rest_can_be_taken(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        bench.camera.arm(1)
+        times = self._pulses(bench, 200)
+        bench.clock.sleep(times[-1] - bench.clock.now() + 1.0)
+        with pytest.raises(DeviceError, match=r"ring of \d+ frames was overrun and \d+ frames are lost"):
+            bench.camera.next_frame(timeout=1.0)
+        rest = [bench.camera.next_frame(timeout=1.0)]
+        while rest[-1].framestamp < 199:
+            rest.append(bench.camera.next_frame(timeout=1.0))
+        assert [frame.framestamp for frame in rest] == list(range(200 - len(rest), 200))
+        assert [frame.time - rest[0].time for frame in rest] == pytest.approx(
+            [time - times[-len(rest)] for time in times[-len(rest) :]], abs=2e-4
+        )
+
+    def test_pulses_before_arm_are_lost(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        self._pulses(bench, 2, delay=0.0)
+        bench.clock.sleep(1.0)
+        bench.camera.arm(1)
+        with pytest.raises(DeviceTimeout):
+            bench.camera.next_frame(timeout=0.1)
+
+    def test_a_frame_that_does_not_come_is_a_timeout_in_time(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        bench.camera.arm(1)
+        start = bench.clock.now()
+        with pytest.raises(DeviceTimeout, match=r"0\.3 s"):
+            bench.camera.next_frame(timeout=0.3)
+        assert bench.clock.now() - start == pytest.approx(0.3, abs=0.1)
+        self._pulses(bench, 1)  # and it still works
+        assert bench.camera.next_frame(timeout=1.0).framestamp == 0
+
+    def test_software_triggers(self, bench: CameraBench) -> None:
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.SOFTWARE))
+        bench.camera.arm(3)
+        for k in range(3):
+            at = bench.clock.now()
+            bench.camera.software_trigger()
+            frame = bench.camera.next_frame(timeout=1.0)
+            assert frame.framestamp == k
+            assert frame.time == pytest.approx(at, abs=0.05)
+            bench.clock.sleep(bench.camera.timing.min_period)
+
+    def test_software_trigger_is_refused_where_it_means_nothing(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        with pytest.raises(DeviceRefused, match="not armed"):
+            bench.camera.software_trigger()
+        bench.camera.arm(1)
+        with pytest.raises(DeviceRefused, match="external"):
+            bench.camera.software_trigger()
+
+    def test_free_run_gives_the_frames_asked_for(self, bench: CameraBench) -> None:
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
+        bench.camera.arm(4)
+        frames = self._take(bench, 4)
+        assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
+        gaps = np.diff([frame.time for frame in frames])
+        assert (gaps >= bench.settings.exposure - 2e-6).all()  # a camera's clock may tick in microseconds
+        assert gaps == pytest.approx(gaps[0], abs=2e-4)
+
+    def test_framestamps_start_anew_with_every_arm(self, bench: CameraBench) -> None:
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
+        for _ in range(2):
+            bench.camera.arm(2)
+            assert [frame.framestamp for frame in self._take(bench, 2)] == [0, 1]
+            bench.camera.disarm()
+
+    def test_frames_own_their_memory(self, bench: CameraBench) -> None:
+        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
+        bench.camera.arm(2)
+        first, second = self._take(bench, 2)
+        assert not np.shares_memory(first.counts, second.counts)
+        kept = first.counts.copy()
+        second.counts[:] = 0
+        np.testing.assert_array_equal(first.counts, kept)
+
+    def test_disarm_is_legal_in_every_state(self, bench: CameraBench) -> None:
+        bench.camera.disarm()
+        bench.camera.configure(bench.settings)
+        bench.camera.disarm()
+        bench.camera.arm(3)
+        self._pulses(bench, 3)
+        bench.camera.next_frame(timeout=1.0)
+        bench.camera.disarm()
+        bench.camera.disarm()
+        with pytest.raises(DeviceRefused, match="not armed"):
+            bench.camera.next_frame(timeout=0.1)
+        bench.camera.configure(bench.settings)
+
+    def test_an_armed_camera_takes_no_settings_and_no_second_arm(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        bench.camera.arm(2)
+        with pytest.raises(DeviceRefused, match="disarm"):
+            bench.camera.configure(replace(bench.settings, exposure=2 * bench.settings.exposure))
+        with pytest.raises(DeviceRefused, match="disarm"):
+            bench.camera.arm(2)
+        bench.camera.disarm()
+        with pytest.raises(DeviceRefused, match="less than one frame"):
+            bench.camera.arm(0)
+
+    def test_describes_itself_for_the_file(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        text = bench.camera.describe()
+        assert {type(value) for value in text.values()} <= {str, int, float}
+        assert text["model"]
+        assert float(text["conversion_factor"]) > 0  # electrons a count
+        assert float(text["conversion_offset"]) >= 0  # counts
+
+    def test_a_closed_camera_says_so(self, bench: CameraBench) -> None:
+        bench.camera.configure(bench.settings)
+        bench.camera.arm(1)
+        bench.camera.close()
+        bench.camera.close()
+        bench.camera.disarm()
+        with pytest.raises(DeviceError, match="closed"):
+            bench.camera.configure(bench.settings)
+        with pytest.raises(DeviceError, match="closed"):
+            bench.camera.arm(1)

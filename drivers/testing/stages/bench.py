@@ -1,0 +1,125 @@
+"""A stage and its trigger cable on a bench, for tests that know no protocol: moves, trains, pulses in degrees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from drivers.clock import Clock
+from drivers.protocols import Motion, RotationStage, TriggerTrain
+
+SPEED = math.radians(10)
+LONG = 60.0
+FARTHEST = 1e9
+"""rad; no stage goes further."""
+
+
+class Pulse(Protocol):
+    """A pulse on the cable: when it rose, s, and where the stage was in fact, rad."""
+
+    @property
+    def time(self) -> float: ...
+
+    @property
+    def angle(self) -> float: ...
+
+
+class Cable(Protocol):
+    """The trigger cable, and what measures where the stage is in fact: a simulated line, or a counter card."""
+
+    def next_after(self, time: float) -> Pulse | None:
+        """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
+        ...
+
+    def angle_at(self, time: float) -> float:
+        """The true angle in rad."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageKind:
+    """What the suite has to know of a stage.
+
+    Attributes:
+        width: a pulse width (s) that the output has, at most 1 ms; None where it has no choice.
+        no_width: one that it has not, or has not beside others.
+        inverts: its pulses may be active low.
+        homes: it has a reference, within its limits.
+        stops_are_told: `status` tells that the last move was stopped.
+        turning_back_ends: a train ends where the stage turns back inside it; elsewhere its rest comes later.
+        disarms_moving: a train can be ended while the stage moves.
+        relative_moves: how many of them make the long way; fewer where bytes cost time and the law is tested elsewhere.
+    """
+
+    width: float | None = 100e-6
+    no_width: float = 0.0
+    inverts: bool = False
+    homes: bool = True
+    stops_are_told: bool = True
+    turning_back_ends: bool = True
+    disarms_moving: bool = True
+    relative_moves: int = 1000
+
+
+@dataclass
+class StageBench:
+    """A stage at angle 0 that can go from -5 to 100 degrees at 10 degrees/s or faster, and its trigger cable."""
+
+    stage: RotationStage
+    clock: Clock
+    line: Cable
+
+    def pulses(self) -> list[Pulse]:
+        """Those that have been emitted by now."""
+        return emitted(self.line, self.clock)
+
+    def go(self, degrees: float) -> float:
+        """Move and wait; where it stands, in degrees."""
+        self.stage.start_move(math.radians(degrees), SPEED)
+        return math.degrees(self.stage.wait(LONG))
+
+    def counts(self, degrees: float) -> int:
+        return self.stage.to_counts(math.radians(degrees))
+
+    def train(self, first: float, step: float, n: int) -> TriggerTrain:
+        """A train in degrees."""
+        return TriggerTrain(self.counts(first), self.counts(step), n)
+
+    @property
+    def count(self) -> float:
+        """One count in degrees."""
+        return 360.0 / self.stage.limits.counts_per_turn
+
+
+Build = Callable[..., StageBench]
+"""Opens the stage anew, with settings of its driver that differ from the usual ones."""
+
+
+def emitted(line: Cable, clock: Clock) -> list[Pulse]:
+    """The pulses that have come out of a cable by now, in their order."""
+    found: list[Pulse] = []
+    after = -math.inf
+    while (pulse := line.next_after(after)) is not None and pulse.time <= clock.now():
+        found.append(pulse)
+        after = pulse.time
+    return found
+
+
+def start_move_by(stage: Motion, angle: float, speed: float) -> None:
+    """Begin a move by `angle` (rad, rounded once to whole counts) from the count where the stage stands, or is held by
+    its servo: what a servo is beside that does not add up.
+
+    n such moves make exactly n times these counts, however long the sum. Where an angle is no whole number of counts,
+    its multiples are not n times them: for equally spaced views give `start_move` the multiples.
+
+    Raises:
+        DeviceRefused, DeviceError: as `start_move`.
+    """
+    if not abs(angle) < FARTHEST:
+        stage.start_move(angle, speed)  # refuses in the stage's own words
+        return
+    status = stage.status()
+    here = status.counts if status.held is None else status.held
+    stage.start_move(stage.to_angle(here + stage.to_counts(angle)), speed)

@@ -1,0 +1,193 @@
+"""Every stage: a train gives exactly its pulses at its angles, once, until it is disarmed, replaced or over."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from contextlib import nullcontext
+
+import pytest
+
+from drivers.errors import DeviceRefused
+from drivers.protocols import TriggerTrain
+from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
+
+
+class Trains:
+    """Laws of drivers.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
+
+    @pytest.mark.parametrize(("first", "step", "n"), [(2.0, 0.5, 37), (-1.0, -0.25, 9), (1.0, 0.1, 1), (-1.0, -0.1, 1)])
+    def test_a_train_gives_exactly_its_pulses_at_its_angles(
+        self, bench: StageBench, first: float, step: float, n: int
+    ) -> None:
+        train = bench.train(first, step, n)
+        bench.stage.arm(train)
+        bench.clock.sleep(1.0)
+        assert bench.pulses() == []
+        bench.go(first + n * step + math.copysign(1.0, step))
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [train.start + k * train.interval for k in range(n)]
+        for k, pulse in enumerate(bench.pulses()):
+            asked = bench.stage.to_angle(train.start + k * train.interval)
+            assert pulse.angle == pytest.approx(asked, abs=math.radians(bench.count))
+            assert bench.line.angle_at(pulse.time) == pytest.approx(asked, abs=math.radians(bench.count))
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_a_single_pulse_may_have_any_interval(self, bench: StageBench, sign: int) -> None:
+        bench.stage.arm(TriggerTrain(sign * 100, sign, 1))
+        bench.go(sign * 3.0)
+        assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [sign * 100]
+
+    def test_at_constant_speed_pulses_are_equally_spaced_in_time(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(5.0, 0.5, 21))
+        bench.go(20.0)
+        times = [pulse.time for pulse in bench.pulses()]
+        periods = [later - earlier for earlier, later in itertools.pairwise(times)]
+        assert periods == pytest.approx([0.05] * 20, rel=1e-3)
+
+    def test_the_train_ends_with_its_last_pulse_however_far_it_turns(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+        bench.go(30.0)
+        assert len(bench.pulses()) == 3
+
+    def test_a_train_fires_once(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+        bench.go(5.0)
+        bench.go(0.0)
+        bench.go(5.0)
+        assert len(bench.pulses()) == 3
+
+    def test_one_train_after_another(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+        bench.go(5.0)
+        bench.stage.arm(bench.train(4.5, -1.0, 4))
+        bench.go(0.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 4.5, 3.5, 2.5, 1.5)]
+
+    def test_no_pulse_without_arming(self, bench: StageBench) -> None:
+        bench.go(10.0)
+        assert bench.pulses() == []
+
+    def test_no_pulse_after_disarming(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 3))
+        bench.stage.disarm()
+        bench.go(10.0)
+        assert bench.pulses() == []
+
+    def test_disarming_in_the_middle_of_a_train_ends_it(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 9))
+        bench.go(3.5)
+        bench.stage.disarm()
+        bench.go(7.5)
+        bench.go(0.0)
+        bench.go(20.0)
+        assert len(bench.pulses()) == 3
+        bench.stage.arm(bench.train(21.0, 1.0, 4))
+        bench.go(30.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 21.0, 22.0, 23.0, 24.0)]
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_a_train_that_is_stopped_in_the_middle_goes_on_with_the_next_move(
+        self, bench: StageBench, sign: int
+    ) -> None:
+        bench.go(-4.5 if sign > 0 else 10.0)
+        first = -3.0 if sign > 0 else 8.0
+        bench.stage.arm(bench.train(first, sign * 0.5, 20))
+        for degrees in (first + sign * 1.25, first + sign * 3.1, first + sign * 10.0):
+            bench.go(degrees)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(first) + sign * k * bench.counts(0.5) for k in range(20)]
+
+    def test_arming_again_replaces_the_train(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 9))
+        bench.stage.arm(bench.train(2.0, 3.0, 2))
+        bench.go(20.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(2.0), bench.counts(5.0)]
+
+    def test_arming_again_in_the_middle_of_a_train_replaces_it(self, bench: StageBench) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 9))
+        bench.go(3.5)
+        bench.stage.arm(bench.train(2.0, -1.0, 2))
+        bench.go(0.0)
+        bench.go(20.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 2.0, 1.0)]
+
+    def test_disarming_what_is_not_armed_is_fine(self, bench: StageBench) -> None:
+        bench.stage.disarm()
+        bench.stage.disarm()
+
+    def test_pulses_still_to_come_are_counted_where_the_controller_tells(self, bench: StageBench) -> None:
+        told = [bench.stage.remaining_pulses()]
+        bench.stage.arm(bench.train(1.0, 1.0, 5))
+        told.append(bench.stage.remaining_pulses())
+        bench.go(2.5)
+        told.append(bench.stage.remaining_pulses())
+        bench.go(10.0)
+        told.append(bench.stage.remaining_pulses())
+        assert told in ([0, 5, 3, 0], [None] * 4)
+
+    def test_a_train_under_which_the_stage_is_stopped_goes_on_with_the_next_move(self, bench: StageBench) -> None:
+        train = bench.train(1.0, 1.0, 30)
+        bench.stage.arm(train)
+        bench.stage.start_move(math.radians(40), SPEED)
+        bench.clock.sleep(1.6)
+        bench.stage.stop()
+        before = len(bench.pulses())
+        assert 10 < before < 20
+        assert bench.stage.remaining_pulses() in (30 - before, None)
+        bench.go(40.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [train.start + train.interval * k for k in range(30)]
+
+    @pytest.mark.parametrize("stopped", [False, True], ids=["at the end of a move", "after a stop"])
+    def test_turning_back_inside_a_train_gives_no_pulse_and_ends_it_where_it_cannot_go_on(
+        self, kind: StageKind, bench: StageBench, stopped: bool
+    ) -> None:
+        train = bench.train(1.0, 1.0, 30)
+        bench.stage.arm(train)
+        if stopped:
+            bench.stage.start_move(math.radians(40), SPEED)
+            bench.clock.sleep(1.1)
+            bench.stage.stop()
+        else:
+            bench.go(10.5)
+        before = len(bench.pulses())
+        assert before == 10 or (stopped and 5 < before < 15)
+        bench.go(2.0)
+        assert len(bench.pulses()) == before
+        assert bench.stage.remaining_pulses() in (0 if kind.turning_back_ends else 30 - before, None)
+        bench.go(40.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [train.start + train.interval * k for k in range(before if kind.turning_back_ends else 30)]
+
+    @pytest.mark.parametrize("stop", [-2.0, 0.5, 1.5, 1.9])
+    def test_turning_back_before_the_first_pulse_keeps_the_train(self, bench: StageBench, stop: float) -> None:
+        train = bench.train(2.0, 1.0, 5)
+        bench.stage.arm(train)
+        bench.go(stop)
+        bench.go(-4.0)
+        assert bench.stage.remaining_pulses() in (5, None)
+        bench.go(20.0)
+        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
+        assert counts == [train.start + train.interval * k for k in range(5)]
+
+    def test_disarming_on_the_way_ends_the_pulses_or_is_refused_and_lets_it_move(
+        self, kind: StageKind, bench: StageBench
+    ) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 30))
+        bench.stage.start_move(math.radians(40), SPEED)
+        bench.clock.sleep(1.6)
+        with (
+            nullcontext()
+            if kind.disarms_moving
+            else pytest.raises(DeviceRefused, match="disarming is not possible while it moves")
+        ):
+            bench.stage.disarm()
+        before = len(bench.pulses())
+        assert 10 < before < 20
+        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(40.0, abs=bench.count)
+        assert len(bench.pulses()) == (before if kind.disarms_moving else 30)

@@ -1,0 +1,129 @@
+"""Matter: how a material attenuates and delays X-rays, for the corrections of phase and beam hardening.
+
+Cross sections are those of xraylib from 0.1 to 800 keV (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). The
+simulator reads the same tables and states the same compositions and densities; all else is computed here anew, so that
+a correction is not tested with the formulas that made its data.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import numpy as np
+import xraylib
+from numpy.typing import ArrayLike, NDArray
+
+from recon.prep.phase import HC
+
+F64 = NDArray[np.float64]
+
+_LEAST_KEV, _MOST_KEV = 0.1, 800.0
+_DECREMENT = 0.0004151791  # keV² cm³/mol: classical electron radius x (hc)² x Avogadro's number / 2 pi
+_NODES = 513  # energies of a tube
+_SOFTEST_KEV, _NOTHING = 1.0, 1e-7  # a tube's lowest energy; the share of its light below which an energy is left out
+_LP30 = {"LiPF6": 151.9, "C3H4O3": 574.05, "C3H6O3": 574.05}  # g/l: 1 mol/l in equal masses of two carbonates
+
+KNOWN: Mapping[str, tuple[float, Mapping[str, float]]] = MappingProxyType(
+    {
+        "LiCoO2": (5.05011, {"LiCoO2": 1}),
+        "graphite": (2.26, {"C": 1}),
+        "Al": (2.699, {"Al": 1}),
+        "Cu": (8.96, {"Cu": 1}),
+        "Si": (2.33, {"Si": 1}),
+        "Ni": (8.902, {"Ni": 1}),
+        "steel": (7.85, {"Fe": 0.995, "Mn": 0.004, "C": 0.001}),
+        "stainless_steel": (8.0, {"Fe": 0.71, "Cr": 0.19, "Ni": 0.1}),
+        "electrolyte": (1.30, _LP30),
+        "polypropylene": (0.90, {"C3H6": 1}),
+        "polyethylene": (0.93, {"C2H4": 1}),
+        "water": (1.0, {"H2O": 1}),
+        "air": (1.205e-3, {"C": 0.000124, "N": 0.755267, "O": 0.231781, "Ar": 0.012827}),
+        "PVDF": (1.78, {"C2H2F2": 1}),
+        # Polypropylene with 41 % of pores full of electrolyte.
+        "separator": (1.064, {"C3H6": 590 * 0.90, **{salt: 0.41 * mass for salt, mass in _LP30.items()}}),
+    }
+)
+"""Density in g/cm³ and parts of the mass; see simulators.light.palette for the sources."""
+
+
+def delta_beta(name: str, energy_kev: float) -> float:
+    """Ratio of delta to beta of the refractive index 1 - delta + i beta; a material's density does not matter.
+
+    delta is by the electrons and the dispersion f' (Als-Nielsen & McMorrow 2011, Elements of Modern X-ray Physics,
+    equation 3.2), beta = mu wavelength / 4 pi.
+
+    Args:
+        name: of a known material, or a chemical formula.
+
+    Raises:
+        ValueError: neither of them, or an energy outside the tables.
+    """
+    beta = 0.1 * float(mass_attenuation(name, energy_kev)) * HC / energy_kev / (4 * math.pi)
+    electrons = sum(
+        share * (z + xraylib.Fi(z, energy_kev)) / xraylib.AtomicWeight(z) for z, share in _fractions(name).items()
+    )
+    return float(_DECREMENT * electrons / energy_kev**2 / beta)
+
+
+def mass_attenuation(name: str, energies: ArrayLike) -> F64:
+    """Mass attenuation in cm²/g at energies in keV, float64, of their shape; errors as of `delta_beta`."""
+    e = np.asarray(energies, np.float64)
+    if not ((e >= _LEAST_KEV) & (e <= _MOST_KEV)).all():
+        raise ValueError(
+            f"attenuation is tabulated from {_LEAST_KEV} to {_MOST_KEV:g} keV; got {e.min():g} ... {e.max():g} keV"
+        )
+    total = np.zeros(e.size)
+    for z, share in _fractions(name).items():
+        total += share * np.array([xraylib.CS_Total(z, float(energy)) for energy in e.flat])
+    return total.reshape(e.shape)
+
+
+def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
+    """The light of an X-ray tube: the bremsstrahlung of a thick target (Kramers, Phil. Mag. 46, 836, 1923).
+
+    Args:
+        kv: voltage.
+        filters: mm of each known material before the sample.
+
+    Returns:
+        Energies in keV, float64 [energy], and the shares of the photons at them, of any sum.
+
+    Raises:
+        ValueError: a voltage outside 5 ... 800 kV, a filter without a known density, or no light behind the filters.
+    """
+    if not 5 <= kv <= 800:
+        raise ValueError(f"kv must lie in 5 ... 800, got {kv}")
+    x, w = np.polynomial.legendre.leggauss(_NODES)
+    energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (x + 1) / 2
+    depth = np.zeros(_NODES)
+    for name, mm in filters.items():
+        if name not in KNOWN:
+            raise ValueError(f"the filter {name!r} has no known density; expected one of {', '.join(KNOWN)}")
+        depth += 0.1 * mm * KNOWN[name][0] * mass_attenuation(name, energies)
+    weights = w * (kv - energies) / energies * np.exp(-depth)
+    if not weights.any():
+        raise ValueError(f"no light of the tube's {kv:g} kV passes its filters {dict(filters)} mm")
+    kept = weights > _NOTHING * weights.sum()
+    return energies[kept], weights[kept]
+
+
+def _fractions(name: str) -> dict[int, float]:
+    """Share of the mass of each element, by atomic number."""
+    nmc = re.fullmatch(r"NMC(\d)(\d)(\d)", name)
+    if nmc is not None and any(map(int, nmc.groups())):  # a layered oxide by the shares of its metals: NMC622
+        total = sum(map(int, nmc.groups()))
+        metals = [f"{symbol}{int(n) / total:.9f}" for symbol, n in zip(("Ni", "Mn", "Co"), nmc.groups(), strict=True)]
+        name = f"Li{''.join(metal for metal in metals if float(metal[2:]) > 0)}O2"
+    parts = KNOWN[name][1] if name in KNOWN else {name: 1.0}
+    shares: dict[int, float] = {}
+    for formula, mass in parts.items():
+        try:
+            parsed = xraylib.CompoundParser(formula)
+        except ValueError as error:
+            raise ValueError(f"{name!r} is neither a material that scenes know nor a chemical formula") from error
+        for z, share in zip(parsed["Elements"], parsed["massFractions"], strict=True):
+            shares[z] = shares.get(z, 0.0) + mass / sum(parts.values()) * share
+    return shares

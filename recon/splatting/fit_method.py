@@ -1,0 +1,59 @@
+"""FitMethod: what a fit of Gaussians is asked for; StreamingMethod: one whose volume can grow while views arrive."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+from recon.base.choices import Start
+from recon.base.geometry import Geometry
+from recon.base.method import Method
+from recon.splatting.gaussians import Gaussians
+from recon.splatting.settings import FitSettings
+from recon.splatting.stream import Clock, StreamingFit
+
+
+@runtime_checkable
+class FitMethod(Method, Protocol):
+    """A fit of Gaussians with these settings, see `R2`."""
+
+    @property
+    def steps(self) -> int | None: ...
+
+    @property
+    def seconds(self) -> float | None: ...
+
+    @property
+    def gaussians(self) -> int | Gaussians | None: ...
+
+    @property
+    def start(self) -> Start: ...
+
+    @property
+    def early_stop(self) -> bool: ...
+
+    @property
+    def finish(self) -> int | None: ...
+
+    @property
+    def allow_negative(self) -> bool: ...
+
+    @property
+    def fit(self) -> FitSettings: ...
+
+    @property
+    def planned_steps(self) -> int | None:
+        """Steps that end the fit; None where `seconds` alone do."""
+        ...
+
+    def finish_sweeps(self, geometry: Geometry) -> int:
+        """Sweeps of the finish on these views."""
+        ...
+
+
+@runtime_checkable
+class StreamingMethod(FitMethod, Protocol):
+    """A method whose volume can grow while views arrive; its `seconds` are those of the last round, over all views."""
+
+    def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
+        """A fit of views with the geometry of `template`, whose angles are ignored."""
+        ...

@@ -1,0 +1,62 @@
+"""What other packages add to a registry, and what is left out with a warning."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from drivers import plugins as module
+from drivers.plugins import plugins
+
+
+@pytest.fixture
+def announced(monkeypatch: pytest.MonkeyPatch) -> list[EntryPoint]:
+    """The entry points of all packages, in place of those installed."""
+    points: list[EntryPoint] = []
+    monkeypatch.setattr(module, "_announced", lambda: tuple(points))
+    return points
+
+
+def _point(name: str, value: str, kind: str = "reader") -> EntryPoint:
+    return EntryPoint(name, value, f"splatline.{kind}")
+
+
+def test_the_plug_ins_of_a_kind_come_by_name(announced: list[EntryPoint]) -> None:
+    announced += [_point("tau", "math:tau"), _point("pi", "math:pi"), _point("e", "math:e", "effect")]
+
+    assert list(plugins("reader", ()).items()) == [("pi", math.pi), ("tau", math.tau)]
+    assert plugins("reader", (), lambda name, found: (name, round(found))) == {"pi": ("pi", 3), "tau": ("tau", 6)}
+    assert plugins("stage", ()) == {}
+
+
+@pytest.mark.parametrize(
+    ("points", "said"),
+    [
+        ([("old", "math:e")], r"'old' \(math:e\) was left out: .*taken by splatline"),
+        ([("twice", "math:e"), ("twice", "math:tau")], r"taken by another plug-in"),
+        ([("gone", "no_such_module:thing")], r"The volume format 'gone' .*ModuleNotFoundError"),
+        ([("wrong", "math:no_such_thing")], r"AttributeError"),
+        ([("odd", "math:inf")], r"OverflowError.*all else works without it"),
+    ],
+)
+def test_what_does_not_load_or_fit_or_has_a_name_that_is_taken_is_left_out_with_a_warning(
+    announced: list[EntryPoint], points: list[tuple[str, str]], said: str
+) -> None:
+    announced += [_point(*point, "volume_format") for point in [*points, ("pi", "math:pi")]]
+    with pytest.warns(UserWarning) as told:
+        assert plugins("volume_format", ("old",), lambda name, found: int(found)) == {"pi": 3}
+    assert len(told) == len(points)
+
+    assert all(re.search(said, str(warning.message)) for warning in told)
+
+
+def test_help_looks_for_no_plug_in() -> None:
+    code = "import sys; from beamline.cli.main import run; sys.argv = ['beamline', '--help']\n"
+    code += "try: run()\nexcept SystemExit: print('drivers.plugins' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"

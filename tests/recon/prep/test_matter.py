@@ -1,0 +1,69 @@
+"""Delta, beta and tubes: against xraylib, and against the simulator, which reads the same tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xraylib
+
+from recon.prep.hardening import curve_of_spectrum
+from recon.prep.matter import KNOWN, delta_beta, mass_attenuation, tube_spectrum
+from simulators.light.beam import Beam, Tube
+from simulators.light.palette import Palette
+from simulators.light.spectrum import light
+
+
+@pytest.mark.parametrize(("name", "formula"), [("water", "H2O"), ("SiO2", "SiO2"), ("Al", "Al"), ("LiCoO2", "LiCoO2")])
+@pytest.mark.parametrize("energy", [8.0, 25.0])
+def test_the_ratio_is_that_of_the_refractive_index(name: str, formula: str, energy: float) -> None:
+    delta = 1 - xraylib.Refractive_Index_Re(formula, energy, 1.0)
+    beta = xraylib.Refractive_Index_Im(formula, energy, 1.0)
+    assert delta_beta(name, energy) == pytest.approx(delta / beta, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", [*KNOWN, "NMC622"])
+def test_corrections_and_simulator_share_tables_compositions_and_densities(name: str) -> None:
+    """The one thing that both know: a wrong cross section would be in the data and in the correction."""
+    simulated, energies = Palette()(name), np.array([8.0, 25.0, 120.0])
+    np.testing.assert_allclose(
+        mass_attenuation(name, energies), 10 * simulated.attenuation(energies) / simulated.density, rtol=1e-12
+    )
+    if not name.startswith("NMC"):  # which no filter is of
+        energies, behind = tube_spectrum(800.0, {name: 0.1})
+        weights = np.interp(energies, *tube_spectrum(800.0, {})) * np.exp(-0.1 * simulated.attenuation(energies))
+        np.testing.assert_allclose(behind, weights, rtol=1e-5, atol=1e-6)  # an open beam has fewer nodes left
+
+
+@pytest.mark.parametrize(("kv", "filters"), [(160.0, {"Cu": 0.5}), (60.0, {"Al": 1.0})])
+def test_a_tube_hardens_as_the_simulated_one_does(kv: float, filters: dict[str, float]) -> None:
+    """The simulator finds as few energies as a material needs; here are all of them."""
+    palette = Palette()
+    steel = palette("steel")
+    thickness = np.linspace(0, 4 / float(steel.attenuation(kv / 2)), 9)
+    found = light(Beam(0.0, tube=Tube(kv, filters)), [steel.attenuation], thickness[-1], palette.filters)
+    views = -np.log(found.transmission(steel.attenuation, thickness)).astype(np.float32)[None]
+    energies, weights = tube_spectrum(kv, filters)
+    seen = views.copy()
+    curve_of_spectrum(mass_attenuation("steel", energies), weights, float(seen.max())).linearise(seen)
+    np.testing.assert_allclose(seen[0], found.mean(steel.attenuation) * thickness, rtol=3e-3, atol=1e-4)
+    assert views[0, -1] < 0.9 * seen[0, -1]
+
+
+def test_what_is_no_material_is_said() -> None:
+    with pytest.raises(ValueError, match="'bone' is neither a material that scenes know nor a chemical formula"):
+        delta_beta("bone", 20.0)
+    with pytest.raises(ValueError, match="tabulated from"):
+        delta_beta("Al", 2000.0)
+
+
+@pytest.mark.parametrize(
+    ("kv", "filters", "said"),
+    [
+        (60.0, {"Sn": 0.5}, r"the filter 'Sn' has no known density; expected one of LiCoO2, .*Al, Cu"),
+        (4.0, {}, r"kv must lie in 5 \.\.\. 800, got 4"),
+        (60.0, {"Cu": 1e6}, "no light of the tube's 60 kV passes"),
+    ],
+)
+def test_an_impossible_tube_is_refused(kv: float, filters: dict[str, float], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        tube_spectrum(kv, filters)
