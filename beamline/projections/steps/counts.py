@@ -1,4 +1,4 @@
-"""CountModel: line integrals are logarithms, or carry the likelihood of the photons counted."""
+"""Counts: line integrals are logarithms, or carry the likelihood of the photons counted."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class CountModel:
     gain: float | None = option(
         "--gain",
         None,
-        "CountModel a photon, for --noise. Default: as the flats vary.",
+        "Counts a photon, for --noise. Default: as the flats vary.",
         parse=positive,
         metavar="COUNTS",
     )
