@@ -15,7 +15,7 @@ from beamline.cli.option_groups import CORRECTIONS, DATA, heading
 from beamline.cli.options import POSITIVE
 from beamline.cli.scan_options import scan_options
 from beamline.projections.steps.registry import key_of, registered, steps_of
-from beamline.projections.steps.step import Option, Step, options_of
+from beamline.projections.steps.step import Option, PrepStep, options_of
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -103,7 +103,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
     return SourceOptions(file, **rest), selection
 
 
-def steps_said(said: Mapping[str, Any]) -> tuple[Step, ...]:
+def steps_said(said: Mapping[str, Any]) -> tuple[PrepStep, ...]:
     """The steps by their options in `said`."""
     try:
         return steps_of(said)

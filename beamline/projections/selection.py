@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.projections.steps.registry import all_steps
-from beamline.projections.steps.step import Step
+from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 
-S = TypeVar("S", bound=Step)
+S = TypeVar("S", bound=PrepStep)
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
 
@@ -45,19 +45,19 @@ class Selection:
     cone: tuple[float, float] | None = None
     seed: int = 0
     axis_rows: tuple[int, int] | None = None
-    steps: tuple[Step, ...] = ()
+    steps: tuple[PrepStep, ...] = ()
 
     def step(self, kind: type[S]) -> S:
         """The step of a kind: the one given, else one that does what its defaults say."""
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
-    def having(self, *steps: Step) -> Selection:
+    def having(self, *steps: PrepStep) -> Selection:
         """The same with these steps, each in place of another one of its kind."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
 
     @property
-    def in_order(self) -> list[Step]:
+    def in_order(self) -> list[PrepStep]:
         """Every step that there is, each after those that it follows."""
         return [self.step(kind) for kind in all_steps()]
 

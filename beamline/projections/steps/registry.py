@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.steps.step import Done, Step, options_of
+from beamline.projections.steps.step import Done, PrepStep, options_of
 
 if TYPE_CHECKING:
     from beamline.storage.writers.recon_file import Value
@@ -29,7 +29,7 @@ REGISTRY: dict[str, str] = {
 
 
 @cache
-def registered() -> tuple[type[Step], ...]:
+def registered() -> tuple[type[PrepStep], ...]:
     """Every step, in the order of the registry."""
     return tuple(
         getattr(import_module(f"beamline.projections.steps.{module}"), cls) for module, cls in REGISTRY.items()
@@ -37,14 +37,14 @@ def registered() -> tuple[type[Step], ...]:
 
 
 @cache
-def all_steps() -> tuple[type[Step], ...]:
+def all_steps() -> tuple[type[PrepStep], ...]:
     """Every step, each after those that it follows."""
-    by_name: dict[str, type[Step]] = {step.name: step for step in registered()}
+    by_name: dict[str, type[PrepStep]] = {step.name: step for step in registered()}
     order = TopologicalSorter({name: step.follows for name, step in by_name.items()}).static_order()
     return tuple(by_name[name] for name in order)
 
 
-def steps_of(values: Mapping[str, Any]) -> tuple[Step, ...]:
+def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
     """All steps with these values of their options, which are keyed as `key_of` says.
 
     Raises:
@@ -61,7 +61,7 @@ def key_of(option: str) -> str:
     return option.lstrip("-").replace("-", "_")
 
 
-def recorded(steps: Sequence[Step], done: Mapping[str, Done]) -> dict[str, Value]:
+def recorded(steps: Sequence[PrepStep], done: Mapping[str, Done]) -> dict[str, Value]:
     """What the file of a volume records of the steps, by name."""
     found: dict[str, Value] = {}
     for step in steps:
@@ -71,7 +71,7 @@ def recorded(steps: Sequence[Step], done: Mapping[str, Done]) -> dict[str, Value
     return found
 
 
-def _options(step: Step) -> dict[str, Value]:
+def _options(step: PrepStep) -> dict[str, Value]:
     """The values of a step's options."""
     values = {key_of(option.name): getattr(step, field) for field, option in options_of(type(step)).items()}
     return {key: value if isinstance(value, int | float) else str(value) for key, value in values.items()}

@@ -51,7 +51,7 @@ def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
     return field(default=None if default is None else made.parse(default), metadata={"option": made})
 
 
-def options_of(step: type[Step]) -> dict[str, Option]:
+def options_of(step: type[PrepStep]) -> dict[str, Option]:
     """The options of a step, by field."""
     return {each.name: each.metadata["option"] for each in fields(step) if "option" in each.metadata}  # type: ignore[arg-type]
 
@@ -77,7 +77,7 @@ class Done:
     parameters: Mapping[str, Value] | None = None
 
 
-class Step(Protocol):
+class PrepStep(Protocol):
     """A correction. Its ValueError on creation is bad usage.
 
     Attributes:
@@ -110,7 +110,7 @@ class ViewFilter:
 
 
 @runtime_checkable
-class ViewStep(Step, Protocol):
+class ViewStep(PrepStep, Protocol):
     """A step on each view alone, also of a scan that still runs."""
 
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
@@ -122,7 +122,7 @@ class ViewStep(Step, Protocol):
 
 
 @runtime_checkable
-class ScanStep(Step, Protocol):
+class ScanStep(PrepStep, Protocol):
     """A step on all views of a scan."""
 
     def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:

@@ -14,7 +14,7 @@ from beamline.projections.prepare import PreparedProjections, Spill, prepare_pro
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import Step
+from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.frame import FrameKind
@@ -34,7 +34,7 @@ def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
 
 
 def prepare(
-    path: Path, *steps: Step, spill: Spill | None = None, **chosen: Any
+    path: Path, *steps: PrepStep, spill: Spill | None = None, **chosen: Any
 ) -> tuple[PreparedProjections, list[str]]:
     told: list[str] = []
     selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"), *steps), **chosen)
