@@ -358,7 +358,73 @@ assert wire.transmit() == b"0007"
 """,
 )
 
-EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER, "stage": STAGE}
+STEP = Extension(
+    {
+        "beamline/projections/steps/lift.py": """
+from dataclasses import dataclass
+from typing import ClassVar
+
+from beamline.projections.steps.step import Done, option
+
+
+@dataclass(frozen=True)
+class Lift:
+    name: ClassVar[str] = "lift"
+    follows: ClassVar[tuple[str, ...]] = ("hardening",)
+    by: float = option("--lift", "0", "Add this to all line integrals.", parse=float, metavar="BY")
+
+    def __post_init__(self):
+        if self.by < 0:
+            raise ValueError("--lift: nothing is taken off.")
+
+    @property
+    def needs_finished(self):
+        return "--lift is for a finished scan." if self.by else ""
+
+    def apply(self, views, angles):
+        views.projections.data[...] += self.by
+        return Done(f"Lifted by {self.by:g}." if self.by else "")
+"""
+    },
+    (("beamline/projections/steps/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),
+    """
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner
+from beamline.cli.main import main
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.lift import Lift
+from beamline.projections.steps.registry import recorded
+from beamline.storage.readers.open import SourceOptions, open_scan
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+path = write_exchange(Path("lift.h5"), TwoCylinders(shape=(2, 40)))
+with open_scan(SourceOptions(path)) as source:
+    chosen = [Selection(axis_col=20.7, steps=(Air("none"), *steps)) for steps in ((), (Lift(0.5),))]
+    plain, lifted = (prepare_projections(source, each, print) for each in chosen)
+np.testing.assert_allclose(lifted.projections.data, plain.projections.data + 0.5, atol=1e-6)
+assert lifted.done["lift"].said == "Lifted by 0.5."
+found = recorded(chosen[1].in_order, lifted.done)
+assert (found["lift"], found["lift_said"]) == (0.5, "Lifted by 0.5.")
+
+def run(*options):
+    done = CliRunner().invoke(main, ["recon", "lift.h5", "-m", "r2", "--axis", "20.7", *options])
+    return done.exit_code, done.output
+
+assert "lift: 0.5" in run("--lift", "0.5", "--write-config", "-")[1]
+Path("recipe.yaml").write_text("method: r2\\nlift: 0.7\\n")
+assert "lift: 0.7" in run("--config", "recipe.yaml", "--write-config", "-")[1]
+code, said = run("--lift", "1", "--follow")
+assert code == 2 and "--lift is for a finished scan" in said
+assert run("--lift", "-1")[0] == run("--lift", "much")[0] == 2
+assert "--lift BY" in CliRunner().invoke(main, ["recon", "--help-all"]).output
+""",
+)
+
+EXTENSIONS = {"method": METHOD, "check": CHECK, "effect": EFFECT, "reader": READER, "stage": STAGE, "step": STEP}
 
 
 # Each proof in a namespace of its own; the last line printed says which failed, and how.

@@ -94,7 +94,8 @@ def reconstruct(
         rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
         views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
         binning: pixels that are averaged, a side.
-        selection: everything else, such as Selection(axis_col=1023.5, rings="vo"); the arguments above go before it.
+        selection: everything else, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
+            `beamline.projections.steps`; the arguments above go before it.
         output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
             A scan that does not fit into the memory needs one.
         tell: gets a sentence on what happens; None: nobody does.

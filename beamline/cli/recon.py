@@ -29,7 +29,7 @@ from beamline.cli.method_options import (
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
 from beamline.cli.recipe import config_option, recipe_text, repeating
-from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import LogLines, Terminal, counting, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
 from beamline.core.events import Event, Sink, fan_out, while_it_works
@@ -270,14 +270,9 @@ def recon(
     if method is None:
         method = DEFAULT if follow or any_setting or set(options_of_a_method(context)) - {"budget"} else AUTO
     refuse_contradictions(context, method, follow)
-    if follow and values["flags"] == "judge":
-        raise click.UsageError("--flags judge is for a finished scan; a running one is judged while it is taken.")
-    if follow and values["rings"] != "none":
-        raise click.UsageError("--rings is for a finished scan: it needs all views.")
-    if follow and values["hardening"] is not None:
-        raise click.UsageError("--hardening is for a finished scan: its curve is of all views.")
-    if follow and values["tilt"] == "auto":
-        raise click.UsageError("--tilt auto is for a finished scan: it needs all views. Give it in degrees.")
+    for step in steps_said(values) if follow else ():
+        if step.needs_finished:
+            raise click.UsageError(step.needs_finished)
     enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
     if enough is not None and not follow:
         raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")

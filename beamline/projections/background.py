@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.selection import Surface
+from beamline.projections.steps.air import Surface
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -13,23 +12,29 @@ from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count, spans
-from beamline.projections.phase import filter_of
 from beamline.projections.read import (
     current_scale,
     open_beam,
     photons_of,
     read_binned,
     read_references,
+    use_current,
     with_dynamic_flats,
 )
-from beamline.projections.selection import Selection, cone_of, rows_of
+from beamline.projections.selection import Selection, rows_of
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.counts import CountModel
+from beamline.projections.steps.defects import Defects
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.flats import Flats
+from beamline.projections.steps.references import ReferenceCheck
+from beamline.projections.steps.step import Done, ViewFilter, ViewStep
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
 from drivers.frame import FrameKind
-from recon.prep.correct import Correction, Projections, References, Transmission, UnlitViewsError
+from recon.prep.correct import Correction, CorrectionSettings, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
-from recon.prep.resample import Resampling
 
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
 
@@ -54,28 +59,38 @@ class ScanCorrection:
             DataError: references that cannot be used.
         """
         self.rows, self.binning = rows_of(source, selection), selection.binning
-        self._filter, self.phase = filter_of(source, selection)
-        self._resampling = resampling_of(source, selection)
-        if self._filter is not None or self._resampling is not None:
-            if selection.noise == "counts":
-                what = "--tilt and --distortion mix" if self._filter is None else "--phase mixes"
-                raise ConfigError(f"{what} neighbouring pixels, so that --noise counts has no likelihood for them.")
-            selection = replace(selection, noise="log")
+        counted = selection.step(CountModel).noise == "counts"
+        self._filters: list[ViewFilter] = []
+        self._filtered: dict[str, Done] = {}
+        for step in selection.in_order:
+            if isinstance(step, ViewStep):
+                found, self._filtered[step.name] = step.on(source, selection)
+                self._filters += [] if found is None else [found]
+        if self._filters:
+            if counted:
+                raise ConfigError(
+                    f"{self._filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
+                )
+            selection = selection.having(CountModel("log"))
         self._source, self._selection, self._warn = source, selection, warn
         if source.altered:
             warn(altered_said(source))
-        self._current_factor = current_scale(source) if selection.use_current else None  # [frame], by the ring current
+        defects = selection.step(Defects)
+        self._settings = CorrectionSettings(
+            defects.floor, defects.hot_threshold, defects.zinger_threshold, selection.step(Air).columns
+        )
+        self._current_factor = current_scale(source) if use_current(selection) else None  # [frame], by the ring current
         wide, _ = self._widened(None)
         self._n_references = _count_references(source)
         self._references: References | None = None
         self.photons: Photons | None = None
-        if selection.noise == "counts" and source.quantity != "counts":
+        if counted and source.quantity != "counts":
             raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
         if source.quantity == "counts":
             groups = reference_groups(source)
-            used = groups if selection.accept_references else groups.good()
+            used = groups if selection.step(ReferenceCheck).accepted else groups.good()
             self._references = read_references(source, used, wide, selection)
-            if selection.flat_fields == "dynamic":
+            if selection.step(Flats).fields == "dynamic":
                 self._references = with_dynamic_flats(source, used, self._references, wide, selection)
             self._tell_damaged(np.concatenate([*used.darks, *used.flats]))
             self._tell_parts_without_flats(self._references)
@@ -104,7 +119,7 @@ class ScanCorrection:
         if not frames.size:
             raise self._no_view()
         if self._references is None:
-            return self._retrieved(_as_given(data, frames), rows)
+            return self._filtered_views(_as_given(data, frames), rows)
         return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, told=told)
 
     def in_batches(
@@ -135,7 +150,7 @@ class ScanCorrection:
                     survey.survey(self._transmission(survey, data, found))
                 told(min((done + 1) * batch, frames.size), passes * frames.size)
             columns = survey.air_columns
-            settings = replace(self._selection.correction, air=columns if any(columns) else "none")
+            settings = replace(self._settings, air=columns if any(columns) else "none")
             stream = Correction(self._references, settings, masked=survey.masked)
             parts = [found for found in alive if found.size]
         at, kept, begun = 0, [], (passes - 1) * frames.size
@@ -145,7 +160,7 @@ class ScanCorrection:
             if stream is not None:
                 corrected = self._corrected(stream, data, found, last)
             elif found.size:
-                corrected = self._retrieved(_as_given(data, found), None)
+                corrected = self._filtered_views(_as_given(data, found), None)
             else:
                 continue
             n = len(corrected.data)
@@ -169,7 +184,7 @@ class ScanCorrection:
         """
         data, frames = self._read(frames, None)
         if self._references is None:
-            return self._retrieved(_as_given(data, frames), None) if frames.size else None
+            return self._filtered_views(_as_given(data, frames), None) if frames.size else None
         if self._stream is None:
             self._stream = self._correction(None)
         if not frames.size and not (last and self._stream.waiting):
@@ -183,10 +198,24 @@ class ScanCorrection:
     def newest(self) -> Projections | None:
         """Line integrals of the newest view while it waits for the next, as if none came after it."""
         part = None if self._stream is None else self._stream.provisional()
-        return None if part is None else self._retrieved(part, None)
+        return None if part is None else self._filtered_views(part, None)
 
     @property
-    def flats(self) -> str:
+    def done(self) -> dict[str, Done]:
+        """What each step did, by name."""
+        if self._references is None:
+            return {**{name: Done(parameters={}) for name in ("flats", "defects", "noise")}, **self._filtered}
+        flats, noise, settings = self._flats, self._noise, asdict(self._settings)
+        recorded = {name: value if isinstance(value, float) else str(value) for name, value in settings.items()}
+        return {
+            "defects": Done(parameters={f"correction_{name}": value for name, value in recorded.items()}),
+            "flats": Done(flats, {"flats": flats or self._selection.step(Flats).fields}),
+            "noise": Done(noise, {"noise": noise or "logarithms of counts"}),
+            **self._filtered,
+        }
+
+    @property
+    def _flats(self) -> str:
         """What was done about changes of the beam, in words; empty where nothing was asked."""
         said = []
         if self._current_factor is not None:
@@ -204,7 +233,7 @@ class ScanCorrection:
         return " ".join(said)
 
     @property
-    def noise(self) -> str:
+    def _noise(self) -> str:
         """How counts become line integrals, in words; empty where they are logarithms."""
         if self.photons is None or self._references is None:
             return ""
@@ -238,7 +267,7 @@ class ScanCorrection:
             lost = frames[~alive]
             self._warn(f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out.")
             data, frames = data[alive], frames[alive]
-        if (damaged := self._tell_damaged(frames)).any() and self._selection.use_flags:
+        if (damaged := self._tell_damaged(frames)).any() and self._selection.step(Flags).used:
             data, frames = data[~damaged], frames[~damaged]
         return data, frames
 
@@ -246,7 +275,7 @@ class ScanCorrection:
         """Which of the frames are not what was written, as far as they were read; a warning names them."""
         damaged = np.isin(frames, sorted(self._source.damaged))
         if damaged.any():
-            taken = "left out" if self._selection.use_flags else "used as they are (--flags ignore)"
+            taken = "left out" if self._selection.step(Flags).used else "used as they are (--flags ignore)"
             self._warn(
                 f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
                 f"checksums: {taken}. Look for a good copy of {self._source.path}."
@@ -278,7 +307,7 @@ class ScanCorrection:
         within = slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
         references = self._references.rows(within)
         try:
-            return Correction(references, self._selection.correction, photons=self.photons)
+            return Correction(references, self._settings, photons=self.photons)
         except ValueError as error:
             raise self._refusal(error) from error
 
@@ -289,24 +318,19 @@ class ScanCorrection:
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // self.binning)
             first, end = first + start * self.binning, first + stop * self.binning
-        n, steps = self.binning, (self._filter, self._resampling)
-        reach = sum(step.reach for step in steps if step is not None)
+        n, reach = self.binning, sum(each.reach for each in self._filters)
         above = min(reach, first // n)
         below = min(reach, (self._source.shape[0] - end) // n)
         return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
 
-    def _retrieved(self, part: Projections, rows: slice | None) -> Projections:
-        """The views resampled and through the filter, in the rows wanted."""
-        if (self._filter is None and self._resampling is None) or not part.view_ids.size:
+    def _filtered_views(self, part: Projections, rows: slice | None) -> Projections:
+        """The views through the filters of the steps, in the rows wanted."""
+        if not self._filters or not part.view_ids.size:
             return part
         read, wanted = self._widened(rows)
-        masked = part.masked
-        if self._resampling is not None:
-            self._resampling.apply(part.data, read.start)
-            masked = self._resampling.nearest(masked, read.start)
-        if self._filter is not None:
-            self._filter.retrieve(part.data, self._selection.correction.floor)
-        return replace(part, data=np.ascontiguousarray(part.data[:, wanted]), masked=masked[wanted])
+        for each in self._filters:
+            part = each.apply(part, read.start)
+        return replace(part, data=np.ascontiguousarray(part.data[:, wanted]), masked=part.masked[wanted])
 
     def _corrected(
         self,
@@ -324,9 +348,10 @@ class ScanCorrection:
                 views = self._transmission(correction, data, frames, lambda done: told((n + done) // _STEPS, n))
                 correction.survey(views)
             lines = correction.line_integrals(views, last, lambda done: told((2 * n + done) // _STEPS, n))
-            return self._retrieved(lines, rows)
+            return self._filtered_views(lines, rows)
         except UnlitViewsError as error:
-            advice = "" if self._selection.judge else " (--flags judge leaves out what the monitor finds dark)"
+            judged = self._selection.step(Flags).judged
+            advice = "" if judged else " (--flags judge leaves out what the monitor finds dark)"
             raise DataError(
                 f"{self._refusal(error)}{advice}; if the sample covers these columns, --air none"
             ) from error
@@ -353,21 +378,6 @@ class ScanCorrection:
 
     def _refusal(self, error: ValueError) -> DataError:
         return DataError(f"{self._source.path} cannot be corrected: {error}")
-
-
-def resampling_of(source: ScanSource, selection: Selection) -> Resampling | None:
-    """How views are resampled; None where they are used as they are.
-
-    Raises:
-        ConfigError: a cone's axis is to be levelled.
-    """
-    tilt = selection.tilt_deg or 0.0
-    if (tilt or selection.find_tilt) and cone_of(source, selection) is not None:
-        raise ConfigError(f"--tilt is for a parallel beam; {source.path} is a cone. Leave it out.")
-    if not tilt and selection.distortion is None:
-        return None
-    height, width = source.shape
-    return Resampling((height, width), math.radians(tilt), selection.distortion, selection.binning)
 
 
 def _count_references(source: ScanSource) -> int:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from beamline.projections.selection import Hardening
+from beamline.projections.steps.hardening import Hardening
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -26,7 +26,7 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
     """The curve of a scan's line integrals [view, row, col], and a sentence about it; None where none is to be used."""
     highest = max(float(view.max()) for view in views)
     if wanted.spectrum is not None:
-        curve, how = curve_of_spectrum(*wanted.spectrum, highest), f"of {wanted.description}"
+        curve, how = curve_of_spectrum(*wanted.spectrum, highest), f"of {wanted.wanted}"
     else:
         try:
             curve, explained = fitted(views, geometry)

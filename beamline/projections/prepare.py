@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -13,15 +13,12 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
-from beamline.projections.background import without_background
-from beamline.projections.correction import ScanCorrection, Warn, resampling_of
+from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
-from beamline.projections.hardening import curve_of
 from beamline.projections.jumps import find_jumps, longest_part
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import (
-    Hardening,
     Selection,
     check_axis,
     choose_views,
@@ -31,6 +28,10 @@ from beamline.projections.selection import (
     rows_of,
     unbinned,
 )
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.references import ReferenceCheck
+from beamline.projections.steps.resampling import TiltAndLens
+from beamline.projections.steps.step import Done, ScanStep
 from beamline.projections.tilt import spread, spread_views, warn_of_tilt, with_tilt
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
@@ -44,7 +45,6 @@ from recon.base.masks import RayWeights, areas, masked
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate, find_axis
 from recon.prep.correct import Projections
-from recon.prep.rings import remove_rings_in_place
 from recon.voxels.projector import seen_rays
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
@@ -68,18 +68,10 @@ class PreparedProjections:
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
         left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
         flags: of all frames of the scan; None where there are none.
-        noise: how photons were counted, in words; empty: the line integrals are logarithms.
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         jumps: what was done about jumps of the sample; empty where there was none.
-        background: what was done about the background of the beam; empty where nothing was asked.
-        background_terms: of the mean surface that was taken off, see `recon.prep.background.surface`; None: none was.
-        rings: what was done about rings; empty where nothing was asked.
-        flats: what was done about changes of the beam; empty where nothing was asked.
-        phase: what was done about phase; empty where nothing was asked.
-        hardening: what was done about beam hardening; empty where nothing was asked.
-        tilt: what was done about a tilt of the axis; empty where nothing was asked.
-        tilt_deg: by which views were turned.
+        done: what each step did, by name, in the order in which it did.
         shares_of: `shares` of some rows [view, row, col], where line integrals lie on disk and these are made when
             wanted; None: as `shares` says.
     """
@@ -95,18 +87,10 @@ class PreparedProjections:
     view_weights: NDArray[np.float32] | None = None
     left_out: int = 0
     flags: FrameFlags | None = None
-    noise: str = ""
     measured: NDArray[np.bool_] | None = None
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
-    background: str = ""
-    background_terms: NDArray[np.float64] | None = None
-    rings: str = ""
-    flats: str = ""
-    phase: str = ""
-    hardening: str = ""
-    tilt: str = ""
-    tilt_deg: float = 0.0
+    done: Mapping[str, Done] = field(default_factory=dict)
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
 
     @property
@@ -209,7 +193,7 @@ def prepare_projections(
     pixel_size(source, selection)
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
     phases.enter("tilt and references")
-    selection, tilt = with_tilt(source, selection, scan_frames, warn)
+    selection, sought = with_tilt(source, selection, scan_frames, warn)
     correction = ScanCorrection(source, selection, warn)
     warn_of_tilt(source, selection, correction, scan_frames, warn)
     axis_col, axis = selection.axis_col, None
@@ -247,13 +231,7 @@ def prepare_projections(
         held_out = others.data, jumps.corrected(unseen, others.view_ids)
     ids = projections.view_ids
     geometry = jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids)
-    background, background_terms = without_background(
-        projections.data, geometry, selection.surface, held_out, areas(projections.masked)
-    )
-    taken, rings = remove_rings_in_place(projections.data, source.angles[ids], selection.rings)
-    if others is not None:
-        others.data[...] -= taken
-    regions = replace(usable.regions, resampling=resampling_of(source, selection))
+    regions = replace(usable.regions, resampling=selection.step(TiltAndLens).of(source, selection))
     shares_of = None
     if spill is not None:
         rows = rows_of(source, selection)
@@ -261,34 +239,15 @@ def prepare_projections(
             shares_of = partial(_shares_of, regions, ids, rows, selection.binning, projections.data.shape[2])
         usable = replace(usable, regions=Regions())
     found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
-    found = replace(
-        found,
-        geometry=geometry,
-        jumps=jumps.said,
-        noise=correction.noise,
-        flats=correction.flats,
-        phase=correction.phase,
-        background=background,
-        background_terms=background_terms,
-        rings=rings,
-        tilt=tilt,
-        shares_of=shares_of,
-    )
-    if selection.hardening is not None:
-        found = _linearised(found, selection.hardening)
+    done = {**correction.done, **({"tilt": selection.step(TiltAndLens).done(sought)} if sought else {})}
+    found = replace(found, geometry=geometry, jumps=jumps.said, shares_of=shares_of)
+    for step in selection.in_order:
+        if isinstance(step, ScanStep):
+            done[step.name] = step.apply(found, source.angles[ids])
+    found = replace(found, done=done)
     if spill is not None:
         _fill_unknown(found, regions, rows_of(source, selection), selection.binning)
     return found
-
-
-def _linearised(found: PreparedProjections, wanted: Hardening) -> PreparedProjections:
-    """The same with beam hardening corrected, in place."""
-    curve, said = curve_of(found.projections.data, found.geometry, wanted)
-    if curve is not None:
-        curve.linearise(found.projections.data, found.projections.weights)
-        if found.held_out is not None:
-            curve.linearise(found.held_out[0])
-    return replace(found, hardening=said)
 
 
 def _fill_unknown(found: PreparedProjections, regions: Regions, rows: slice, binning: int) -> None:
@@ -340,12 +299,13 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     Raises:
         DataError: it cannot be reconstructed; with every reason, and what to do about each.
     """
-    judged = judged_flags(source) if selection.judge and source.finished else None
-    findings = [*scan_findings(source), *references_usable(source, selection.accept_references)]
-    if selection.use_flags:
+    flags = selection.step(Flags)
+    judged = judged_flags(source) if flags.judged and source.finished else None
+    findings = [*scan_findings(source), *references_usable(source, selection.step(ReferenceCheck).accepted)]
+    if flags.used:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     refuse(source, findings)
-    usable = usable_views(source, selection.use_flags, judged)
+    usable = usable_views(source, flags.used, judged)
     if usable.said:
         warn(usable.said)
     for finding in findings:
@@ -381,7 +341,7 @@ def assemble(
         raise DataError(f"{source.path}: the views chosen are zero everywhere; there is nothing in the beam.")
     axis_col, estimate = axis
     rows, shape = rows_of(source, selection), projections.data.shape[1:]
-    unknown, resampling = projections.masked, resampling_of(source, selection)
+    unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)
     if resampling is not None:
         unknown = unknown | resampling.unseen((shape[0], shape[1]), rows.start)
     unknown = areas(unknown)
@@ -400,7 +360,6 @@ def assemble(
         flags=usable.flags,
         shares=regions.weights(projections.view_ids, rows, selection.binning, (shape[0], shape[1])),
         measured=~unknown if unknown.any() else None,
-        tilt_deg=selection.tilt_deg or 0.0,
     )
 
 
@@ -413,7 +372,8 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
 
 def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
     """Why the frames of a scan that is still growing cannot be corrected."""
-    rules = (quantity_said, references_present, *(() if selection.accept_references else (references_usable,)))
+    checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
+    rules = (quantity_said, references_present, *checked)
     return [finding for rule in rules for finding in rule(source)]
 
 

@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.selection import Selection
+from beamline.projections.steps.counts import CountModel
+from beamline.projections.steps.defects import Defects
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.flats import Flats
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups
 from drivers.frame import FrameKind
@@ -74,9 +78,9 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
     Raises:
         DataError: all frames of a kind are damaged.
     """
-    binning, use_damaged = selection.binning, not selection.use_flags
+    binning, use_damaged = selection.binning, not selection.step(Flags).used
     dark = _mean(source, np.concatenate(groups.darks), rows, binning, None, use_damaged)
-    scale = light_scale(source, selection.use_current)
+    scale = light_scale(source, use_current(selection))
     flats = []
     for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group], use_damaged)
@@ -100,16 +104,16 @@ def with_dynamic_flats(
         ConfigError: there are too few flats.
     """
     frames = np.concatenate(groups.flats)
-    if selection.use_flags:
+    if selection.step(Flags).used:
         frames = np.setdiff1d(frames, list(source.damaged))
-    scale = light_scale(source, selection.use_current)
+    scale = light_scale(source, use_current(selection))
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame in frames:
             image = read_binned(source, np.array([frame]), rows, selection.binning)[0]
             yield ((image - references.dark) * np.float32(scale[frame])).astype(np.float32)
 
-    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], selection.correction.hot_threshold)
+    masked = dead_pixels(references.dark, [flat for _, flat in references.flats], selection.step(Defects).hot_threshold)
     try:
         found = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
     except ValueError as error:
@@ -117,13 +121,13 @@ def with_dynamic_flats(
     return replace(references, dynamic=found)
 
 
-def light_scale(source: ScanSource, use_current: bool = False) -> NDArray[np.float64]:
+def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
 
-    If projections differ, the median counts. With `use_current` also from its own ring current.
+    If projections differ, the median counts. With `by_current` also from its own ring current.
     """
     scale = _to_median(source.exposures, source.image_key)
-    return scale * current_scale(source) if use_current else scale
+    return scale * current_scale(source) if by_current else scale
 
 
 def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -133,6 +137,11 @@ def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDA
     if views.size == 0:
         return np.ones(values.size)
     return np.where(np.isfinite(values), np.median(views) / values, 1.0)
+
+
+def use_current(selection: Selection) -> bool:
+    """Views and flats are divided by the ring current."""
+    return selection.step(Flats).ring_current == "use"
 
 
 def current_scale(source: ScanSource) -> NDArray[np.float64]:
@@ -179,36 +188,37 @@ def photons_of(
         ConfigError: counts are asked for, and the flats do not tell the gain. Or the gain given makes the photons of
             the open beam too many or too few for any detector.
     """
-    if selection.noise == "log":
+    wanted = selection.step(CountModel)
+    if wanted.noise == "log":
         return None
     binning = selection.binning
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
-    spoilt = [] if not selection.use_flags else sorted(source.damaged)
+    spoilt = [] if not selection.step(Flags).used else sorted(source.damaged)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (used.flats, used.darks)
     )
-    if selection.gain is not None:  # a mean of n pixels has n times as many photons a count
-        light = _open_beam_counts(references) * binning**2 / selection.gain
+    if wanted.gain is not None:  # a mean of n pixels has n times as many photons a count
+        light = _open_beam_counts(references) * binning**2 / wanted.gain
         low, high = _PHOTONS
         if not low <= light <= high:
             raise ConfigError(
-                f"--gain {selection.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
+                f"--gain {wanted.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
                 f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
             )
         variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
-        found = Photons(selection.gain / binning**2, variance)
+        found = Photons(wanted.gain / binning**2, variance)
     else:
         try:
             found = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
         except ValueError as error:
-            if selection.noise == "auto":
+            if wanted.noise == "auto":
                 return None
             raise ConfigError(
                 f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
             ) from error
-    if selection.noise == "auto" and not open_beam(references, found) < FEW_PHOTONS:
+    if wanted.noise == "auto" and not open_beam(references, found) < FEW_PHOTONS:
         return None
     return found
 

@@ -3,64 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
+from beamline.projections.steps.registry import all_steps
+from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.base import ScanSource
-from recon.base.choices import FlatFields, Rings
-from recon.base.choices import Noise as Noise
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
-from recon.prep.correct import CorrectionSettings
-from recon.prep.resample import Distortion
 
-Surface = Literal["auto", "none"] | int
-"""The surface that is taken off as the background of the beam: by its order, or "auto" where the views confirm it."""
+S = TypeVar("S", bound=PrepStep)
 
 _PIXEL_SIZES_UM = 1e-6, 1e6  # far beyond any detector's on either side
 
 
 @dataclass(frozen=True)
-class Phase:
-    """How phase is retrieved.
-
-    Attributes:
-        material: as the user said it, a ratio or a material, for the record.
-        delta_beta: the ratio of delta to beta at an energy in keV.
-        distance_mm: from the sample to the detector; None takes the file's.
-        energy_kev: None takes the file's.
-        unsharp: (sigma in pixels as they are used, weight), see `recon.prep.phase.Paganin`; None: none.
-    """
-
-    material: str
-    delta_beta: Callable[[float], float]
-    distance_mm: float | None = None
-    energy_kev: float | None = None
-    unsharp: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Hardening:
-    """How beam hardening is corrected.
-
-    Attributes:
-        description: the material and the beam as the user said them, for the record.
-        spectrum: the material's attenuation, in any unit, at the energies of the beam, and their shares of the detected
-            light. None: the curve is fitted on the views.
-    """
-
-    description: str
-    spectrum: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-
-
-@dataclass(frozen=True)
 class Selection:
-    """Which part of a scan to use, and how.
+    """Which part of a scan to use, and the corrections that differ from their defaults.
 
     Attributes:
         views: a view selection, see recon.base.views.parse_views.
@@ -69,26 +32,9 @@ class Selection:
         axis_col: rotation axis in columns of the full detector; None finds it.
         pixel_size_mm: at the sample (of a cone: on the detector); None takes the file's.
         cone: mm from the source to the rotation axis and to the detector; None takes the file's, or a parallel beam.
-        correction: of counts to line integrals.
-        surface: see `beamline.projections.background`.
         seed: of random view selections.
-        use_flags: views with an alarm of the monitor are left out, those with a warning weigh less.
-        judge: the monitor looks at the frames of the file now, and its flags count in place of the file's.
-        accept_references: darks and flats are used as they are, also saturated, dark, uneven or lit ones.
-        noise: "log": line integrals are logarithms of counts; "counts": they and weights carry the likelihood of the
-            counts. "auto": that where the open beam has few photons a pixel.
-        flat_fields: "groups": a view's flat is interpolated between groups of flats; "dynamic": it has those components
-            of their changes that the view shows, see `recon.prep.dynamic_flats`.
-        use_current: views and flats are divided by the ring current that the file has for each frame.
-        rings: how stripes are removed from line integrals, see `recon.prep.rings.remove_rings_in_place`.
-        gain: counts a photon, of single pixels; None finds it by the flats.
-        phase: None: it is not retrieved.
-        hardening: None: it is not corrected.
         axis_rows: (first, end) detector rows by which the axis is found; None: those of `rows`.
-        tilt_deg: by how much the axis leans in the detector's plane: its column grows by tan(tilt) a row. None: nobody
-            knows, and views are used as they are.
-        find_tilt: the tilt is found.
-        distortion: of the lens; None: none.
+        steps: corrections that are to do something else than their defaults, see `beamline.projections.steps`.
     """
 
     views: str = "all"
@@ -97,23 +43,23 @@ class Selection:
     axis_col: float | None = None
     pixel_size_mm: float | None = None
     cone: tuple[float, float] | None = None
-    correction: CorrectionSettings = field(default_factory=CorrectionSettings)
-    surface: Surface = "auto"
     seed: int = 0
-    use_flags: bool = True
-    judge: bool = False
-    accept_references: bool = False
-    noise: Noise = "auto"
-    rings: Rings = "none"
-    flat_fields: FlatFields = "groups"
-    use_current: bool = False
-    gain: float | None = None
-    phase: Phase | None = None
-    hardening: Hardening | None = None
     axis_rows: tuple[int, int] | None = None
-    tilt_deg: float | None = None
-    find_tilt: bool = False
-    distortion: Distortion | None = None
+    steps: tuple[PrepStep, ...] = ()
+
+    def step(self, kind: type[S]) -> S:
+        """The step of a kind: the one given, else one that does what its defaults say."""
+        return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
+
+    def having(self, *steps: PrepStep) -> Selection:
+        """The same with these steps, each in place of another one of its kind."""
+        kinds = {type(step) for step in steps}
+        return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
+
+    @property
+    def in_order(self) -> list[PrepStep]:
+        """Every step that there is, each after those that it follows."""
+        return [self.step(kind) for kind in all_steps()]
 
 
 def choose_views(

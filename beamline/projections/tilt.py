@@ -9,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import ScanCorrection, Warn, resampling_of
+from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.selection import Selection, cone_of
+from beamline.projections.steps.counts import CountModel
+from beamline.projections.steps.phase import Phase
+from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.readers.base import ScanSource
 from recon.prep.tilt import FEWEST_BANDS, STEEPEST, TiltEstimate, find_tilt
 
@@ -24,7 +27,8 @@ _ROUNDS = 5
 
 
 def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> tuple[Selection, str]:
-    """The selection with its tilt found, if it wants that, by all rows of the detector; and a sentence about the tilt.
+    """The selection with its tilt found, if it wants that, by all rows of the detector; and a sentence about it,
+    empty where nothing was sought.
 
     Args:
         frames: views that may be used.
@@ -33,9 +37,10 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
         ConfigError: a cone.
         DataError: the views do not tell it.
     """
-    resampling_of(source, selection)  # refuses a cone
-    if not selection.find_tilt:
-        return selection, turned_text(selection.tilt_deg) if selection.tilt_deg else ""
+    step = selection.step(TiltAndLens)
+    step.of(source, selection)  # refuses a cone
+    if not step.sought:
+        return selection, ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
     try:
         tilt, uncertainty = _refined(source, replace(selection, rows=None), frames)
@@ -52,13 +57,8 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
     if uncertainty * rows > _MATTERS:
         warn(f"{said}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
     if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
-        return replace(selection, find_tilt=False, tilt_deg=0.0), f"{said}: not corrected."
-    return replace(selection, find_tilt=False, tilt_deg=math.degrees(tilt)), f"{said}; views are turned."
-
-
-def turned_text(degrees: float) -> str:
-    """How a given tilt was treated."""
-    return f"Views are turned by {degrees:g} degrees."
+        return selection.having(replace(step, tilt=0.0)), f"{said}: not corrected."
+    return selection.having(replace(step, tilt=math.degrees(tilt))), f"{said}; views are turned."
 
 
 def warn_of_tilt(
@@ -66,7 +66,7 @@ def warn_of_tilt(
 ) -> None:
     """Warn where the rows chosen show a tilt that matters, and nobody said what it is."""
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
-    if selection.tilt_deg is not None or cone_of(source, selection) is not None or rows < _FEWEST_ROWS:
+    if selection.step(TiltAndLens).tilt is not None or cone_of(source, selection) is not None or rows < _FEWEST_ROWS:
         return
     frames = spread_views(source.angles[frames], _LOOK_VIEWS, frames)
     try:
@@ -106,11 +106,11 @@ def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64]
     Raises:
         ValueError: see `find_tilt`.
     """
-    plain = replace(selection, phase=None, noise="log", find_tilt=False)
+    plain, step = selection.having(Phase(), CountModel("log")), selection.step(TiltAndLens)
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     tilt = 0.0
     for _ in range(_ROUNDS):
-        levelled = ScanCorrection(source, replace(plain, tilt_deg=math.degrees(tilt)), lambda _: None)
+        levelled = ScanCorrection(source, plain.having(replace(step, tilt=math.degrees(tilt))), lambda _: None)
         found = _look(source, levelled, frames, _BANDS, _BAND_ROWS)
         tilt += found.tilt
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:

@@ -135,9 +135,7 @@ def reconstruct_file(
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Send the event `recon_started`; before it, what was done to the views on request."""
-    steps = "tilt", "flats", "noise", "phase", "background", "rings", "hardening"
-    done = {name: getattr(prepared, name) for name in steps}
-    corrections_done(done, sink, clock)
+    corrections_done({name: done.said for name, done in prepared.done.items()}, sink, clock)
     data = {
         "file": options.source.path,
         "method": options.method.name,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -12,7 +12,6 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
-from beamline.projections.background import without_background
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.jumps import frames_text
@@ -24,7 +23,8 @@ from beamline.projections.prepare import (
     refuse,
 )
 from beamline.projections.selection import check_axis, geometry_of
-from beamline.projections.tilt import turned_text
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.step import Done, ScanStep
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
@@ -34,7 +34,6 @@ from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.clock import Clock
 from drivers.frame import FrameKind
-from recon.base.masks import areas
 from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty
@@ -94,7 +93,7 @@ class ScanFollower:
         """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
         n = self.source.refresh()
         grown, self._frames = n > self._frames, n
-        views = self._chosen(usable_views(self.source, self._options.selection.use_flags).frames)
+        views = self._chosen(usable_views(self.source, self._options.selection.step(Flags).used).frames)
         if views.size == 0:
             self._taken = n
             return grown
@@ -105,8 +104,7 @@ class ScanFollower:
                 return grown
             refuse(self.source, blockers)
             self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
-            done = {"noise": self._correction.noise, "phase": self._correction.phase}
-            corrections_done(done, self._sink, self._clock)
+            self._tell(self._correction.done)
         if not self._axis.settled:
             self._settle_axis(self._correction, views, ended)
         if self.axis_col is None:
@@ -132,7 +130,7 @@ class ScanFollower:
         if self._newest is not None:
             self._feed(np.empty(0, np.int64), last=True)
         if self._batches:
-            usable = usable_views(self.source, self._options.selection.use_flags)
+            usable = usable_views(self.source, self._options.selection.step(Flags).used)
             self._correct_again(usable, _NEXT_PART)
         else:
             self._correction = self._correction.renewed()
@@ -295,8 +293,7 @@ class ScanFollower:
             )
         assert self._correction is not None
         self._correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
-        background, terms = self._without_background(self.axis_col)
-        prepared = replace(self._prepared(self.axis_col, usable), background=background, background_terms=terms)
+        prepared = self._prepared(self.axis_col, usable)
         self._sink(
             Event(
                 "state",
@@ -345,27 +342,24 @@ class ScanFollower:
             self._batches = [merge_and_empty(self._batches)]
         return self._batches[0]
 
-    def _without_background(self, axis_col: float) -> tuple[str, NDArray[np.float64] | None]:
-        """Take the background of the beam off all views, now that all are there; as `without_background`."""
-        assert self._fit is not None
-        views, selection = self._joined(), self._options.selection
-        geometry = geometry_of(self.source, selection, axis_col, self.source.angles[views.view_ids])
-        try:
-            said, terms = without_background(views.data, geometry, selection.surface, unknown=areas(views.masked))
-        except DataError as error:  # nobody throws the volume of a scan away for this
-            self._warn(str(error))
-            return "", None
-        if said:
-            corrections_done({"background": said}, self._sink, self._clock)
-            self._fit.replace_views(views.data)
-        return said, terms
-
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
-        projections = self._joined()
-        assert self._correction is not None
-        found = assemble(
-            self.source, self._options.selection, projections, (axis_col, self._axis.estimate), usable, self._warn
-        )
-        done, degrees = self._correction, self._options.selection.tilt_deg
-        tilt = turned_text(degrees) if degrees else ""
-        return replace(found, noise=done.noise, phase=done.phase, flats=done.flats, tilt=tilt)
+        """All views, now that they are there, after the steps that need all of them."""
+        assert self._correction is not None and self._fit is not None
+        selection, projections = self._options.selection, self._joined()
+        found = assemble(self.source, selection, projections, (axis_col, self._axis.estimate), usable, self._warn)
+        done = self._correction.done
+        for step in selection.in_order:
+            if isinstance(step, ScanStep):
+                try:
+                    done[step.name] = step.apply(found, self.source.angles[projections.view_ids])
+                except DataError as error:  # nobody throws the volume of a scan away for this
+                    self._warn(str(error))
+                    continue
+                if done[step.name].said:
+                    self._tell({step.name: done[step.name]})
+                    self._fit.replace_views(projections.data)
+        return replace(found, done=done)
+
+    def _tell(self, done: Mapping[str, Done]) -> None:
+        """Say what steps did."""
+        corrections_done({name: each.said for name, each in done.items()}, self._sink, self._clock)

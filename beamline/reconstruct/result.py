@@ -17,6 +17,7 @@ from beamline.core.events import Event, Sink
 from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
+from beamline.projections.steps.registry import recorded
 from beamline.reconstruct.measure import measure, regions, residual_share
 from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
@@ -239,7 +240,6 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
     """Everything that the volume depends on, by name."""
     selection, geometry = context.selection, prepared.geometry
     rows = selection.rows
-    corrected = prepared.quantity == "counts"
     return {
         "method": made.method,
         "axis_col": prepared.axis_col,
@@ -249,8 +249,6 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "view_angles_deg": np.degrees(geometry.angles),
         "n_views": geometry.n_views,
         "n_projections": prepared.n_projections,
-        "references": "accept" if selection.accept_references else "check",
-        "flags": "judge" if selection.judge else "use" if selection.use_flags else "ignore",
         "views_left_out": prepared.left_out,
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
         **({"jumps": prepared.jumps, "view_shifts_px": geometry.shifts} if prepared.jumps else {}),
@@ -260,19 +258,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
-        **(_flat("correction", asdict(selection.correction)) if corrected else {}),
-        **({"noise": prepared.noise or "logarithms of counts"} if corrected else {}),
-        **({"flats": prepared.flats or selection.flat_fields} if corrected else {}),
-        "tilt_deg": prepared.tilt_deg,
-        **({"tilt": prepared.tilt} if prepared.tilt else {}),
-        **({} if selection.distortion is None else _flat("distortion", asdict(selection.distortion))),
-        "phase": prepared.phase or "not retrieved",
-        "hardening": prepared.hardening or "not corrected",
-        "surface": selection.surface,
-        "background": prepared.background or "none taken off",
-        **({} if prepared.background_terms is None else {"background_terms": prepared.background_terms}),
-        "rings": selection.rings,
-        **({"rings_removed": prepared.rings} if prepared.rings else {}),
+        **recorded(selection.in_order, prepared.done),
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),

@@ -15,9 +15,10 @@ from beamline.core.events import Event, Sink
 from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
 from beamline.core.text import size
-from beamline.projections.correction import Warn, resampling_of
+from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import choose_views, cone_of, rows_of
+from beamline.projections.steps.resampling import TiltAndLens
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
@@ -182,7 +183,8 @@ def spill_of(
 
 def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
     """Whether rays have weights before the views are known, which may give them some: of views that are turned."""
-    return not options.method.traits.direct and resampling_of(source, options.selection) is not None
+    turned = options.selection.step(TiltAndLens).of(source, options.selection) is not None
+    return turned and not options.method.traits.direct
 
 
 def memory_of(options: ReconOptions) -> int:

@@ -13,12 +13,12 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.digest import digest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
 from recon.base.volume import Grid
-from recon.prep.correct import CorrectionSettings
 from recon.voxels.fdk import fdk
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
@@ -26,7 +26,7 @@ BALL, CENTRE, MU = 0.2, (0.12, -0.05, 0.06), 1.5  # mm, (x, y, z), 1/mm
 INFO = ScanInfo(
     sample="ball", pixel_size_mm=PITCH, distance_mm=SDD - SOD, source_distance_mm=SOD, axis_col=AXIS
 )  # fmt: skip
-PLAIN = Selection(correction=CorrectionSettings(air="none"))
+PLAIN = Selection(steps=(Air("none"),))
 
 
 def _line_integrals(angle: float) -> NDArray[np.float64]:

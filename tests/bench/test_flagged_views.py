@@ -21,6 +21,7 @@ from beamline.config.load import config_folder
 from beamline.projections import flag_regions, flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.flags import Flags
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules import treatment
 from recon.base.method import DataUse
@@ -86,8 +87,8 @@ def test_what_regions_of_flags_are_worth(tmp_path: Path, seed: int) -> None:
     with h5py.File(tmp_path / f"truth{seed}.h5") as file:
         truth = file["entry/data/data"][rows[0] // BIN : rows[1] // BIN]
     axis = (SIDE - 1) / 2 - 2.6
-    every = Selection(rows=rows, binning=BIN, axis_col=axis, use_flags=False)
-    judged = Selection(rows=rows, binning=BIN, axis_col=axis, judge=True)
+    every = Selection(rows=rows, binning=BIN, axis_col=axis, steps=(Flags("ignore"),))
+    judged = Selection(rows=rows, binning=BIN, axis_col=axis, steps=(Flags("judge"),))
     print(f"\nseed {seed}: clean {psnr(clean, truth, every):.2f} dB")
     for fault in FAULTS:
         path = scan(tmp_path, fault, seed)

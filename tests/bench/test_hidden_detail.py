@@ -42,7 +42,7 @@ def _volume(path: Path, rows: slice, name: str) -> F32:
     method, rings = METHODS[name]
     with warnings.catch_warnings(), open_scan(path) as scan:
         warnings.simplefilter("ignore")
-        prepared = prepare_projections(scan, Selection(rings=rings), lambda _: None)
+        prepared = prepare_projections(scan, Selection(steps=(Rings(rings),)), lambda _: None)
     data = np.ascontiguousarray(prepared.projections.data[:, rows])
     geometry = prepared.geometry.rows(rows.start, rows.start + data.shape[1])
     return recon.reconstruct(data, geometry, method, grid=recon.Grid.matching(geometry)).volume.data

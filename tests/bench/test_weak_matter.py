@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection, Surface
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 
 pytestmark = pytest.mark.bench
@@ -21,9 +22,9 @@ CAP, AIR, RADIUS = slice(27, 37), slice(4, 19), 40  # slices of the cap, slices 
 METHODS = {"FISTA-TV": recon.FistaTv(), "r2": recon.R2(), "SIRT": recon.Sirt()}
 
 
-def _volume(shared_data: Path, method: recon.Method, surface: Surface) -> NDArray[np.float32]:
+def _volume(shared_data: Path, method: recon.Method, air: str) -> NDArray[np.float32]:
     with open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as scan:
-        prepared = prepare_projections(scan, Selection(surface=surface), lambda _: None)
+        prepared = prepare_projections(scan, Selection(steps=(Air(air),)), lambda _: None)
     return recon.reconstruct(prepared.projections.data, prepared.geometry, method).volume.data
 
 

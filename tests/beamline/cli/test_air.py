@@ -11,7 +11,8 @@ from click.testing import CliRunner
 
 from beamline.cli.main import main
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
-from beamline.projections.selection import Selection, Surface
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -41,9 +42,9 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
-def _prepared(path: Path, surface: Surface = "auto", spill: Spill | None = None) -> PreparedProjections:
+def _prepared(path: Path, model: str = "auto", spill: Spill | None = None) -> PreparedProjections:
     with open_scan(path) as source:
-        return prepare_projections(source, Selection(axis_col=27.5, surface=surface), lambda said: None, spill)
+        return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, spill)
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
@@ -60,7 +61,7 @@ def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
 
 def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Path]) -> None:
     bent, straight = (_prepared(scans[name]) for name in ("bent", "straight"))
-    assert "taken off" in bent.background and straight.background == ""
+    assert "taken off" in bent.done["background"].said and straight.done["background"].said == ""
     left = bent.projections.data - straight.projections.data
     noise = float(np.std(left[:, :8]))
     assert np.abs(left.mean(axis=0)).max() < 0.01 and noise < 0.02
@@ -82,7 +83,7 @@ def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path])
     spill = Spill(np.empty((VIEWS, *SHAPE), np.float32), 7, lambda n, of: None)
     parts = _prepared(scans["bent"], spill=spill)
     np.testing.assert_array_equal(parts.projections.data, whole.projections.data)
-    assert parts.background == whole.background
+    assert parts.done["background"].said == whole.done["background"].said
 
 
 def test_a_followed_scan_loses_its_background_before_the_last_round(scans: dict[str, Path], tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from beamline.core.events import Announcer
 from beamline.core.stop import StopRequest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.scan import run as module
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
@@ -24,7 +25,6 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import Frame, FrameKind
 from recon.base.volume import Grid
-from recon.prep.correct import CorrectionSettings
 from recon.voxels.fdk import fdk
 from tests.beamline.ball_scan import BALL, shipped
 
@@ -134,7 +134,7 @@ def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path
     with open_scan(result.path) as source:
         assert (source.cone, source.attributes["distance_mm"]) == ((SOD, SDD), SDD - SOD)
         assert source.pixel_size_mm == pytest.approx(4.6e-3 * SDD / SOD)  # NXtomo's is that on the detector
-        prepared = prepare_projections(source, Selection(correction=CorrectionSettings(air="none")), said.append)
+        prepared = prepare_projections(source, Selection(steps=(Air("none"),)), said.append)
     geometry = prepared.geometry
     assert (geometry.is_cone, geometry.axis_col, geometry.axis_row) == (True, 21.0, 15.5)
     grid = Grid.matching(geometry)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,16 +9,17 @@ from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import source_findings
 from drivers.frame import FrameKind
-from recon.prep.correct import CorrectionSettings
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
 SCAN = TwoCylinders()
-SELECTION = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air="none"))
-ACCEPT = replace(SELECTION, accept_references=True)
+SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
+ACCEPT = SELECTION.having(ReferenceCheck("accept"))
 FULL = 65535.0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,9 @@ from beamline.projections import correction as module
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
-from recon.prep.correct import Correction, CorrectionSettings, merge_and_empty
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flats import Flats
+from recon.prep.correct import Correction, merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 
@@ -25,7 +26,7 @@ def test_only_what_was_asked_for_is_read() -> None:
     counts = SCAN.counts()
     data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
     source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
-    selection = Selection(views="first:5", rows=(1, 3), axis_col=20.7, correction=CorrectionSettings(air="none"))
+    selection = Selection(views="first:5", rows=(1, 3), axis_col=20.7, steps=(Air("none"),))
     correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
     correction.at_once(np.arange(2, 7))
     assert {rows for frames, rows in source.was_read if min(frames) >= 2} == {2}
@@ -57,16 +58,14 @@ def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pyt
     assert after == {"reading": 15, "dividing": 30} and told == sorted(told) and told[-1] == (45, 45)
 
 
-@pytest.mark.parametrize("air", ["auto", "none", (3, 3)])
+@pytest.mark.parametrize("air", ["auto", "none", "3,3"])
 @pytest.mark.parametrize("sizes", [[45], [1] * 45, [32, 13], [7, 20, 18]])
 @pytest.mark.parametrize("ended", ["with the last batch", "later"])
-def test_batches_are_the_views_at_once_also_where_the_end_comes_later(
-    sizes: list[int], air: object, ended: str
-) -> None:
+def test_batches_are_the_views_at_once_also_where_the_end_comes_later(sizes: list[int], air: str, ended: str) -> None:
     counts = SCAN.counts()
     data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), counts]).astype(np.uint16)
     source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
-    selection = Selection(correction=CorrectionSettings(air=air))  # type: ignore[arg-type]
+    selection = Selection(steps=(Air(air),))
     correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
     ends = np.cumsum([2, *sizes])
     batches = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
@@ -99,7 +98,7 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
     data = rng.poisson(DARK + light[:, None, None] * np.ones((1, 20, 80))).astype(np.uint16)
     source, said = ArraySource(data, keys.tolist(), np.zeros(keys.size), np.ones(keys.size)), list[str]()
     source.part_starts = np.array([0, len(first)])
-    selection = Selection(correction=CorrectionSettings(air="none"))
+    selection = Selection(steps=(Air("none"),))
     views = np.flatnonzero(keys == 0)
     found = ScanCorrection(source, selection, said.append).at_once(views)  # type: ignore[arg-type]
     truth = np.full(views.size, 0.5)
@@ -132,14 +131,14 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     source = ArraySource(data.astype(np.float32), [2] + [1] * 12 + [0] * 45, np.r_[[np.nan] * 13, SCAN.angles])
     errors = []
     for way in ("groups", "dynamic"):
-        correction = ScanCorrection(source, Selection(flat_fields=way), pytest.fail)  # type: ignore[arg-type]
-        assert bool(correction.flats) is (way == "dynamic")
+        correction = ScanCorrection(source, Selection(steps=(Flats(way),)), pytest.fail)  # type: ignore[arg-type]
+        assert bool(correction.done["flats"].said) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
-    assert "components of their changes" in correction.flats
+    assert "components of their changes" in correction.done["flats"].said
     few = ArraySource(np.delete(data, np.s_[4:13], axis=0), [2] + [1] * 3 + [0] * 45, np.r_[[np.nan] * 4, SCAN.angles])
     with pytest.raises(ConfigError, match="--flat-fields dynamic: array: dynamic flats need at least 4 flats, got 3"):
-        ScanCorrection(few, Selection(flat_fields="dynamic"), lambda _: None)  # type: ignore[arg-type]
+        ScanCorrection(few, Selection(steps=(Flats("dynamic"),)), lambda _: None)  # type: ignore[arg-type]
 
 
 def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
@@ -151,16 +150,16 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
         * np.nan_to_num(current)[:, None, None]
     )
     source = ArraySource((data / 180 + DARK).astype(np.float32), [2, 1, 1] + [0] * 45, np.r_[[np.nan] * 3, SCAN.angles])
-    none = Selection(correction=CorrectionSettings(air="none"))
+    none = Selection(steps=(Air("none"),))
     with pytest.raises(ConfigError, match="array has no ring current"):
-        ScanCorrection(source, replace(none, use_current=True), pytest.fail)  # type: ignore[arg-type]
+        ScanCorrection(source, none.having(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]
     source.currents = current
     off = []
-    for selection in (none, replace(none, use_current=True)):
+    for selection in (none, none.having(Flats(ring_current="use"))):
         correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
-    assert correction.flats == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    assert correction.done["flats"].said == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
     source.currents[2] = np.nan
     with pytest.raises(ConfigError, match="no ring current for some views or flats"):
-        ScanCorrection(source, replace(none, use_current=True), pytest.fail)  # type: ignore[arg-type]
+        ScanCorrection(source, none.having(Flats(ring_current="use")), pytest.fail)  # type: ignore[arg-type]

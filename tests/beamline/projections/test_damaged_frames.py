@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -11,10 +12,12 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
 from drivers.frame import FrameKind
-from recon.prep.correct import CorrectionSettings
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()
@@ -30,9 +33,11 @@ def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
     return path
 
 
-def prepare(path: Path, spill: Spill | None = None, **chosen: object) -> tuple[PreparedProjections, list[str]]:
+def prepare(
+    path: Path, *steps: PrepStep, spill: Spill | None = None, **chosen: Any
+) -> tuple[PreparedProjections, list[str]]:
     told: list[str] = []
-    selection = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air="none"), **chosen)  # type: ignore[arg-type]
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"), *steps), **chosen)
     with open_scan(path) as source:
         return prepare_projections(source, selection, told.append, spill), told
 
@@ -46,7 +51,7 @@ def test_a_good_scan_says_nothing(tmp_path: Path) -> None:
 def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, spilled: bool) -> None:
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
     spill = Spill(np.empty((45, height, 40), np.float32), 7, lambda n, of: None) if spilled else None
-    prepared, told = prepare(path, spill, rows=rows)
+    prepared, told = prepare(path, spill=spill, rows=rows)
     np.testing.assert_array_equal(prepared.projections.view_ids, np.setdiff1d(np.arange(4, 49), [9, 20, 21]))
     said = " ".join(told)
     assert ("Frames 9 " in said and "Frames 20-21 " in said) if spilled else "Frames 9, 20-21 " in said
@@ -54,7 +59,7 @@ def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, i
 
 
 def test_flags_ignore_uses_them_and_says_so(tmp_path: Path) -> None:
-    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), use_flags=False)
+    prepared, (said,) = prepare(scan(tmp_path, 9, bit=0), Flags("ignore"))
     assert prepared.projections.view_ids.size == 45
     assert "Frames 9 do not have the pixels that were written" in said and "used as they are" in said
 
@@ -73,7 +78,7 @@ def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple
     path = scan(tmp_path, *rows, bit=0)
     with pytest.raises(DataError, match=f"all {kind} are damaged"):
         prepare(path)
-    assert prepare(path, use_flags=False)[0].projections.view_ids.size == 45
+    assert prepare(path, Flags("ignore"))[0].projections.view_ids.size == 45
 
 
 def test_rows_count_on_behind_references_that_were_given(tmp_path: Path) -> None:

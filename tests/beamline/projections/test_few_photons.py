@@ -11,9 +11,11 @@ from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
-from beamline.projections.selection import Noise, Selection
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.counts import CountModel
 from beamline.reconstruct.budget import binned
-from recon.prep.correct import CorrectionSettings
+from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import TwoCylinders
@@ -21,7 +23,7 @@ from tests.beamline.scans import TwoCylinders
 SCAN = TwoCylinders(shape=(16, 64), axis_col=31.7)
 EXACT = SCAN.line_integrals()
 GAIN, DARK, READOUT = 7.0, 100.0, 6.0
-PLAIN = Selection(axis_col=31.7, correction=CorrectionSettings(air="none"))
+PLAIN = Selection(axis_col=31.7, steps=(Air("none"),))
 
 
 def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
@@ -41,7 +43,7 @@ def prepare(source: ArraySource, selection: Selection, said: list[str] | None = 
 
 def test_line_integrals_and_weights_are_those_of_counts() -> None:
     source = scan(20)
-    found = prepare(source, replace(PLAIN, noise="counts", gain=GAIN)).projections
+    found = prepare(source, PLAIN.having(CountModel("counts", GAIN))).projections
     darks, flats, views = source.read(slice(10)), source.read(slice(10, 30)), source.read(slice(30, None))
     variance = float(np.median(darks.var(axis=0, ddof=1)))
     data, weights = line_integrals(Counts(views, flats.mean(axis=0), darks.mean(axis=0), GAIN, variance))
@@ -53,19 +55,19 @@ def test_line_integrals_and_weights_are_those_of_counts() -> None:
 def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     """The likelihood chosen by itself, with the gain that the flats show."""
     behind = 0.3 * EXACT.max() < EXACT
-    counted, logarithm = prepare(scan(10), PLAIN), prepare(scan(10), replace(PLAIN, noise="log"))
+    counted, logarithm = prepare(scan(10), PLAIN), prepare(scan(10), PLAIN.having(CountModel("log")))
     weights = counted.ray_weights()
     assert weights is not None and logarithm.ray_weights() is None
     assert abs(np.average((counted.projections.data - EXACT)[behind], weights=weights[behind])) < 0.03
     assert np.mean((logarithm.projections.data - EXACT)[behind]) > 0.1
-    assert "10" in counted.noise and logarithm.noise == ""
+    assert "10" in counted.done["noise"].said and logarithm.done["noise"].said == ""
 
 
 @pytest.mark.parametrize(("photons", "noise", "counted"), [
     (30, "auto", True), (1000, "auto", False), (1000, "counts", True), (30, "log", False)
 ])  # fmt: skip
 def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, counted: bool) -> None:
-    found = ScanCorrection(scan(photons), replace(PLAIN, noise=noise), pytest.fail)  # type: ignore[arg-type]
+    found = ScanCorrection(scan(photons), PLAIN.having(CountModel(noise)), pytest.fail)  # type: ignore[arg-type]
     assert (found.photons is not None) == counted
     if found.photons is not None:
         assert found.photons.gain == pytest.approx(GAIN, rel=0.1)
@@ -75,14 +77,14 @@ def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, co
 def test_binned_pixels_have_the_photons_of_all() -> None:
     """By the flats as they are read and by the gain of one pixel: a mean of four pixels has a quarter of the gain."""
     for gain in (None, GAIN):
-        found = ScanCorrection(scan(20), replace(PLAIN, noise="counts", gain=gain, binning=2), pytest.fail)  # type: ignore[arg-type]
+        found = ScanCorrection(scan(20), replace(PLAIN, binning=2).having(CountModel("counts", gain)), pytest.fail)  # type: ignore[arg-type]
         assert found.photons is not None
         assert found.photons.gain == pytest.approx(GAIN / 4, rel=0.1)
         assert found.photons.variance == pytest.approx(READOUT**2 / 4, rel=0.2)
 
 
 def test_batches_give_what_one_pass_gives() -> None:
-    selection = replace(PLAIN, noise="counts")
+    selection = PLAIN.having(CountModel("counts"))
     whole = ScanCorrection(scan(20), selection, pytest.fail).at_once(np.arange(30, 40))  # type: ignore[arg-type]
     fed = ScanCorrection(scan(20), selection, pytest.fail)  # type: ignore[arg-type]
     parts = [fed.feed(np.arange(30, 34), last=False), fed.feed(np.arange(34, 40), last=True)]
@@ -92,7 +94,7 @@ def test_batches_give_what_one_pass_gives() -> None:
 
 
 def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
-    prepared = prepare(scan(20), replace(PLAIN, noise="counts"))
+    prepared = prepare(scan(20), PLAIN.having(CountModel("counts")))
     held = hold_out(prepared, 9, advice="")
     weights = prepared.ray_weights()
     left = held.ray_weights(3)
@@ -103,13 +105,13 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:
-    assert prepare(scan(20, n_flats=1), PLAIN).noise == ""
+    assert prepare(scan(20, n_flats=1), PLAIN).done["noise"].said == ""
     with pytest.raises(ConfigError, match="--gain COUNTS"):
-        prepare(scan(20, n_flats=1), replace(PLAIN, noise="counts"))
+        prepare(scan(20, n_flats=1), PLAIN.having(CountModel("counts")))
 
 
 def test_line_integrals_have_no_photons() -> None:
     source = scan(20)
     source.quantity = "line_integrals"
     with pytest.raises(ConfigError, match="not counts"):
-        prepare(source, replace(PLAIN, noise="counts"))
+        prepare(source, PLAIN.having(CountModel("counts")))

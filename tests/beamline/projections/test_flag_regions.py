@@ -15,9 +15,9 @@ from beamline.projections.flag_regions import WARNED_SHARE, regions_of
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import SourceOptions
-from recon.prep.correct import CorrectionSettings
 from recon.prep.resample import Resampling
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -92,7 +92,7 @@ def test_a_view_with_a_region_is_used_beside_it(tmp_path: Path) -> None:
     data = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
     alarm, half = (flag(row, (0, 4, 10, 12), level) for row, level in ((8, Level.ALARM), (9, Level.WARN)))
     path = write_flagged(tmp_path / "scan.h5", frames_of(data), {}, flags=[alarm, half])
-    selection = Selection(axis_col=data.axis_col, correction=CorrectionSettings(air="none"))
+    selection = Selection(axis_col=data.axis_col, steps=(Air("none"),))
     told: list[str] = []
     with SourceOptions(path).open() as source:
         prepared: PreparedProjections = prepare_projections(source, selection, told.append)

@@ -14,14 +14,15 @@ from beamline.projections.flags import WARNED_WEIGHT
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.flags import FEWEST_VIEWS
 from drivers.frame import FrameKind
-from recon.prep.correct import CorrectionSettings
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
-SELECTION = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air="none"))
+SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
 FIRST = 4  # row of the first view: two darks, two flats
 ALARMS = {FIRST + i: Level.ALARM for i in range(10, 16)}
 LEVELS = {**ALARMS, FIRST + 3: Level.WARN, FIRST + 20: Level.WARN}
@@ -76,7 +77,7 @@ def test_a_view_alone_leaves_no_gap_worth_a_word(tmp_path: Path) -> None:
 
 
 def test_flags_may_be_ignored(tmp_path: Path) -> None:
-    selection = replace(SELECTION, use_flags=False)
+    selection = SELECTION.having(Flags("ignore"))
     found, told = prepared(scan(tmp_path), selection)
     assert found.geometry.n_views == 30 and found.view_weights is None and found.ray_weights() is None
     assert told[0] == "--flags ignore: 6 views with an alarm and 2 with a warning are used as they are."
@@ -97,7 +98,7 @@ def test_a_file_without_flags_is_judged_where_that_is_wanted(tmp_path: Path) -> 
     frames[9], frames[10] = (replace(frames[i], counts=frames[8].counts) for i in (9, 10))
     path = write_flagged(tmp_path / "s.h5", frames, {})
     assert prepared(path)[0].geometry.n_views == 30
-    found, told = prepared(path, replace(SELECTION, judge=True))
+    found, told = prepared(path, SELECTION.having(Flags("judge")))
     assert found.geometry.n_views == 28 and "2 have an alarm and are left out (stuck 2 alarm)" in told[0]
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.projections.hardening import curve_of
-from beamline.projections.selection import Hardening
+from beamline.projections.steps.hardening import Hardening
 from recon.base.geometry import Geometry
 from simulators.effects.beam_hardening import BeamHardening
 from simulators.frame.detector import Detector

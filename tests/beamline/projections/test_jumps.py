@@ -15,18 +15,19 @@ from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.clock import SystemClock
 from drivers.frame import Frame, FrameKind
-from recon.prep.correct import CorrectionSettings
 from tests.recon.voxels.balls import ball_views
 
 SHAPE = (8, 48)
 ANGLES = np.radians(np.arange(0, 180, 3.0))
 JUMP, FIRST = 41, 4  # view; row of the first view: two darks, two flats
 LATER = np.arange(ANGLES.size) >= JUMP
-SELECTION = Selection(axis_col=23.5, correction=CorrectionSettings(air="none"))
+SELECTION = Selection(axis_col=23.5, steps=(Air("none"),))
 
 
 def scan(path: Path, views: NDArray[np.float32], *jumps: int) -> Path:
@@ -55,7 +56,7 @@ def moved(x: float, z: float) -> NDArray[np.float32]:
 
 
 def test_views_after_a_jump_are_corrected_by_shifts(tmp_path: Path) -> None:
-    selection = Selection(views="first:55", axis_col=23.5, correction=CorrectionSettings(air="none"))
+    selection = Selection(views="first:55", axis_col=23.5, steps=(Air("none"),))
     found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), selection)
     assert found.geometry.n_views == 55 and found.left_out == 0 and found.held_out is not None
     later, shifts, unseen = LATER[:55], found.geometry.shifts, found.held_out[1]
@@ -96,7 +97,7 @@ def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "said"),
     [
-        (Selection(axis_col=23.5, use_flags=False), "--flags ignore: 1 view with an alarm"),
+        (Selection(axis_col=23.5, steps=(Flags("ignore"),)), "--flags ignore: 1 view with an alarm"),
         (Selection(axis_col=23.5, cone=(100.0, 200.0)), "Views of a cone beam are not corrected"),
     ],
 )

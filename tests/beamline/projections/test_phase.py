@@ -9,14 +9,16 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.phase import filter_of
-from beamline.projections.selection import Phase, Selection
-from recon.prep.correct import CorrectionSettings, merge_and_empty
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.counts import CountModel
+from beamline.projections.steps.phase import Phase
+from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK
 
-PHASE = Phase("20", lambda _: 20.0, distance_mm=50.0, energy_kev=20.0)
-SELECTION = Selection(phase=PHASE, pixel_size_mm=1e-3, correction=CorrectionSettings(air="none"))
+PHASE = Phase("20", distance_mm=50.0, energy_kev=20.0)
+SELECTION = Selection(pixel_size_mm=1e-3, steps=(Air("none"), PHASE))
 
 
 def _source() -> ArraySource:
@@ -50,26 +52,27 @@ def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
     np.testing.assert_allclose(band, whole[:, 20 // binning : 28 // binning], atol=0.01)
     narrow = _correction(selection).at_once(frames, slice(4, 6)).data
     np.testing.assert_allclose(narrow, whole[:, 4:6], atol=0.01)
-    assert whole.std() < 0.5 * _correction(replace(selection, phase=None)).at_once(frames).data.std()
+    assert whole.std() < 0.5 * _correction(selection.having(Phase())).at_once(frames).data.std()
 
 
 def test_what_the_file_does_not_say_is_asked_for() -> None:
     source = _source()
     with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev, which"):
-        filter_of(source, replace(SELECTION, phase=Phase("20", lambda _: 20.0)))  # type: ignore[arg-type]
+        Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
     source.attributes, source.energy_kev = {"distance_mm": 50.0}, 20.0
-    found, said = filter_of(source, replace(SELECTION, phase=Phase("20", lambda _: 20.0)))  # type: ignore[arg-type]
-    assert found == filter_of(source, SELECTION)[0] and "delta/beta 20 at 20 keV, 50 mm behind" in said  # type: ignore[arg-type]
+    found, said = Phase("20").filter_of(source, SELECTION)  # type: ignore[arg-type]
+    assert found == PHASE.filter_of(source, SELECTION)[0]  # type: ignore[arg-type]
+    assert "delta/beta 20 at 20 keV, 50 mm behind" in said
     with pytest.raises(ConfigError, match=r"filter over 702.4 pixels; array has 48 x 40"):
-        filter_of(source, replace(SELECTION, phase=replace(PHASE, distance_mm=5e6)))  # type: ignore[arg-type]
+        replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
-        _correction(replace(SELECTION, noise="counts"))
+        _correction(SELECTION.having(CountModel("counts")))
 
 
 def test_a_cone_is_scaled_to_the_sample() -> None:
     source = _source()
     source.cone = (10.0, 40.0)
-    found, said = filter_of(source, replace(SELECTION, phase=replace(PHASE, distance_mm=None)))  # type: ignore[arg-type]
-    plane, _ = filter_of(_source(), replace(SELECTION, pixel_size_mm=0.25e-3, phase=replace(PHASE, distance_mm=7.5)))  # type: ignore[arg-type]
-    assert found is not None and plane is not None and "30 mm behind" in said
-    assert found.length == pytest.approx(plane.length)
+    found, said = replace(PHASE, distance_mm=None).filter_of(source, SELECTION)  # type: ignore[arg-type]
+    near = replace(SELECTION, pixel_size_mm=0.25e-3)
+    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near)  # type: ignore[arg-type]
+    assert "30 mm behind" in said and found.length == pytest.approx(plane.length)

@@ -13,16 +13,16 @@ from beamline.core.errors import DataError
 from beamline.projections import prepare as pipeline
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.projections.tilt import spread_views
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from recon.prep.align import AxisError, AxisEstimate
-from recon.prep.correct import CorrectionSettings
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
 
 SCAN = TwoCylinders()
-PLAIN = CorrectionSettings(air="none")
+PLAIN = (Air("none"),)
 
 
 def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[PreparedProjections, list[str]]:
@@ -33,7 +33,7 @@ def _prepare(path: Path, selection: Selection, **said: Any) -> tuple[PreparedPro
 
 def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN)
-    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    prepared, warnings = _prepare(path, Selection(steps=PLAIN))
     # A count of 20000 is rounded to a half: 2.5e-5 of transmission near 1, less than 1e-4 of a line integral below 1.
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
     assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.25)
@@ -47,7 +47,7 @@ def test_counts_become_line_integrals_with_the_axis_found(tmp_path: Path) -> Non
 @pytest.mark.parametrize(("rows", "binning", "shape"), [((1, 4), 1, (3, 40)), (None, 2, (2, 20)), ((0, 4), 3, (1, 13))])
 def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: int, shape: tuple[int, int]) -> None:
     path = write_exchange(tmp_path / "scan.h5", replace(SCAN, pixel_size_mm=0.5))
-    selection = Selection(rows=rows, binning=binning, axis_col=20.7, correction=PLAIN)
+    selection = Selection(rows=rows, binning=binning, axis_col=20.7, steps=PLAIN)
     prepared, _ = _prepare(path, selection)
     first, end = rows or (0, 4)
     expected = Geometry.parallel(SCAN.angles, (end - first, 40), 0.5, 20.7).binned(binning)
@@ -63,14 +63,14 @@ def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: in
 
 def test_auto_axis_of_binned_views_is_in_full_columns(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", TwoCylinders(shape=(2, 80), axis_col=40.7))
-    prepared, _ = _prepare(path, Selection(binning=2, correction=PLAIN))
+    prepared, _ = _prepare(path, Selection(binning=2, steps=PLAIN))
     assert prepared.axis_col == pytest.approx(40.7, abs=0.5)
     assert prepared.geometry.axis_col == pytest.approx((prepared.axis_col - 0.5) / 2)
 
 
 def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "scan.h5", SCAN)
-    prepared, _ = _prepare(path, Selection(views="first:10", axis_col=20.7, correction=PLAIN))
+    prepared, _ = _prepare(path, Selection(views="first:10", axis_col=20.7, steps=PLAIN))
     assert prepared.geometry.n_views == 10
     assert prepared.n_projections == 45
     np.testing.assert_array_equal(prepared.projections.view_ids, np.arange(4, 14))  # 2 darks and 2 flats come first
@@ -87,7 +87,7 @@ def test_selected_views_of_a_whole_turn_spread_over_it_where_the_axis_is_off_the
 ) -> None:
     whole = replace(SCAN, angles=np.linspace(0, 2 * np.pi, 48, endpoint=False))
     path = write_exchange(tmp_path / "scan.h5", whole)
-    prepared, _ = _prepare(path, Selection(views="fixed:12", axis_col=axis_col, correction=PLAIN))
+    prepared, _ = _prepare(path, Selection(views="fixed:12", axis_col=axis_col, steps=PLAIN))
     expected = np.linspace(0, 2 * np.pi * turned, 12, endpoint=False)
     np.testing.assert_allclose(prepared.geometry.angles, expected, atol=1e-5)
 
@@ -101,7 +101,7 @@ def test_a_fading_beam_is_followed_by_flats_at_both_ends() -> None:
     data = np.concatenate([np.full((1, 4, 40), DARK), flats[0], views, flats[1]]).astype(np.float32)
     angles = np.concatenate([[np.nan] * 2, SCAN.angles, [np.nan]])
     source = ArraySource(data, [2, 1] + [0] * n + [1], angles)
-    prepared = prepare_projections(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(axis_col=20.7, steps=PLAIN), pytest.fail)  # type: ignore[arg-type]
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-4)
 
 
@@ -121,7 +121,7 @@ def exposed(flats: list[float], dark: float = 0.1, views: float = 0.1) -> ArrayS
 @pytest.mark.parametrize("binning", [1, 2])
 def test_flats_with_an_exposure_of_their_own_count_as_exposed_like_the_views(flats: list[float], binning: int) -> None:
     """Without it every line integral would be off by log(flat exposure / view exposure)."""
-    selection = Selection(axis_col=20.7, correction=PLAIN, binning=binning)
+    selection = Selection(axis_col=20.7, steps=PLAIN, binning=binning)
     prepared = prepare_projections(exposed(flats), selection, pytest.fail)  # type: ignore[arg-type]
     shape = (45, 4 // binning, binning, 40 // binning, binning)
     expected = -np.log(np.exp(-SCAN.line_integrals()).reshape(shape).mean(axis=(2, 4)))
@@ -134,13 +134,13 @@ def test_where_an_exposure_is_not_known_nothing_is_scaled(unknown: str) -> None:
     source.exposures[source.image_key == (1 if unknown == "flats" else 0)] = np.nan
     source.exposures[source.image_key == (0 if unknown == "flats" else 1)] = 7.0
     source.exposures[source.image_key == 2] = np.nan
-    prepared = prepare_projections(source, Selection(axis_col=20.7, correction=PLAIN), pytest.fail)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(axis_col=20.7, steps=PLAIN), pytest.fail)  # type: ignore[arg-type]
     np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals(), atol=1e-5)
 
 
 def test_darks_of_another_exposure_are_told() -> None:
     warnings: list[str] = []
-    selection = Selection(axis_col=20.7, correction=PLAIN)
+    selection = Selection(axis_col=20.7, steps=PLAIN)
     prepare_projections(exposed([0.1], dark=0.025), selection, warnings.append)  # type: ignore[arg-type]
     assert len(warnings) == 1
     assert "darks were exposed for 0.025 s and the projections for 0.1 s" in warnings[0]
@@ -150,7 +150,7 @@ def test_views_without_a_finite_pixel_are_left_out_aloud(tmp_path: Path) -> None
     counts = SCAN.counts().astype(np.float32)
     counts[[3, 30]] = np.nan
     path = write_exchange(tmp_path / "scan.h5", SCAN, {"data": counts})
-    prepared, warnings = _prepare(path, Selection(correction=PLAIN))
+    prepared, warnings = _prepare(path, Selection(steps=PLAIN))
     assert prepared.geometry.n_views == 43
     np.testing.assert_allclose(prepared.geometry.angles, np.delete(SCAN.angles, [3, 30]))
     np.testing.assert_allclose(prepared.projections.data, np.delete(SCAN.line_integrals(), [3, 30], axis=0), atol=1e-4)
@@ -215,12 +215,12 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     )
     source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
     warnings: list[str] = []
-    prepared = prepare_projections(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
     assert prepared.axis_col == 18.0
     assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
     source.axis_col = 20.5
     warnings.clear()
-    prepared = prepare_projections(source, Selection(correction=PLAIN), warnings.append)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
     assert prepared.axis_col == 20.5
     assert any("the file's 20.50 is used" in text for text in warnings)
 

@@ -12,16 +12,19 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.counts import CountModel
+from beamline.projections.steps.defects import Defects
+from beamline.projections.steps.resampling import TiltAndLens
 from recon.assess.metrics import psnr
 from recon.base.volume import Grid
-from recon.prep.correct import CorrectionSettings
 from recon.prep.resample import Distortion
 from recon.voxels.fbp import fbp
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.balls import Balls
 
-SELECTION = Selection(correction=CorrectionSettings(air="none"))
+SELECTION = Selection(steps=(Air("none"),))
 STRAIGHT = Balls(np.radians(np.arange(0, 180, 3.0)), seed=3)
 
 
@@ -51,22 +54,31 @@ def _quality(prepared: PreparedProjections) -> float:
     return psnr(fbp(prepared.projections.data, prepared.geometry, grid)[inside], _truth(grid.shape)[inside])
 
 
+def _tilt(prepared: PreparedProjections) -> tuple[str, object]:
+    """What was said of the tilt, and the degrees that the file records."""
+    done = prepared.done["tilt"]
+    assert done.parameters is not None
+    return done.said, done.parameters["tilt_deg"]
+
+
 def test_a_tilt_is_warned_of() -> None:
     as_it_is, warned = _prepared(_source(1.5), SELECTION)
     assert [text for text in warned if "seems to lean by 1." in text and "--tilt auto" in text]
-    assert as_it_is.tilt == "" and as_it_is.tilt_deg == 0
+    assert _tilt(as_it_is) == ("", 0)
 
 
 @pytest.mark.slow
 def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> None:
     straight, said = _prepared(_source(0.0), SELECTION)
-    assert not said and straight.tilt == "" and straight.tilt_deg == 0
+    assert not said and _tilt(straight) == ("", 0)
     as_it_is, _ = _prepared(_source(1.5), SELECTION)
-    levelled, said = _prepared(_source(1.5), replace(SELECTION, find_tilt=True))
-    assert not said and levelled.tilt.startswith("The axis leans by 1.") and "views are turned" in levelled.tilt
-    given, _ = _prepared(_source(1.5), replace(SELECTION, tilt_deg=1.5, axis_col=STRAIGHT.axis_col))
+    levelled, said = _prepared(_source(1.5), SELECTION.having(TiltAndLens("auto")))
+    assert (
+        not said and _tilt(levelled)[0].startswith("The axis leans by 1.") and "views are turned" in _tilt(levelled)[0]
+    )
+    given, _ = _prepared(_source(1.5), replace(SELECTION, axis_col=STRAIGHT.axis_col).having(TiltAndLens(1.5)))
     for found in (levelled, given):
-        assert found.tilt_deg == pytest.approx(1.5, abs=0.05)
+        assert _tilt(found)[1] == pytest.approx(1.5, abs=0.05)
         assert found.axis_col == pytest.approx(STRAIGHT.axis_col, abs=0.25)
         assert _quality(found) > _quality(straight) - 0.3
     assert _quality(as_it_is) < _quality(straight) - 1
@@ -74,15 +86,15 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
 
 def test_no_tilt_changes_nothing() -> None:
     plain, _ = _prepared(_source(1.5), SELECTION)
-    zero, said = _prepared(_source(1.5), replace(SELECTION, tilt_deg=0.0))
-    assert not said and zero.tilt == "" and zero.measured is None
+    zero, said = _prepared(_source(1.5), SELECTION.having(TiltAndLens(0.0)))
+    assert not said and _tilt(zero)[0] == "" and zero.measured is None
     np.testing.assert_array_equal(zero.projections.data, plain.projections.data)
-    found, said = _prepared(_source(0.0), replace(SELECTION, find_tilt=True))
-    assert found.tilt_deg == 0 and found.tilt.endswith("not corrected.") and not said
+    found, said = _prepared(_source(0.0), SELECTION.having(TiltAndLens("auto")))
+    assert _tilt(found)[1] == 0 and _tilt(found)[0].endswith("not corrected.") and not said
 
 
 def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
-    prepared, _ = _prepared(_source(0.0), replace(SELECTION, tilt_deg=5.0, axis_col=49.3))
+    prepared, _ = _prepared(_source(0.0), replace(SELECTION, axis_col=49.3).having(TiltAndLens(5.0)))
     assert prepared.measured is not None and 0.9 < prepared.measured.mean() < 1
     assert prepared.measured[8:-8, 4:-4].all() and not prepared.measured[0, -1]
     weights = prepared.ray_weights()
@@ -92,8 +104,8 @@ def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
 @pytest.mark.parametrize("binning", [1, 2])
 @pytest.mark.parametrize("lens", [None, Distortion(50.0, 30.0, (1.0, 3e-4, -4e-6))])
 def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion | None) -> None:
-    plain = CorrectionSettings(air="none", zinger_threshold=1e9)  # zingers are judged by the rows that are there
-    selection = Selection(tilt_deg=1.5, distortion=lens, binning=binning, correction=plain)
+    plain = Air("none"), Defects(zinger_threshold=1e9)  # zingers are judged by the rows that are there
+    selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
     correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
     whole = correction.at_once(frames).data
@@ -108,9 +120,9 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
 def test_what_cannot_be_levelled_is_refused() -> None:
     source = _source(0.0)
     with pytest.raises(ConfigError, match="--tilt is for a parallel beam; array is a cone"):
-        _prepared(source, replace(SELECTION, tilt_deg=1.0, cone=(100.0, 200.0), pixel_size_mm=0.1))
+        _prepared(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).having(TiltAndLens(1.0)))
     with pytest.raises(ConfigError, match="--tilt and --distortion mix neighbouring pixels"):
-        _prepared(source, replace(SELECTION, tilt_deg=1.0, noise="counts"))
+        _prepared(source, SELECTION.having(TiltAndLens(1.0), CountModel("counts")))
     few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
     with pytest.raises(DataError, match="the tilt of the axis was not found"):
-        _prepared(few, replace(SELECTION, find_tilt=True, axis_col=49.3))
+        _prepared(few, replace(SELECTION, axis_col=49.3).having(TiltAndLens("auto")))

@@ -24,6 +24,8 @@ from beamline.monitor.digest import digest
 from beamline.projections.flags import UsableViews
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
 from beamline.reconstruct import axis_search, snapshots
 from beamline.reconstruct import follow as follow_module
 from beamline.reconstruct import growing as module
@@ -42,7 +44,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Progress
 from recon.base.volume import Volume
 from recon.prep.align import AxisEstimate
-from recon.prep.correct import Correction, CorrectionSettings, Projections, Transmission
+from recon.prep.correct import Correction, Projections, Transmission
 from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp
@@ -186,7 +188,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
 def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
     clock, events, alarms = ScanClock(), list[Event](), {4 + i for i in range(7, 12)}
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), alarms=alarms)
-    selection = Selection(axis_col=SCAN.axis_col, use_flags=use_flags)
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Flags("use" if use_flags else "ignore"),))
     follow(_options(tmp_path, selection=selection), events.append, clock, RHYTHM)
     parameters = read_reconstruction(tmp_path / "recon.h5").parameters
     assert set(parameters["view_frames"]) == set(range(4, 34)) - (alarms if use_flags else set())  # type: ignore[arg-type]
@@ -202,7 +204,7 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     frames.append(replace(frames[12], index=34, replaces=12, time=frames[33].time + 1))
     frames[12] = replace(frames[12], counts=frames[12].counts // 40)
     _schedule(clock, tmp_path / "scan.h5", frames, alarms={12})
-    selection = Selection(axis_col=SCAN.axis_col, use_flags=use_flags)
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Flags("use" if use_flags else "ignore"),))
     metrics = follow(_options(tmp_path, selection=selection), events.append, clock, RHYTHM)
     record = read_reconstruction(tmp_path / "recon.h5")
     assert set(record.parameters["view_frames"]) == set(range(4, 35)) - {12}  # type: ignore[arg-type]
@@ -234,9 +236,9 @@ def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
 
 @pytest.mark.parametrize("pause", [0.0, 2.0])
 @pytest.mark.parametrize("gain", [None, 1.3])
-@pytest.mark.parametrize("air", ["auto", "none", (3, 3)])
+@pytest.mark.parametrize("air", ["auto", "none", "3,3"])
 def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to_the_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float | None, air: object, pause: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gain: float | None, air: str, pause: float
 ) -> None:
     """Also where flats at the end (of a brighter beam) change every view that the model has learnt from."""
     fits: list[StreamingFit] = []
@@ -257,8 +259,7 @@ def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
     _schedule(clock, tmp_path / "scan.h5", frames if gain is None else _late_flats(frames, gain), pause=pause)
-    correction = CorrectionSettings(air=air)  # type: ignore[arg-type]
-    selection = Selection(axis_col=SCAN.axis_col, correction=correction)
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Air(air),))
     follow(_options(tmp_path, selection=selection), events.append, clock, RHYTHM)
 
     with open_scan(tmp_path / "scan.h5") as source:
@@ -307,7 +308,7 @@ def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
 
     monkeypatch.setattr(ScanFollower, "_correct_again", as_it_was)
     monkeypatch.setattr(follow_module, "write_result", write_and_keep)
-    selection = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air="none"))
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
     source = SourceOptions(tmp_path / "rest.h5", earlier=(tmp_path / "scan.h5",))
     goal = Goal(psnr_loss=0.01)
     follow(_options(tmp_path, source=source, selection=selection, enough=goal), events.append, clock, RHYTHM)
@@ -348,7 +349,7 @@ def test_nothing_is_corrected_twice_where_all_references_came_first(
     monkeypatch.setattr(Correction, "provisional", lambda self: None)  # a first look at the newest view apart
     clock = ScanClock()
     _schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
-    selection = Selection(axis_col=SCAN.axis_col, correction=CorrectionSettings(air=(3, 3)))
+    selection = Selection(axis_col=SCAN.axis_col, steps=(Air("3,3"),))
     follow(_options(tmp_path, selection=selection), lambda event: None, clock, RHYTHM)
     assert len(corrected) == 30 and len(set(corrected)) == 30
 

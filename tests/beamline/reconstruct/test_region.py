@@ -87,7 +87,7 @@ def test_refused_with_nothing_written(folder: Path, options: tuple[str, ...], co
     [
         (("--roi", "38:60,10:40,4:49", "--axis", "23.2"), "ScanCorrection", "x 4:49 does not lie"),
         (("--roi", "38:60,10:97,4:29"), "ScanCorrection", "y 10:97 does not lie in the widest volume's 0:96"),
-        (("--roi", "38:60,10:40,4:49"), "remove_rings_in_place", "x 4:49 does not lie in the volume's 0:48"),
+        (("--roi", "38:60,10:40,4:49"), "assemble", "x 4:49 does not lie in the volume's 0:48"),
     ],
     ids=["by the axis given", "by the detector", "by the axis found"],
 )

@@ -18,6 +18,9 @@ from beamline.core.files import parts_of
 from beamline.core.stop import StopRequest
 from beamline.projections.prepare import checked_views, prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.references import ReferenceCheck
 from beamline.scan import control
 from beamline.scan.control import Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
@@ -35,7 +38,6 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.frame import FrameKind
-from recon.prep.correct import CorrectionSettings
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran, small
 
@@ -139,7 +141,7 @@ def test_only_the_missing_views_are_taken(tmp_path: Path, monkeypatch: pytest.Mo
         assert describe(part)["findings"].count(line) == 1
         warned: list[str] = []
         with open_scan(part) as source:
-            checked_views(source, Selection(accept_references=True), warned.append)
+            checked_views(source, Selection(steps=(ReferenceCheck("accept"),)), warned.append)
         assert warned.count(line) == 1
     said = describe(run / "joined.h5")
     assert not any("parts of a scan" in finding for finding in said["findings"])
@@ -192,7 +194,7 @@ def test_the_views_of_all_parts_are_corrected_together(tmp_path: Path, monkeypat
             assert OverlaidSource(source, darks=images).part_starts.tolist() == [0, frames + 2]
             assert OverlaidSource(source, flats=images).part_starts.tolist() == [0]
     with open_scan(run / "joined.h5") as source:
-        selection = Selection(axis_col=5.5, correction=CorrectionSettings(air="none"), use_flags=False)
+        selection = Selection(axis_col=5.5, steps=(Air("none"), Flags("ignore")))
         prepared = prepare_projections(source, selection, lambda said: None)
     assert len(prepared.projections.data) == VIEWS
 
@@ -231,7 +233,7 @@ def test_references_of_the_end_alone_are_taken(
     with open_scan(run / "joined.h5") as source:
         prepared = prepare_projections(
             source,
-            Selection(axis_col=5.5, correction=CorrectionSettings(air="none"), use_flags=False, accept_references=True),
+            Selection(axis_col=5.5, steps=(Air("none"), Flags("ignore"), ReferenceCheck("accept"))),
             lambda said: None,
         )
     assert len(prepared.projections.data) == VIEWS

@@ -25,6 +25,8 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.mass import MassCheck
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
 from beamline.scan import recorder as recorder_module
 from beamline.scan import run as module
 from beamline.scan.ledger import LedgerError
@@ -35,7 +37,6 @@ from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.errors import DeviceError
 from drivers.frame import Frame, FrameKind
 from drivers.frame_memory import FrameMemory
-from recon.prep.correct import CorrectionSettings
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults
 from tests.beamline.ran import SMALL, Ran, small
 
@@ -395,7 +396,7 @@ def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_pa
     result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
     assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
     with open_scan(result.path) as source:
-        selection = Selection(axis_col=19.5, correction=CorrectionSettings(air="none"), use_flags=False)
+        selection = Selection(axis_col=19.5, steps=(Air("none"), Flags("ignore")))
         said: list[str] = []
         prepared = prepare_projections(source, selection, said.append)
         assert len(said) == 1 and said[0].startswith("--flags ignore")

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from beamline.core.events import Event
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
 from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.simulate.truth import binning_of, truth_of
 from beamline.simulate.write import write_scan
 from beamline.storage.readers.open import open_scan
 from drivers.clock import SystemClock
 from recon.base.volume import Grid
-from recon.prep.correct import CorrectionSettings
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk
 from simulators.frame.detector import Detector
@@ -57,7 +57,7 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
     write_scan(scene, scan, tmp_path / "scan.h5", _silent, SystemClock(), lambda: False)
     truth = truth_of(scan.scene.sample, scan.detector, binning)
     assert truth.names == ("ellipsoid",)
-    chosen = Selection(binning=binning, axis_col=24.0, correction=CorrectionSettings(air="none"))
+    chosen = Selection(binning=binning, axis_col=24.0, steps=(Air("none"),))
     with open_scan(tmp_path / "scan.h5") as source:
         assert source.axis_col == 24.0
         prepared = prepare_projections(source, chosen, _silent)

@@ -1,0 +1,77 @@
+"""The registry of steps: one line a step. Adding a correction takes its file and its line here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from graphlib import TopologicalSorter
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from beamline.projections.steps.step import Done, PrepStep, options_of
+
+if TYPE_CHECKING:
+    from beamline.storage.writers.recon_file import Value
+
+REGISTRY: dict[str, str] = {
+    "resampling": "TiltAndLens",
+    "air": "Air",
+    "flags": "Flags",
+    "references": "ReferenceCheck",
+    "counts": "CountModel",
+    "defects": "Defects",
+    "flats": "Flats",
+    "phase": "Phase",
+    "rings": "Rings",
+    "hardening": "Hardening",
+}
+"""Module in this folder, and its class; options stand in this order."""
+
+
+@cache
+def registered() -> tuple[type[PrepStep], ...]:
+    """Every step, in the order of the registry."""
+    return tuple(
+        getattr(import_module(f"beamline.projections.steps.{module}"), cls) for module, cls in REGISTRY.items()
+    )
+
+
+@cache
+def all_steps() -> tuple[type[PrepStep], ...]:
+    """Every step, each after those that it follows."""
+    by_name: dict[str, type[PrepStep]] = {step.name: step for step in registered()}
+    order = TopologicalSorter({name: step.follows for name, step in by_name.items()}).static_order()
+    return tuple(by_name[name] for name in order)
+
+
+def steps_of(values: Mapping[str, Any]) -> tuple[PrepStep, ...]:
+    """All steps with these values of their options, which are keyed as `key_of` says.
+
+    Raises:
+        ValueError: options of a step that do not go together.
+    """
+    return tuple(
+        step(**{field: values[key_of(option.name)] for field, option in options_of(step).items()})
+        for step in registered()
+    )
+
+
+def key_of(option: str) -> str:
+    """The name of an option's value among those of a command."""
+    return option.lstrip("-").replace("-", "_")
+
+
+def recorded(steps: Sequence[PrepStep], done: Mapping[str, Done]) -> dict[str, Value]:
+    """What the file of a volume records of the steps, by name."""
+    found: dict[str, Value] = {}
+    for step in steps:
+        did = done.get(step.name, Done())
+        said = {f"{step.name}_said": did.said} if did.said else {}
+        found |= _options(step) | said if did.parameters is None else did.parameters
+    return found
+
+
+def _options(step: PrepStep) -> dict[str, Value]:
+    """The values of a step's options."""
+    values = {key_of(option.name): getattr(step, field) for field, option in options_of(type(step)).items()}
+    return {key: value if isinstance(value, int | float) else str(value) for key, value in values.items()}

@@ -1,0 +1,46 @@
+"""Rings: stripes of the sinograms are removed, see `recon.prep.rings`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, get_args
+
+from beamline.projections.steps.step import Done, option
+from recon.base.choices import Rings as Way
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from beamline.projections.prepare import PreparedProjections
+
+
+@dataclass(frozen=True)
+class Rings:
+    """Removal of stripes from line integrals.
+
+    Attributes:
+        way: see `recon.prep.rings.remove_rings_in_place`.
+    """
+
+    name: ClassVar[str] = "rings"
+    follows: ClassVar[tuple[str, ...]] = ("background",)
+    way: Way = option(
+        "--rings",
+        "none",
+        "Stripes of the sinograms, which make rings. sort: small ones; vo: dead columns, large and small ones; "
+        "wavelet: by their wavelets; auto: sort or vo where there are some, and says so.",
+        choices=get_args(Way),
+    )
+
+    @property
+    def needs_finished(self) -> str:
+        return "" if self.way == "none" else "--rings is for a finished scan: it needs all views."
+
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:
+        from recon.prep.rings import remove_rings_in_place
+
+        taken, said = remove_rings_in_place(views.projections.data, angles, self.way)
+        if views.held_out is not None:
+            views.held_out[0][...] -= taken
+        return Done(said, {"rings": self.way, **({"rings_removed": said} if said else {})})

@@ -1,0 +1,136 @@
+"""What a step is: a correction of views with its options, its place among the others, and what it says it did.
+
+A step is a frozen dataclass. A field made by `option` is an option of the commands, of a recipe and of Python alike. A
+module of a step is imported for every help text: what computes is imported where it is called.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from beamline.projections.prepare import PreparedProjections
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.base import ScanSource
+    from beamline.storage.writers.recon_file import Value
+    from recon.prep.correct import Projections
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a step on the command line.
+
+    Attributes:
+        name: with its dashes.
+        help: for people.
+        default: as it would be typed; None: there is nothing to type.
+        parse: what is typed to the value of the field; its ValueError is bad usage.
+        choices: what may be typed; empty: anything that `parse` takes.
+        metavar: what stands for the value in help.
+        path: it names a file.
+    """
+
+    name: str
+    help: str
+    default: str | None = None
+    parse: Callable[[str], Any] = str
+    choices: tuple[str, ...] = ()
+    metavar: str | None = None
+    path: bool = False
+
+
+def option(name: str, default: str | None, help: str, **rest: Any) -> Any:
+    """A field of a step that the option `name` sets; `rest` is as of `Option`. Its default is that of the option."""
+    made = Option(name, help, default, **rest)
+    return field(default=None if default is None else made.parse(default), metadata={"option": made})
+
+
+def options_of(step: type[PrepStep]) -> dict[str, Option]:
+    """The options of a step, by field."""
+    return {each.name: each.metadata["option"] for each in fields(step) if "option" in each.metadata}  # type: ignore[arg-type]
+
+
+def positive(text: str) -> float:
+    """A finite number above 0. ValueError for anything else."""
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise ValueError(f"{text} is not in the range x>0")
+    return number
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """What a step did.
+
+    Attributes:
+        said: a sentence; empty where nothing was asked, or nothing found.
+        parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
+    """
+
+    said: str = ""
+    parameters: Mapping[str, Value] | None = None
+
+
+class PrepStep(Protocol):
+    """A correction. Its ValueError on creation is bad usage.
+
+    Attributes:
+        name: by which events and `PreparedProjections.done` know it.
+        follows: names of steps that come before it.
+    """
+
+    name: ClassVar[str]
+    follows: ClassVar[tuple[str, ...]]
+
+    @property
+    def needs_finished(self) -> str:
+        """Why the scan must have ended, as a sentence for who follows one; empty: it need not."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewFilter:
+    """A step on the views of one scan, which it takes a batch at a time.
+
+    Attributes:
+        apply: views, and the row of the detector at which they begin, to as many views filtered; line integrals may be
+            changed in place.
+        reach: rows, binned, beside a row from which it takes something.
+        mixes: the subject and verb that say who mixes neighbouring pixels.
+    """
+
+    apply: Callable[[Projections, int], Projections]
+    reach: int
+    mixes: str
+
+
+@runtime_checkable
+class ViewStep(PrepStep, Protocol):
+    """A step on each view alone, also of a scan that still runs."""
+
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+        """The filter of a scan, None where nothing is to be done; and what it does.
+
+        Raises:
+            ConfigError: the scan does not say what the step needs, or the step does not fit it.
+        """
+
+
+@runtime_checkable
+class ScanStep(PrepStep, Protocol):
+    """A step on all views of a scan."""
+
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:
+        """Change line integrals, weights and views held out in place.
+
+        Args:
+            angles: [view] of the stage, radians.
+
+        Raises:
+            DataError: the views do not show what the step needs.
+        """

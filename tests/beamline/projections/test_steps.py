@@ -1,0 +1,59 @@
+"""Steps: their order, their options by their defaults, and what the file records of one that says nothing itself."""
+
+from __future__ import annotations
+
+import pytest
+
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.counts import CountModel
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.phase import Phase
+from beamline.projections.steps.registry import all_steps, key_of, recorded, registered, steps_of
+from beamline.projections.steps.rings import Rings
+from beamline.projections.steps.step import Done, options_of
+
+
+def test_each_comes_after_those_that_it_follows_and_no_two_share_a_name() -> None:
+    names = [step.name for step in all_steps()]
+    assert len(set(names)) == len(registered()) == len(names)
+    assert all(names.index(before) < names.index(step.name) for step in all_steps() for before in step.follows)
+
+
+def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
+    options = [option for step in registered() for option in options_of(step).values()]
+    values = {
+        key_of(option.name): None if option.default is None else option.parse(option.default) for option in options
+    }
+    assert len(values) == len(options)
+    assert steps_of(values) == tuple(step() for step in registered())
+    assert not any(step.needs_finished for step in steps_of(values))
+    with pytest.raises(ValueError, match="--gain is for counted photons"):
+        steps_of(values | {"noise": "log", "gain": 2.0})
+
+
+def test_a_selection_takes_one_step_of_a_kind() -> None:
+    selection = Selection(steps=(Rings("sort"),)).having(Air("none"), Rings("vo"))
+    assert selection.steps == (Air("none"), Rings("vo"))
+    assert (selection.step(Rings).way, selection.step(Phase)) == ("vo", Phase())
+    assert [step.name for step in selection.in_order] == [step.name for step in all_steps()]
+
+
+def test_the_file_records_what_a_step_says_or_its_options() -> None:
+    steps = [Flags("ignore"), CountModel("counts", 2.0), Rings("vo")]
+    done = {"rings": Done("none seen", {"rings_removed": "none seen"}), "noise": Done("counted")}
+    expected = {
+        "flags": "ignore",
+        "noise": "counts",
+        "gain": 2.0,
+        "noise_said": "counted",
+        "rings_removed": "none seen",
+    }
+    assert recorded(steps, done) == expected
+
+
+@pytest.mark.parametrize(
+    ("model", "parts"), [("auto", ("auto", "auto")), ("3,4", ((3, 4), "none")), ("surface:2", ("auto", 2))]
+)
+def test_air_by_its_columns_and_its_surface(model: str, parts: object) -> None:
+    assert (Air(model).columns, Air(model).surface) == parts
