@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import Quantity, ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 
 class ReaderConformance:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
+from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.plugins import plugins
-from drivers.protocols import Camera, CameraSettings, CameraTiming
 from drivers.stages.settings import with_keys
 
 

@@ -9,7 +9,7 @@ Ask = Callable[[str], None]
 
 
 class ManualShutter:
-    """Implements `drivers.protocols.Shutter` by asking the operator.
+    """Implements `drivers.base.protocols.Shutter` by asking the operator.
 
     The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later ones ask only
     where the state changes.
@@ -38,7 +38,7 @@ class ManualShutter:
 
 
 class ManualSampleMover:
-    """Implements `drivers.protocols.SampleMover` by asking the operator; the sample starts in the beam."""
+    """Implements `drivers.base.protocols.SampleMover` by asking the operator; the sample starts in the beam."""
 
     def __init__(self, ask: Ask, name: str = "sample mover") -> None:
         self.name = name

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from drivers.protocols import CameraSettings, CameraTiming
+from drivers.base.protocols import CameraSettings, CameraTiming
 
 SENSOR_SHAPE = (2304, 4096)
 PITCH_MM = 4.6e-3

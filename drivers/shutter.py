@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import DigitalOutput
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import DigitalOutput
 
 
 class OutputShutter:
-    """Implements `drivers.protocols.Shutter` on a controller's output.
+    """Implements `drivers.base.protocols.Shutter` on a controller's output.
 
     Reading back checks the output, not the blade: only the beam shows whether the shutter moved. `close` always sends
     its command, also where the shutter is known to be closed.

@@ -211,7 +211,7 @@ READER = Extension(
 import numpy as np
 
 from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 
 class NpyStack(BaseSource):
@@ -336,7 +336,7 @@ from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
 from beamline.instrument.connect import connect
 from beamline.scan.preflight import dry_run
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from simulators.wires.registry import WIRES
 
 turn = "kind: turn, port: 'sim://turn', counts_per_turn: 3600, max_speed_deg_s: 90, acceleration_deg_s2: 180"

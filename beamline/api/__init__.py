@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from beamline.core.errors import BeamlineError, ConfigError, DataError, ReferencesError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 
 if TYPE_CHECKING:
     from beamline.api.instrument import Instrument, ScanResult, connect, scan, to_stderr

@@ -26,8 +26,8 @@ from beamline.storage.parts import JOINED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import NotReadyError, open_scan
 from beamline.storage.volumes.files import opened_volume
-from drivers.clock import SystemClock
-from drivers.frame import Frame
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame
 from recon.base.volume import Volume
 
 _PATIENCE = 120.0  # real s until a scan that is followed has begun

@@ -25,7 +25,7 @@ from beamline.reconstruct.result import OutputPaths, report_beside
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import ReconRecord
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.auto import Auto
 from recon.base.choices import AUTO
 from recon.base.method import Method

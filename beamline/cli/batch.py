@@ -14,7 +14,7 @@ from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.signals import terminated_like_interrupted
 from beamline.reconstruct.batch import TABLE, BatchOptions, run_batch
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:

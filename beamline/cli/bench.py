@@ -19,7 +19,7 @@ from beamline.core.machine import machine, machine_line
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
 from drivers import orca_quest
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.choices import N_GAUSSIANS, SIDE
 from recon.methods import by_name, names
 
@@ -111,7 +111,7 @@ def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
     from beamline.config.models import StorageSection
     from beamline.config.monitor import configured_checks
     from beamline.doctor.rate import Load
-    from drivers.protocols import CameraSettings, TriggerSource
+    from drivers.base.protocols import CameraSettings, TriggerSource
 
     if file is None:
         return Load(shape or orca_quest.SENSOR_SHAPE, StorageSection().preview_bin, StorageSection().flush_every)

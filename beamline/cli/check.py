@@ -9,7 +9,7 @@ import click
 from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
 from beamline.core.events import Event
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 
 @click.command()

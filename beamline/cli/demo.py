@@ -22,7 +22,7 @@ from beamline.core.narration import sentence
 from beamline.core.process import ChildProcess
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.config.load import Config

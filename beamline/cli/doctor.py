@@ -15,7 +15,7 @@ from beamline.cli.options import set_option
 from beamline.core.events import Event
 from beamline.core.signals import terminated_like_interrupted
 from beamline.doctor.check import Grade
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.doctor.check import Diagnosis

@@ -17,7 +17,7 @@ from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
 from beamline.storage.volumes.registry import suffixes_text
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.storage.writers.recon_file import ReconRecord

@@ -19,7 +19,7 @@ from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import count, printable, size, spans
 from beamline.storage.codecs import CODECS
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 _PATH = click.Path(path_type=Path)
 

@@ -10,7 +10,7 @@ from click.exceptions import ClickException, Exit
 
 from beamline.core.errors import exit_code, user_message
 from beamline.core.events import Event, JsonLines, Sink
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from beamline.cli.terminal import Terminal, counting
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 Box = tuple[tuple[float, float], ...]
 _MOST_VIEWS = 1_000_000

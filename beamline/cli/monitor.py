@@ -19,7 +19,7 @@ from beamline.core.events import Event, fan_out
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal
 from beamline.core.text import spans
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.monitor.check import Level

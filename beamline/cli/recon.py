@@ -38,7 +38,7 @@ from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
 from beamline.storage.volumes.registry import suffixes_text
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO, Filter, Quality
 from recon.methods import DEFAULT, names
 

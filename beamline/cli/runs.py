@@ -14,7 +14,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.core.files import RUNS
 from beamline.core.text import printable, size
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.scan.runs import Run

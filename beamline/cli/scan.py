@@ -19,8 +19,8 @@ from beamline.core.events import Event, Sink
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from beamline.core.text import count
-from drivers.clock import SystemClock
-from drivers.frame import FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import FrameKind
 
 if TYPE_CHECKING:
     from beamline.config.load import Config

@@ -15,7 +15,7 @@ from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event
 from beamline.core.signals import terminated_like_interrupted
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.choices import NECK
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.shipped import shipped_scenes
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
 from beamline.core.text import size
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
     from beamline.simulate.scene_file import Scan, SceneFile

@@ -19,7 +19,7 @@ from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
 from beamline.core.signals import terminated_like_interrupted
 from beamline.study.studies import STUDIES
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names
 

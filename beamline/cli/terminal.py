@@ -19,7 +19,7 @@ from beamline.core.events import Event, Sink
 from beamline.core.narration import sentence
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.manual import Ask
 from recon.methods import BASELINE
 

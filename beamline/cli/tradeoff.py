@@ -17,7 +17,7 @@ from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
 from beamline.core.events import fan_out
 from beamline.core.signals import terminated_like_interrupted
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.methods import names, names_compared
 
 

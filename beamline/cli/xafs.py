@@ -20,7 +20,7 @@ from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Event, fan_out
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     import numpy as np

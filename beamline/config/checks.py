@@ -8,7 +8,7 @@ from pathlib import Path
 from beamline.config.devices import DcamOrca
 from beamline.config.models import Config, FileAngles
 from beamline.plan.plan import Mode
-from drivers.protocols import CameraSettings, TriggerSource
+from drivers.base.protocols import CameraSettings, TriggerSource
 
 
 def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:

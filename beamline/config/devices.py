@@ -18,12 +18,12 @@ from beamline.config.declared import declared, read_from
 from beamline.config.section import Section
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
+from drivers.base.clock import Clock
+from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.beam_monitors.page import url_problem
 from drivers.beam_monitors.reading import pattern_problem
 from drivers.beam_monitors.serial import PATTERN, QUERY
 from drivers.cameras import CAMERAS
-from drivers.clock import Clock
-from drivers.protocols import Camera, CameraSettings, CameraTiming
 from drivers.stages.registry import STAGES
 
 Roi = Annotated[

@@ -9,8 +9,8 @@ from pydantic import Field, create_model, model_validator
 
 from beamline.config.declared import declared, read_from
 from beamline.config.section import Section
-from drivers.clock import Clock
-from drivers.protocols import RotationStage
+from drivers.base.clock import Clock
+from drivers.base.protocols import RotationStage
 from drivers.stages.registry import STAGES
 from drivers.stages.settings import StageSettings
 

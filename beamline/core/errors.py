@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from beamline.core.version import version
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 
 
 class BeamlineError(Exception):

@@ -13,7 +13,7 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from beamline.core.events import Event, Sink
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 
 _SAY_EVERY = 0.2  # s between events on how far a phase is
 

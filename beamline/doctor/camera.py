@@ -13,9 +13,9 @@ from typing import Any
 from beamline.config.devices import DcamOrca
 from beamline.doctor.check import Diagnosis, Grade, of_error
 from drivers import usb
+from drivers.base.errors import DeviceError
 from drivers.dcam.abi import Dcam
 from drivers.dcam.codes import Text
-from drivers.errors import DeviceError
 
 LINK, LIBRARY = "camera link", "camera library"
 _SUPERSPEED = "one Hamamatsu camera on a SuperSpeed link (5 Gbit/s or more)"

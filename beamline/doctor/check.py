@@ -8,7 +8,7 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Any
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 
 
 class Grade(StrEnum):

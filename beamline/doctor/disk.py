@@ -16,7 +16,7 @@ from beamline.core.text import size
 from beamline.doctor.check import Diagnosis, Grade
 from beamline.doctor.needs import ScanNeeds
 from beamline.scan.preflight import free_bytes
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 SECONDS, MOST = 3.0, 4 << 30
 """Longest time (s on the clock) and most bytes of a measurement."""

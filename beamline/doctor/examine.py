@@ -18,9 +18,9 @@ from beamline.doctor.needs import ScanNeeds, needs, ring_bytes
 from beamline.doctor.ports import port, ports
 from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run
-from drivers.clock import Clock
-from drivers.errors import DeviceError
-from drivers.frame import FrameKind
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
+from drivers.base.frame import FrameKind
 from drivers.serial.ports import SerialPort, serial_ports
 
 _MEMORY, _RATE = "memory", "frame rate"

@@ -31,10 +31,10 @@ from beamline.scan.recorder import Recorder, frames_in_memory
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.to_disk import ToDisk
-from drivers.clock import Clock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import Clock
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import TriggerTrain
 from drivers.frame_memory import FrameMemory
-from drivers.protocols import TriggerTrain
 
 REFERENCES = 2  # darks, and as many flats
 RING = 8  # views that differ; they come by turns

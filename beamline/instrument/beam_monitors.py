@@ -6,11 +6,11 @@ from pathlib import Path
 
 from beamline.config.devices import ElectrometerConfig, RingCurrentConfig
 from beamline.instrument.simulated import simulated_electrometer
+from drivers.base.clock import Clock
+from drivers.base.protocols import BeamMonitor
 from drivers.beam_monitors.page import PageSource
 from drivers.beam_monitors.reading import TextBeamMonitor, TextSource
 from drivers.beam_monitors.serial import SerialSource
-from drivers.clock import Clock
-from drivers.protocols import BeamMonitor
 
 
 def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig, clock: Clock) -> BeamMonitor:

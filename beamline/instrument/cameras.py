@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.config.devices import DcamOrca
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.frame_memory import FrameMemory
 
 if TYPE_CHECKING:

@@ -19,10 +19,8 @@ from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.instrument.cameras import make_camera, wait_until_cold
 from beamline.instrument.operator import ask_operator
 from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_devices
-from drivers.clock import Clock, SystemClock
-from drivers.frame_memory import FrameMemory
-from drivers.manual import Ask, ManualSampleMover, ManualShutter
-from drivers.protocols import (
+from drivers.base.clock import Clock, SystemClock
+from drivers.base.protocols import (
     BeamMonitor,
     Camera,
     CameraSettings,
@@ -33,6 +31,8 @@ from drivers.protocols import (
     StageLimits,
     TriggerSource,
 )
+from drivers.frame_memory import FrameMemory
+from drivers.manual import Ask, ManualSampleMover, ManualShutter
 from drivers.shutter import OutputShutter
 from drivers.stages.travel import Travel
 

@@ -11,7 +11,7 @@ else:
 
 import click
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 
 
 def ask_operator(request: str) -> None:

@@ -16,8 +16,8 @@ from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
-from drivers.clock import Clock, SystemClock
-from drivers.protocols import Devices, Shutter
+from drivers.base.clock import Clock, SystemClock
+from drivers.base.protocols import Devices, Shutter
 from drivers.shutter import OutputShutter
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light
 from beamline.monitor.view import PixelBox
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 CALIBRATION = 5  # frames of a kind before a verdict
 BEFORE = 3  # frames whose mean step is a line's velocity

@@ -21,7 +21,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light, more_light
 from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import CellGrid, CellValues, CellView
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
 COVERED = 0.1  # light that the brightest place has less than the flats: there is no air, or the beam fell before

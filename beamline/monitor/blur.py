@@ -21,7 +21,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import CellValues
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 PIXELS = 2**16  # of a frame that are looked at, about
 STRIP = 6  # neighbouring rows that are looked at together

@@ -19,7 +19,7 @@ from beamline.monitor.change import SampleChange
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.spots import NO_SPOTS, Spots
 from beamline.monitor.view import CellGrid, CellValues, CellView, PixelBox
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 State = TypeVar("State")
 

@@ -14,7 +14,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import thinned
 from beamline.monitor.references import FEW, READOUT
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
 SHUT = 3.0  # noises of a pixel of the dark by which flats are brighter where the shutter was shut for the dark

@@ -13,7 +13,7 @@ from pydantic import Field
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import BRIGHT, UNLIT, CellGrid, CellView
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 LASTS = 5  # views in a row with matter at an edge
 NO_BEAM = 3.0  # times the noise, up to which the bright part of a flat is no light: of noise alone it is 1.3

@@ -22,7 +22,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
 from beamline.monitor.view import CellGrid, CellValues, CellView
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
 LATER = LAGS[-1]  # views after the one that is judged

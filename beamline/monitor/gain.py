@@ -14,7 +14,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import CellView
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 SIGMAS = 8.0
 PARTS = 5  # of the field, from left to right

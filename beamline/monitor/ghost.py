@@ -19,7 +19,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
 from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
 from beamline.monitor.view import CellValues
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 COLUMNS = 32  # broad columns of the field
 PARTS = 8  # of the rows

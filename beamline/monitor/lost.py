@@ -9,7 +9,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 CALIBRATION = 10  # projections
 SIGMAS = 6.0

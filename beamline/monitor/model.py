@@ -18,7 +18,7 @@ from pydantic import Field
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues, cell_noise
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 BROAD = 3  # cells a side, over which a difference is averaged
 CALIBRATION = 10  # views

@@ -12,7 +12,7 @@ from beamline.monitor.change import SPAN
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 SIGMAS = 8.0
 CONFIRMED = 0.5  # of a figure; where less of it differs from row to row, that counts: a ghost is as high as the frame

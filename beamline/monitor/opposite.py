@@ -19,7 +19,7 @@ from pydantic import Field
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellGrid, CellView, cell_noise
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 EVERY = math.radians(5)  # between the views that are kept
 MOST = 36  # of them: half a turn

@@ -16,7 +16,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import light
 from beamline.monitor.view import BRIGHT, UNLIT
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 DEAD = 0.2  # of the light of the darkest of the preview blocks around it
 NAMED = 5  # pixels that are named

@@ -18,7 +18,7 @@ from pydantic import Field
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.preview import thinned
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 LEAST_NOISE = 0.5  # counts: what rounding hides

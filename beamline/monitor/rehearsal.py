@@ -10,7 +10,7 @@ import numpy as np
 from beamline.monitor.change import SPAN
 from beamline.monitor.digest import digest
 from beamline.monitor.watch import CheckError, Monitor, look, start
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 _SIDE, _BIN = 256, 4  # pixels of a toy frame, and of a pixel of its preview
 _DARK, _FLAT, _SAMPLE = 100, 20_000, 8_000  # counts

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 FEW_PIXELS = 2  # a hot pixel or two that the darks did not show; that is no exposure too long
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.jit import njit
 from beamline.monitor.digest import FrameDigest, block_side
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 NOISES = 4.0  # times what a block's largest pixel usually is above its mean: 8 to 10 standard deviations of a pixel
 RELATIVE = 0.25  # of the light around it, more than which a spot has: less leaves a faint streak

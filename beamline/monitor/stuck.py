@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 
 @dataclass(frozen=True)

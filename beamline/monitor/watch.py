@@ -17,7 +17,7 @@ from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.preview import more_light
 from beamline.monitor.spots import spots_of
 from beamline.monitor.view import CellView, grid_of, light_left, view_of
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
 FORGET = 0.99  # a view: what was at the edge a quarter of a turn ago may come back

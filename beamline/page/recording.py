@@ -16,7 +16,7 @@ from beamline.page.tiles import MOST, TileRegion, bin_mean
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
 from beamline.storage.writers import layout
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 
 @dataclass(frozen=True)

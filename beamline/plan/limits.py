@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from beamline.core.text import degrees, size
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan
 from beamline.plan.triggers import Flight
-from drivers.protocols import CameraTiming, StageLimits
+from drivers.base.protocols import CameraTiming, StageLimits
 from drivers.stages.travel import least_interval
 
 ROOM = 1.1

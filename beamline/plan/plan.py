@@ -9,8 +9,8 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frame import FrameKind
-from drivers.protocols import TriggerTrain
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import TriggerTrain
 
 
 class Mode(StrEnum):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.plan.plan import Block, Mode
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 
 @dataclass(frozen=True)

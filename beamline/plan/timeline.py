@@ -16,8 +16,8 @@ from beamline.plan.limits import PlanFacts, remarks, violations
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.retake import Retake, retake_block, spread
 from beamline.plan.triggers import Flight, Scale, plan_flight
-from drivers.frame import FrameKind
-from drivers.protocols import CameraTiming, StageLimits, TriggerTrain
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
 
 BYTES_PER_PIXEL, BYTES_PER_BLOCK = 2, 4  # uint16 frames, float32 previews
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.protocols import TriggerTrain
+from drivers.base.protocols import TriggerTrain
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from beamline.projections.steps.step import Done, ViewFilter, ViewStep
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.prep.correct import Correction, CorrectionSettings, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
 

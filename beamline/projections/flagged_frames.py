@@ -13,7 +13,7 @@ from beamline.report.contact_sheet import FlaggedFrame
 from beamline.storage.flag_legend import FlagBit, FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import groups_of
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.binning import bin_views
 
 MOST = 12

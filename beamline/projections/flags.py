@@ -12,7 +12,7 @@ from beamline.projections.flag_regions import Regions, regions_of
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.treatment import treatment_of
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 WARNED_WEIGHT = 0.5
 """Weight of a view with a warning: as if its noise had twice the variance. A warning says that the view differs by more

@@ -39,7 +39,7 @@ from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, areas, masked
 from recon.base.volume import Grid

@@ -17,7 +17,7 @@ from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.flats import Flats
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.choices import FEW_PHOTONS
 from recon.prep.correct import References
 from recon.prep.counts import Photons, photon_transfer

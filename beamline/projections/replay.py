@@ -20,8 +20,8 @@ from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
-from drivers.clock import Clock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import Clock
+from drivers.base.frame import Frame, FrameKind
 
 PREVIEW_BIN = 4
 BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals

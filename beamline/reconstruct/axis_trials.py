@@ -16,7 +16,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import check_axis, cone_of, geometry_of, rows_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.axis_sheet import AxisTrial, axis_sheet
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
 

@@ -18,7 +18,7 @@ from beamline.core.events import Event, Sink
 from beamline.core.files import named_on_failure, remove, whole_file
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.storage.writer_lock import WriterLock, held
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 RowState = Literal["waiting", "done", "poor", "failed"]
 

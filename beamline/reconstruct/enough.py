@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.storage.readers.base import ScanSource
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread

@@ -11,7 +11,7 @@ from beamline.projections.selection import cone_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.storage.writers.partial_volume import slabs_of_partial
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.slabs import slabs_of
 from recon.base.volume import Grid

@@ -31,7 +31,7 @@ from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.base.method import CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
 from recon.base.slabs import Slab
 from recon.base.volume import Grid

@@ -17,7 +17,7 @@ from beamline.reconstruct.recon_report import ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.writer_lock import held
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.base.views import parse_views
 from recon.warm_up import warm_up
 

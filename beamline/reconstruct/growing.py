@@ -32,8 +32,8 @@ from beamline.reconstruct.progress import corrections_done, progress_events
 from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
-from drivers.clock import Clock
-from drivers.frame import FrameKind
+from drivers.base.clock import Clock
+from drivers.base.frame import FrameKind
 from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty

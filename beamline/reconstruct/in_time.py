@@ -13,7 +13,7 @@ from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections
 from beamline.reconstruct.measure import residual_share
 from beamline.reconstruct.result import OutputPaths
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.volume import Grid
 from recon.methods import with_settings

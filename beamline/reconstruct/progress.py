@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
 from beamline.core.events import Event, Sink
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.base.method import Progress
 
 

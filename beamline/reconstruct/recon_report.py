@@ -26,7 +26,7 @@ from beamline.report.time_curves import quality_against_time
 from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.writers.recon_file import Value
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
 from recon.base.volume import Volume

@@ -28,7 +28,7 @@ from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.partial_volume import complete
 from beamline.storage.writers.recon_file import ReconRecord, Value
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.assess.lost_mass import compare
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name

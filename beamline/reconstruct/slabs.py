@@ -26,8 +26,8 @@ from beamline.reconstruct.slurm import is_slurm, slurm_jobs
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.partial_volume import slabs_of_partial
-from drivers.clock import Clock
-from drivers.frame import FrameKind
+from drivers.base.clock import Clock
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.method import DividedMethod, Method
 from recon.base.slabs import Slab, slabs_of

@@ -13,7 +13,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.report.live_picture import LivePicture
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.base.volume import Volume
 from recon.splatting.stream import StreamingFit
 

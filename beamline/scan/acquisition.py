@@ -17,10 +17,10 @@ from beamline.scan.exposures import Exposures, Taken
 from beamline.scan.ledger import LedgerError
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
-from drivers.clock import Clock
-from drivers.errors import DeviceError
-from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraSettings, Devices
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraSettings, Devices
 
 DOUBTFUL = 0.2  # steps by which an angle may be wrong, from which that is told
 

@@ -8,8 +8,8 @@ from types import TracebackType
 from typing import Self
 
 from beamline.core.events import Emit
-from drivers.errors import DeviceError
-from drivers.protocols import BeamMonitor, BeamReading
+from drivers.base.errors import DeviceError
+from drivers.base.protocols import BeamMonitor, BeamReading
 
 LAST_WAIT = 3.0
 """Longest wait in s for a reading in progress at the end of a scan."""

@@ -18,10 +18,10 @@ from beamline.scan.braking import Braking, booked, by_nothing, placing
 from beamline.scan.ledger import EXTRA, Account, DeliveredFrame, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceTimeout
-from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 
 SLICE = 0.5  # s: the longest wait for a frame before the stop request is looked at again
 POLL = 0.02  # s between looks at a moving stage

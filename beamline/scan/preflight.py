@@ -28,7 +28,7 @@ from beamline.plan.timeline import describe as describe_timeline
 from beamline.plan.timeline import work_out
 from beamline.scan.live_process import live_need
 from beamline.storage.writers.nxtomo import ScanInfo
-from drivers.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
+from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
 from recon.base.choices import AUTO
 from recon.methods import streams
 

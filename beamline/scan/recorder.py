@@ -31,7 +31,7 @@ from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
 from beamline.scan.references import ReferenceLog
 from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # at least and at most

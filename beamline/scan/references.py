@@ -8,7 +8,7 @@ from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.references import ReferenceFrame, ReferenceLimits, judge, photons
 from beamline.plan.plan import Block
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)

@@ -34,7 +34,7 @@ from beamline.storage.parts import (
 from beamline.storage.recover import Recovered, recover
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 _UNTOUCHED = "Nothing was changed."
 _IDENTITY = (  # facts about a device that stay the same from scan to scan and day to day

@@ -50,7 +50,7 @@ from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, Be
 from beamline.scan.watchdog import watched
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from drivers.manual import Ask
 
 SAFE = "Stage stopped, shutter closed; the last frames are being written"

@@ -14,7 +14,7 @@ from beamline.core.text import size
 from beamline.monitor.check import Flag, Level, Policy
 from beamline.plan.retake import Retake
 from beamline.scan.states import State, StateMachine
-from drivers.protocols import BeamReading
+from drivers.base.protocols import BeamReading
 
 CLOSING = 20_000_000  # bytes that a file may take to be closed, with its /exchange view
 PAUSE_POLL = 0.05  # real s between looks at a paused scan

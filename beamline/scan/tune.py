@@ -25,9 +25,9 @@ from beamline.monitor.references import FaultKind, ReferenceFrame, ReferenceLimi
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
-from drivers.errors import DeviceRefused
-from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
+from drivers.base.errors import DeviceRefused
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 
 F64 = NDArray[np.float64]
 

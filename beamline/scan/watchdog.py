@@ -30,7 +30,7 @@ from beamline.core.process import ChildProcess
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.instrument.connect import shutter_of
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 
 PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
 BETWEEN = 0.5  # s between attempts

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from beamline.report.figures import grey_window
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from simulators.effects.chain import Anomaly
 from simulators.scenes.expose import expose
 from simulators.scenes.shots import Scan

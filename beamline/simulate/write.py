@@ -20,8 +20,8 @@ from beamline.plan.limits import ROOM
 from beamline.simulate.labels import LabelledRun, LabelLog, labels_path, write_labels
 from beamline.simulate.scene_file import SceneFile
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import Clock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import Clock
+from drivers.base.frame import Frame, FrameKind
 from drivers.orca_quest import BITS
 from simulators.effects.anomaly import Label
 from simulators.scenes.expose import expose

@@ -14,7 +14,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said, source_findings
 from beamline.storage.volumes.files import volume_format
 from beamline.storage.writers.recon_file import ReconRecord
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:

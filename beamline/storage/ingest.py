@@ -25,7 +25,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 PER_FLUSH = 64  # rows
 

@@ -26,7 +26,7 @@ from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 JOINED = "joined.h5"
 """The file of all parts, in the folder of the run, where its first part is."""

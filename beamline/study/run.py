@@ -29,7 +29,7 @@ from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.geometry import Geometry
 from recon.base.method import Plain

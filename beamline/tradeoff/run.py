@@ -28,7 +28,7 @@ from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
 from beamline.tradeoff.varied import Depth
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting.initialise import default_count

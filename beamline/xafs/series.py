@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.events import Event, Sink
 from beamline.xafs.contrast import ContrastRegions, XafsCurve, contrast_of, curve_of
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 Reals = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ import math
 import re
 from typing import Protocol
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import BeamReading
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import BeamReading
 
 OVERFLOW = 9.9e37
 """SCPI instruments send 9.9e37 for "over range" and 9.91e37 for "not a number" (SCPI-99, section 7.2.1)."""
@@ -31,7 +31,7 @@ class TextSource(Protocol):
 
 
 class TextBeamMonitor:
-    """Implements `drivers.protocols.BeamMonitor` over a source of text.
+    """Implements `drivers.base.protocols.BeamMonitor` over a source of text.
 
     Args:
         pattern: regular expression, searched in the text; its first group is the number.

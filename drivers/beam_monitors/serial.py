@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.beam_monitors.reading import within_a_line
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
 from drivers.serial.line import Probe, SerialLine
 from drivers.serial.line_reader import Framing
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from drivers.base.errors import DeviceError
 from drivers.dcam.codes import Capability, CaptureMode, CaptureState, Error, Property, Text, error_name
 from drivers.dcam.structures import (
     ApiInit,
@@ -22,7 +23,6 @@ from drivers.dcam.structures import (
     WaitOpen,
     WaitStart,
 )
-from drivers.errors import DeviceError
 
 _TEXT_BYTES = 256
 _USUAL_ADVICE = "Check the camera's power and cable, switch it off and on, and try again"

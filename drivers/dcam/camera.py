@@ -6,7 +6,9 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from drivers.dcam import cooling
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import CaptureMode, CaptureState, Error, Property
@@ -17,9 +19,7 @@ from drivers.dcam.ring import START_TIMEOUT, Ring, require_stamps, seconds_of
 from drivers.dcam.session import Session, run_all
 from drivers.dcam.settings import apply_settings, apply_trigger_source, read_settings, read_timing
 from drivers.dcam.structures import BufFrame
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.frame_memory import FrameMemory
-from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 
 _WAIT_SLICE = 0.1  # s; short, since an event between looking and waiting is missed
 _LEAST_SLOTS = 16  # if memory allows: the camera may take more frames than asked for while the host is busy
@@ -27,7 +27,7 @@ _TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 
 
 class DcamCamera:
-    """A triggered Hamamatsu camera (ORCA-Quest); implements drivers.protocols.Camera.
+    """A triggered Hamamatsu camera (ORCA-Quest); implements drivers.base.protocols.Camera.
 
     Framestamps are counted by the camera, so a frame that is lost anywhere leaves a gap. An overrun of the ring is also
     an error, and `describe` returns how many frames were overwritten and how many losses the transport reported. Two

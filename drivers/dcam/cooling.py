@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.dcam.codes import Cooler, Property
 from drivers.dcam.properties import Properties
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 
 Progress = Callable[[float, str], None]
 """Called with the sensor's temperature in °C and the cooler's status."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
+from drivers.base.protocols import CameraSettings
 from drivers.dcam import codes
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import Cooler, Error, Property, Text
 from drivers.dcam.options import DcamOptions
 from drivers.dcam.properties import Properties
 from drivers.dcam.session import Session
-from drivers.protocols import CameraSettings
 
 _NOT_AVAILABLE = (Error.NOTSUPPORT, Error.NOTIMPLEMENT, Error.UNKNOWNSTRID, Error.INVALIDPARAM)
 _OPTIONAL = MappingProxyType(

@@ -7,12 +7,12 @@ import ctypes
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.dcam.abi import RUNTIME, Dcam
 from drivers.dcam.codes import CaptureMode, CaptureState
 from drivers.dcam.session import run_all
 from drivers.dcam.structures import BufFrame
-from drivers.errors import DeviceError, DeviceTimeout
 from drivers.frame_memory import FrameMemory
 
 START_TIMEOUT = 5.0

@@ -7,10 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from drivers import usb
+from drivers.base.errors import DeviceError
 from drivers.dcam import codes
 from drivers.dcam.abi import Dcam, DcamError
 from drivers.dcam.codes import DcamEvent, Error
-from drivers.errors import DeviceError
 
 
 class Session:

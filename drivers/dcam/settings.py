@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 from drivers.dcam import codes
 from drivers.dcam.codes import Property
 from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixels, TriggerActive, TriggerMode, TriggerPolarity
 from drivers.dcam.properties import Properties
-from drivers.errors import DeviceRefused
-from drivers.protocols import CameraSettings, CameraTiming, TriggerSource
 
 _TRIGGERS = MappingProxyType(
     {

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import serial
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, readable
 from drivers.serial.ports import open_port
 from drivers.serial.transcript import Transcript

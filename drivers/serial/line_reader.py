@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.serial.transcript import Transcript
 
 LONGEST_LINE = 1024

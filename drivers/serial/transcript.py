@@ -8,7 +8,7 @@ from collections import deque
 from io import FileIO
 from pathlib import Path
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 RECENT_LINES = 6
 """Lines that error messages quote."""

@@ -12,9 +12,9 @@ from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
+from drivers.base.protocols import RotationStage, StageLimits
 from drivers.flat import flat_fields
-from drivers.protocols import RotationStage, StageLimits
 
 FARTHEST = 1e9
 """rad."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.clock import Clock
-from drivers.protocols import StageLimits
+from drivers.base.clock import Clock
+from drivers.base.protocols import StageLimits
 
 POLL = 0.02
 """s between looks at a moving stage."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 
 
 class Stops:

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from fractions import Fraction
 
-from drivers.errors import DeviceRefused, DeviceTimeout
-from drivers.protocols import StageLimits, TriggerTrain
+from drivers.base.errors import DeviceRefused, DeviceTimeout
+from drivers.base.protocols import StageLimits, TriggerTrain
 
 ROUNDING = 1e-6
 """counts by which a spacing may be missed: floats give no better where speeds are written in degrees."""

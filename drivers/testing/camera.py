@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import Camera, CameraFrame, CameraSettings, TriggerSource
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import Camera, CameraFrame, CameraSettings, TriggerSource
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class CameraBench:
 
 
 class CameraConformance:
-    """Laws of drivers.protocols.Camera."""
+    """Laws of drivers.base.protocols.Camera."""
 
     @pytest.fixture
     def bench(self) -> CameraBench:

@@ -15,9 +15,9 @@ from dataclasses import replace
 import numpy as np
 
 from drivers import orca_quest
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.devices.camera_view import CameraView, Exposed
 from simulators.devices.shutter import BeamGate, SimulatedSampleMover
 from simulators.devices.trigger_line import TriggerLine
@@ -35,7 +35,7 @@ TOLERANCE = 1e-6
 
 
 class SimulatedOrcaQuest:
-    """Implements drivers.protocols.Camera.
+    """Implements drivers.base.protocols.Camera.
 
     External triggers come from `line`. One that comes earlier than the least period after the last accepted one is
     ignored without a word, as by the camera. An internally triggered camera runs at the least period and stops after

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from drivers import orca_quest
-from drivers.protocols import CameraSettings
+from drivers.base.protocols import CameraSettings
 from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION
 from simulators.frame.shot import AngleAt, Shot

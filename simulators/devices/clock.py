@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 VIRTUAL_START = 1_795_152_000.0  # s since the Unix epoch: a round moment (2026-11-20 05:20:00 UTC), so that runs repeat
 

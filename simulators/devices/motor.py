@@ -12,7 +12,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import IntFlag, StrEnum
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
 

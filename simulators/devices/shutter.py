@@ -13,7 +13,7 @@ class BeamGate(Protocol):
 
 
 class SimulatedShutter:
-    """Implements `drivers.protocols.Shutter`; it starts closed, as a beamline does."""
+    """Implements `drivers.base.protocols.Shutter`; it starts closed, as a beamline does."""
 
     by_hand = False
 
@@ -42,7 +42,7 @@ class WiredShutter:
 
 
 class SimulatedSampleMover:
-    """Implements `drivers.protocols.SampleMover`; it starts with the sample in the beam."""
+    """Implements `drivers.base.protocols.SampleMover`; it starts with the sample in the beam."""
 
     def __init__(self, name: str = "sample mover") -> None:
         self.name = name

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 
 @dataclass(frozen=True, order=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
 from simulators.frame.detector import Detector
 from simulators.frame.sensor import CONVERSION

@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping, Set
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 
 IDENTITY = "SIMULATED INSTRUMENTS INC.,MODEL 6485,0000001,A01"
 OVER_RANGE = 9.9e37

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol, Self
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from simulators.devices.trigger_line import TriggerLine
 
 

@@ -11,8 +11,8 @@ from beamline.core.stop import StopRequest
 from beamline.plan.plan import Timeline
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.supervision import Supervision
-from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraSettings, TriggerSource
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraSettings, TriggerSource
 from tests.beamline.fakes import COUNT, HOME, FakeInstrument, seen
 
 SETTLE = 0.05

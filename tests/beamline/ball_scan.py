@@ -9,7 +9,7 @@ from beamline.config.models import Config
 from beamline.instrument import connect as devices
 from beamline.plan.plan import Block
 from beamline.plan.timeline import passes
-from drivers.protocols import TriggerSource
+from drivers.base.protocols import TriggerSource
 
 # A ball off the axis and no effects: every frame is Beer-Lambert, so that its angle can be read off the picture.
 BALL = {

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from beamline.instrument.connect import ConnectedDevices
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.timeline import work_out
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.frame import Frame
-from drivers.protocols import (
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.frame import Frame
+from drivers.base.protocols import (
     CameraFrame,
     CameraSettings,
     CameraTiming,

@@ -13,7 +13,7 @@ from beamline.core.events import Event
 from beamline.core.stop import StopRequest
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, decode
 
 SMALL = (

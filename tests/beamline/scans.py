@@ -17,8 +17,8 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
 
 DARK, BEAM = 100.0, 20000.0

@@ -16,8 +16,8 @@ from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
 from recon.voxels.fdk import fdk
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
 from beamline.monitor.digest import FrameDigest, digest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from simulators.effects.anomaly import Label
 from simulators.effects.chain import AnyEffect, Chain
 from simulators.effects.floaters import Floaters

@@ -21,8 +21,8 @@ import pytest
 
 from beamline.monitor.digest import digest
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 
 pytestmark = [
     pytest.mark.bench,

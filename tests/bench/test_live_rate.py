@@ -30,8 +30,8 @@ from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 from recon.splatting import optimise
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up

@@ -17,7 +17,7 @@ from beamline.monitor import watch
 from beamline.monitor.check import ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, digest
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 from tests.beamline.monitor.blobs import COLS, ROWS, Blobs
 
 SHAPE, BIN = (2304, 4096), 8  # as in configs/instrument.yaml

@@ -16,7 +16,7 @@ import pytest
 
 from beamline.monitor import watch
 from beamline.monitor.check import Flag, Level, ScanContext
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from simulators.effects.jump import Jump
 from simulators.scenes.scene import Scene
 from simulators.scenes.shots import Scan

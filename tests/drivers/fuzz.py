@@ -13,8 +13,8 @@ from typing import TypeVar
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
 from simulators.wires.wire import Wire
 
 T = TypeVar("T")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from drivers.clock import Clock
-from drivers.protocols import Camera, CameraSettings, TriggerSource
+from drivers.base.clock import Clock
+from drivers.base.protocols import Camera, CameraSettings, TriggerSource
 from drivers.testing.camera import CameraBench
 
 SETTINGS = CameraSettings(exposure=0.01, trigger=TriggerSource.EXTERNAL, roi=(1120, 2008, 48, 64))

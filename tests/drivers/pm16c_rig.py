@@ -6,7 +6,7 @@ import itertools
 import math
 from typing import Any
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.testing.stages.bench import StageBench

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from drivers.base.protocols import SampleMover, Shutter
 from drivers.manual import ManualSampleMover, ManualShutter
-from drivers.protocols import SampleMover, Shutter
 
 
 def test_the_shutter_asks_for_each_change_and_not_again() -> None:

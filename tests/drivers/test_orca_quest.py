@@ -7,7 +7,7 @@ import re
 import pytest
 
 from drivers import orca_quest
-from drivers.protocols import CameraSettings, TriggerSource
+from drivers.base.protocols import CameraSettings, TriggerSource
 
 
 def _settings(**changes: object) -> CameraSettings:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import Shutter
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import Shutter
 from drivers.shutter import OutputShutter
 from simulators.devices.clock import VirtualClock
 

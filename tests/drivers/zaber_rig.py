@@ -6,7 +6,7 @@ import itertools
 import math
 from typing import Any
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.stage import ZaberStage
 from drivers.testing.stages.bench import StageBench

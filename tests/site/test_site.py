@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers import open as readers
 from beamline.testing import ReaderConformance
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.flat import from_flat
-from drivers.protocols import CameraSettings, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
 from drivers.testing.stages import Build, StageBench, StageConformance, StageKind
 from recon.testing import MethodConformance

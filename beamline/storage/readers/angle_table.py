@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import text_in
 from beamline.plan.angles import from_text
 from beamline.storage import hdf5
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
 Attributes = Mapping[str, str | float | int]
@@ -31,7 +31,7 @@ class ScanSource(Protocol):
         shape: (rows, cols) of a frame.
         dtype: of the pixels that read() returns.
         quantity: what a pixel is. "unknown" where the file does not say and the caller did not.
-        image_key: int32 [frame], values of drivers.frame.FrameKind.
+        image_key: int32 [frame], values of drivers.base.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
         exposures: float64 [frame] s, NaN where unknown.
         currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit.

@@ -12,7 +12,7 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.base import Opening, ScanFormat
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 PLACES = (
     (FrameKind.DARK, "/exchange/data_dark"),

@@ -31,7 +31,7 @@ from beamline.storage.readers.base import (
 )
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 
 class NXtomoSource(BaseSource):

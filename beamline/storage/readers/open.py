@@ -22,7 +22,7 @@ from beamline.storage.readers.parts_source import PartsSource
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeriesSource
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]

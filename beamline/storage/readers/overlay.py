@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.angle_table import assign
 from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, Quantity, ScanSource, frame_indices
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 
 class OverlaidSource(BaseSource):

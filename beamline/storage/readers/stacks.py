@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, frame_indices
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 _LISTED = 10  # datasets of a file that an error names
 

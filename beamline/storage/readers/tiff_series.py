@@ -24,7 +24,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refuse_volume
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
 MOST_FILES = 100_000

@@ -14,7 +14,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, appended, pages_one_by_one, refuse_volume
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 _MANY = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
 

@@ -18,7 +18,7 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.readers.base import Opening, ScanFormat
 from beamline.storage.readers.stacks import FrameStack, StacksSource
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 _SIGNATURE = bytes.fromhex("d0cf11e0a1b11ae1")
 _TYPES: dict[int, np.dtype[Any]] = {5: np.dtype("<u2"), 10: np.dtype("<f4")}

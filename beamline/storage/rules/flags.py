@@ -11,7 +11,7 @@ from beamline.storage.flag_legend import FrameFlags, counted
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.treatment import treatment_of
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 FEWEST_VIEWS = 10
 """Views without an alarm that a volume takes at least, where some have one: so few are a sketch of the sample."""

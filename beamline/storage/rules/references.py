@@ -14,7 +14,7 @@ from beamline.monitor.digest import block_means, digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 SAMPLES = 4  # frames of a group, and views, that are looked at
 BLOCK = 4  # pixels a side

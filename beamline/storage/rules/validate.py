@@ -25,7 +25,7 @@ from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_degrees
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]

@@ -18,7 +18,7 @@ from beamline.storage import hdf5
 from beamline.storage.journal import FileChange, FileChanges
 from beamline.storage.overlay import Overlay
 from beamline.storage.writers import layout
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 NAMES = {FrameKind.PROJECTION: "data", FrameKind.FLAT: "data_white", FrameKind.DARK: "data_dark"}
 THETA = {"data": "theta", "data_white": "theta_white", "data_dark": "theta_dark"}

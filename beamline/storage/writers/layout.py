@@ -43,7 +43,7 @@ from beamline.monitor.checks import ALARMS, CHECKS
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
@@ -156,7 +156,7 @@ class ScanInfo:
 
 @dataclass(frozen=True)
 class Record:
-    """What one row says about its frame beside the pixels; units as in drivers.frame.Frame (radians, s)."""
+    """What one row says about its frame beside the pixels; units as in drivers.base.frame.Frame (radians, s)."""
 
     kind: FrameKind
     angle: float

@@ -29,9 +29,9 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.to_disk import ToDisk
-from drivers.clock import Clock
-from drivers.frame import Frame
-from drivers.protocols import BeamReading
+from drivers.base.clock import Clock
+from drivers.base.frame import Frame
+from drivers.base.protocols import BeamReading
 
 __all__ = ["NXtomoWriter", "ScanInfo"]
 

@@ -9,8 +9,8 @@ import re
 import threading
 from fractions import Fraction
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line import Probe, SerialLine
 from drivers.serial.line_reader import Framing
 from drivers.stages.pi_gcs.errors import REFUSALS, advice, meaning
@@ -157,7 +157,7 @@ class GcsLine:
 
 
 class GcsOutput:
-    """Implements `drivers.protocols.DigitalOutput` on the line of a stage that is open.
+    """Implements `drivers.base.protocols.DigitalOutput` on the line of a stage that is open.
 
     `DIO?` tells the inputs [from memory: of GCS controllers in general], so that an output cannot be read back.
     """

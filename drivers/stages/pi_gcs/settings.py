@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from drivers.protocols import StageLimits
+from drivers.base.protocols import StageLimits
 from drivers.stages.pi_gcs.train import FirstPulse
 from drivers.stages.settings import StageFigures, Wiring, key
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from fractions import Fraction
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.pi_gcs.axis import STOP_ALL, AxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
@@ -25,8 +25,8 @@ from drivers.stages.travel import Travel
 
 
 class PiGcsStage:
-    """Implements `drivers.protocols.RotationStage`. Opening switches the servo on and the trigger line off; closing
-    leaves both, and a move under way, as they are.
+    """Implements `drivers.base.protocols.RotationStage`. Opening switches the servo on and the trigger line off.
+    Closing leaves both, and a move under way, as they are.
 
     `stop` returns when the stage stands, `abort` at once; it stands all axes of the controller. A train is ended by a
     move that would emit it a second time or turn back inside it.
@@ -101,7 +101,7 @@ class PiGcsStage:
             self._target = target
 
     def start_home(self) -> None:
-        """As `drivers.protocols.Motion` has it; soft limits do not hold on the way. A train that was armed is over."""
+        """As `drivers.base.protocols.Motion` has it; soft limits do not hold on the way. An armed train is over."""
         with self._begin("the reference move"):
             self._axis.standing("a reference move")
             self._train, self._target, self._homing = None, None, False

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
 
-from drivers.protocols import TriggerTrain
+from drivers.base.protocols import TriggerTrain
 
 PULLED_APART = Fraction(1, 10)
 """Of an interval: what the last pulse may be off where a controller tells its step rounded. Whether it also keeps it

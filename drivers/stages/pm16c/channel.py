@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.stages.pm16c.line import PM16CLine
 from drivers.stages.pm16c.train import TriggerPoints
 from drivers.stages.settings import Wiring

@@ -6,7 +6,7 @@ controller's panel. The speed is the selected one. A search that has found the s
 
 from __future__ import annotations
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 
 

@@ -10,8 +10,8 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
 from drivers.serial.line import Probe, SerialLine
 from drivers.stages.settings import Wiring
 

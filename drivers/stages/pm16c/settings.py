@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from drivers.protocols import StageLimits
+from drivers.base.protocols import StageLimits
 from drivers.stages.pm16c.train import FirstPulse, PulseWidths
 from drivers.stages.settings import StageFigures, Wiring, key
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 import math
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import DigitalOutput, StageLimits, StageStatus, TriggerTrain
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import DigitalOutput, StageLimits, StageStatus, TriggerTrain
 from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 from drivers.stages.pm16c.home import HomeSearch
 from drivers.stages.pm16c.settings import PM16CSettings
@@ -22,7 +22,7 @@ from drivers.stages.travel import Travel
 
 
 class PM16CStage:
-    """Implements `drivers.protocols.RotationStage`. Closing it leaves a move under way to end by itself.
+    """Implements `drivers.base.protocols.RotationStage`. Closing it leaves a move under way to end by itself.
 
     `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped raises, whoever
     stopped it: no thread takes it for arrived. Arming and disarming need a standing stage.
@@ -81,7 +81,7 @@ class PM16CStage:
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """As `drivers.protocols.Motion` has it; `wait` takes the later steps, and an armed train is disarmed."""
+        """As `drivers.base.protocols.Motion` has it; `wait` takes the later steps, and an armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,
@@ -95,7 +95,7 @@ class PM16CStage:
         self._target, self._search = self._home, search
 
     def status(self) -> StageStatus:
-        """As `drivers.protocols.Motion` has it; `homed` is None where the stage has no home switch."""
+        """As `drivers.base.protocols.Motion` has it; `homed` is None where the stage has no home switch."""
         status = self._channel.status()
         homed = None if self._home is None else self._channel.home() is not None
         return StageStatus(status.counts, status.moving, homed, status.ending)
@@ -176,7 +176,7 @@ class PM16CStage:
         return self._channel.emergency_stop() if hard else self._channel.slow_stop()
 
     def digital_output(self, number: int) -> DigitalOutput:
-        """As `drivers.protocols.RotationStage` has it: the controller has none that can be set."""
+        """As `drivers.base.protocols.RotationStage` has it: the controller has none that can be set."""
         raise DeviceRefused(
             self.name,
             f"the controller has no digital output {number} to set",

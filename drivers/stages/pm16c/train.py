@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drivers.protocols import StageLimits, TriggerTrain
+from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.travel import counts_in
 
 MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}

@@ -10,8 +10,8 @@ import itertools
 import re
 from dataclasses import dataclass
 
-from drivers.clock import Clock
-from drivers.errors import DeviceRefused
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceRefused
 from drivers.serial.line import Probe, SerialLine
 from drivers.stages.zaber.packet import (
     REASONS,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.errors import DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.stages.zaber.axis import ZaberAxis
 from drivers.stages.zaber.train import PulseSettings, has_started, remaining, set_up
 
@@ -89,7 +89,7 @@ def _nowhere(counts: int) -> None:
 
 
 class ZaberOutput:
-    """A digital output of a device whose stage is open. Implements `drivers.protocols.DigitalOutput`."""
+    """A digital output of a device whose stage is open. Implements `drivers.base.protocols.DigitalOutput`."""
 
     def __init__(self, axis: ZaberAxis, number: int, name: str) -> None:
         self.name = name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from drivers.protocols import StageLimits
+from drivers.base.protocols import StageLimits
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.zaber.train import PulseSettings, TriggerUse
 

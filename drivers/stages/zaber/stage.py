@@ -10,9 +10,9 @@ import contextlib
 import math
 from dataclasses import replace
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel
@@ -26,8 +26,8 @@ STANDING_IN_PLACE = 10.0
 
 
 class ZaberStage:
-    """Implements `drivers.protocols.RotationStage`. Closing it leaves a move under way to end by itself, takes an armed
-    train away and leaves speed, acceleration and checksums as they were found.
+    """Implements `drivers.base.protocols.RotationStage`. Closing it leaves a move under way to end by itself, takes an
+    armed train away and leaves speed, acceleration and checksums as they were found.
 
     `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
     move against a train under way ends the train: the controller counts distance both ways. Where triggers are not

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from drivers.protocols import TriggerTrain
+from drivers.base.protocols import TriggerTrain
 from drivers.stages.settings import key
 
 SHORTEST = 1e-3

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.clock import Clock
-from drivers.protocols import Motion, RotationStage, TriggerTrain
+from drivers.base.clock import Clock
+from drivers.base.protocols import Motion, RotationStage, TriggerTrain
 
 SPEED = math.radians(10)
 LONG = 60.0

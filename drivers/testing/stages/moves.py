@@ -6,12 +6,12 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind, start_move_by
 
 
 class Moves:
-    """Laws of drivers.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
+    """Laws of drivers.base.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
 
     def test_it_says_who_it_is(self, bench: StageBench) -> None:
         assert bench.stage.name

@@ -6,13 +6,13 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED, Build, StageBench, StageKind
 
 
 class Pulses:
-    """Laws of drivers.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
+    """Laws of drivers.base.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
 
     @pytest.mark.parametrize("sign", [1, -1])
     def test_at_a_speed_that_is_low_enough_pulses_come_at_each_of_the_smallest_intervals(

@@ -6,12 +6,12 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
 
 
 class Reference:
-    """Laws of drivers.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
+    """Laws of drivers.base.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
 
     def test_a_search_ends_at_the_same_place_from_either_side(self, kind: StageKind, bench: StageBench) -> None:
         if not kind.homes:

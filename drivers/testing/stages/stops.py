@@ -7,12 +7,12 @@ import threading
 
 import pytest
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
 
 
 class Stops:
-    """Laws of drivers.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
+    """Laws of drivers.base.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
 
     def test_its_status_tells_a_stop_until_the_next_move(self, kind: StageKind, bench: StageBench) -> None:
         if not kind.stops_are_told:

@@ -8,13 +8,13 @@ from contextlib import nullcontext
 
 import pytest
 
-from drivers.errors import DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
 
 
 class Trains:
-    """Laws of drivers.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
+    """Laws of drivers.base.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
 
     @pytest.mark.parametrize(("first", "step", "n"), [(2.0, 0.5, 37), (-1.0, -0.25, 9), (1.0, 0.1, 1), (-1.0, -0.1, 1)])
     def test_a_train_gives_exactly_its_pulses_at_its_angles(

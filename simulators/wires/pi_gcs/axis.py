@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.output import Firmware, Output, WiredOutput

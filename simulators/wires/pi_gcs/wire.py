@@ -14,7 +14,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from typing import Self
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.axis import AxisBuild, GcsAxis, GcsError

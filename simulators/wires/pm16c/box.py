@@ -11,7 +11,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import IntFlag
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from simulators.devices.motor import Output, PulseMotor, TriggerSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.home import HomeSwitch

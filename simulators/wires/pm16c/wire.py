@@ -12,7 +12,7 @@ from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from typing import Self, TypeVar
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.train import FirstPulse
 from simulators.devices.trigger_line import TriggerLine

@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.wires.zaber.axis import AxisBuild, Rejected, ZaberAxis
 from simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in

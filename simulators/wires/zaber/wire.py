@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Self
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.zaber.axis import AxisBuild, Rejected

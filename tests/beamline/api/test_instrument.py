@@ -16,7 +16,7 @@ from beamline import api
 from beamline.config.load import config_folder
 from beamline.scan.live_process import Commands
 from beamline.storage.readers.open import open_scan
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 from tests.beamline.fakes import FakeInstrument, Faults
 
 SIMULATED = config_folder() / "simulated.yaml"

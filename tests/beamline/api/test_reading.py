@@ -22,7 +22,7 @@ from beamline.core.events import Event
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers import layout
 from beamline.storage.writers.recon_file import ReconRecord
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.cli.small_scan import SCAN, beamline
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran

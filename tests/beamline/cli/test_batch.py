@@ -17,7 +17,7 @@ from beamline.reconstruct import batch
 from beamline.reconstruct.batch import BatchOptions, BatchRow, Worker, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange
 

@@ -16,7 +16,7 @@ from beamline.cli.main import main
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)

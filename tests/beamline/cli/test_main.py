@@ -20,7 +20,7 @@ from click.testing import CliRunner
 from beamline.cli import main as module
 from beamline.core import errors
 from beamline.core.errors import leave_traceback, user_message
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceTimeout
 
 
 def _raiser(error: BaseException) -> Callable[[], None]:

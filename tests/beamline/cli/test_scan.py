@@ -18,7 +18,7 @@ from beamline.cli.main import main
 from beamline.config.load import config_folder
 from beamline.scan import run as run_module
 from beamline.storage.readers.open import open_scan
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 from drivers.manual import Ask, ManualShutter
 from tests.beamline.fakes import FakeInstrument, Faults
 

@@ -21,7 +21,7 @@ from beamline.simulate import figure, write
 from beamline.simulate.labels import read_labels
 from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.storage.readers.open import open_scan
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from simulators.frame.shot import CannotExposeError

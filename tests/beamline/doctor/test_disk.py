@@ -20,7 +20,7 @@ from beamline.doctor import disk
 from beamline.doctor.check import Grade
 from beamline.doctor.examine import memory
 from beamline.doctor.needs import ScanNeeds
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from simulators.devices.clock import VirtualClock
 
 MB, GB = 1_000_000, 1_000_000_000

@@ -13,8 +13,8 @@ from beamline.core.errors import DataError
 from beamline.doctor import rate
 from beamline.doctor.rate import FEWEST, REFERENCES, RING, STAGES, Load, rates, summary
 from beamline.scan.recorder import Recorder
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 
 LOAD = Load((24, 40), preview_bin=4, flush_every=16)
 

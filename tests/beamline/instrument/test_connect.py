@@ -12,10 +12,10 @@ from beamline.config import load as config
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
+from drivers.base.errors import DeviceError
+from drivers.base.protocols import TriggerSource
 from drivers.dcam.options import DcamOptions
-from drivers.errors import DeviceError
 from drivers.manual import ManualSampleMover, ManualShutter
-from drivers.protocols import TriggerSource
 from tests.beamline.ball_scan import STAGES, shipped, small
 from tests.beamline.closable import Closable
 

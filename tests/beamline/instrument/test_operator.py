@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from beamline.instrument.operator import ask_operator
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 
 
 def test_asking_needs_somebody(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

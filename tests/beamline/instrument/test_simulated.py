@@ -13,8 +13,8 @@ from beamline.instrument import connect as devices
 from beamline.instrument.simulated import clock_of
 from beamline.plan.timeline import block_seconds
 from beamline.scan.preflight import dry_run
-from drivers.clock import SystemClock
-from drivers.protocols import TriggerSource
+from drivers.base.clock import SystemClock
+from drivers.base.protocols import TriggerSource
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from simulators.devices.clock import ScaledClock, VirtualClock

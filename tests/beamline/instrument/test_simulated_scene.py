@@ -23,7 +23,7 @@ from beamline.scan.run import run_scan
 from beamline.simulate.labels import read_labels
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
 from recon.voxels.fdk import fdk
 from tests.beamline.ball_scan import BALL, shipped

@@ -10,7 +10,7 @@ import pytest
 
 from beamline.instrument import connect as devices
 from beamline.scan.preflight import dry_run
-from drivers.errors import DeviceRefused
+from drivers.base.errors import DeviceRefused
 from tests.beamline.ball_scan import COMMON, STAGES, small
 
 

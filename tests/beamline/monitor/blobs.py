@@ -12,7 +12,7 @@ from beamline.monitor import watch
 from beamline.monitor.check import Check, Flag, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 ROWS, COLS, BLOCK = 32, 128, 4
 OPEN, DARK, NOISE = 20_000.0, 100.0, 0.004  # counts, counts, relative noise of a block in the open beam

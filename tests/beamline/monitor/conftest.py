@@ -13,7 +13,7 @@ from beamline.monitor import watch as scan
 from beamline.monitor.check import Check, Flag, ScanContext
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 ROWS, COLS = 64, 96
 OFFSET, PHOTONS = 200.0, 3000.0

@@ -9,7 +9,7 @@ from beamline.monitor import watch
 from beamline.monitor.aside import Aside
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 from tests.beamline.monitor.conftest import COLS, ROWS
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from beamline.monitor.check import Flag, Level
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 
 def only(flags: list[Flag]) -> list[Flag]:

@@ -13,7 +13,7 @@ from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.digest import digest as frame_digest
 from beamline.monitor.view import grid_of, view_of
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.blobs import STEP, Blobs
 
 

@@ -15,7 +15,7 @@ from beamline.monitor import watch
 from beamline.monitor.blur import FAR, STRIP, BlurCheck, sharpness
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.digest import digest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 ROWS, COLS, STEP = 48, 128, np.radians(0.5)
 OPEN, DARK = 20_000.0, 100.0

@@ -11,7 +11,7 @@ import pytest
 from beamline.monitor.check import Flag, Level, ScanContext
 from beamline.monitor.dark import DarkCheck
 from beamline.monitor.digest import digest
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 
 def only(flags: list[Flag]) -> list[Flag]:

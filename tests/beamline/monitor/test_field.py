@@ -9,7 +9,7 @@ import pytest
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.field import FieldOfViewCheck
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.monitor.blobs import BLOCK, COLS, ROWS, Blobs
 from tests.beamline.monitor.conftest import COLS as FAKE_COLS
 from tests.beamline.monitor.conftest import ROWS as FAKE_ROWS

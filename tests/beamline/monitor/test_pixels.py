@@ -10,7 +10,7 @@ import pytest
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.pixels import PixelsCheck
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 
 def only(fake: Any, frames: list[Frame]) -> list[Flag]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.monitor.digest import digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 SHAPE = (64, 80)
 OFFSET, READ, GAIN = 100.0, 3.0, 2.0  # counts, counts, counts a photon

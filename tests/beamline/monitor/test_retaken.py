@@ -10,7 +10,7 @@ import pytest
 
 from beamline.monitor.check import Level
 from beamline.monitor.watch import usual_step
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.conftest import STEP
 
 FIRST = 10  # the row of view 0

@@ -13,7 +13,7 @@ from beamline.monitor.check import Flag, Level, Look, ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.stuck import StuckCheck
 from beamline.monitor.timing import TimingCheck
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 CONTEXT = ScanContext(saturation=65535, pixels=100)
 

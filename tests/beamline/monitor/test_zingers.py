@@ -12,7 +12,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.digest import digest
 from beamline.monitor.spots import Spots, spots_of
 from beamline.monitor.zingers import VIEWS, ZingersCheck
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 SATURATION, BIN = 65535, 4
 

@@ -13,7 +13,7 @@ from beamline.page.recording import Recording
 from beamline.page.tiles import TileRegion
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()

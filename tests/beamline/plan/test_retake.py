@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from beamline.plan.plan import Mode
 from beamline.plan.retake import Retake, middle_of_exposure, retake_block, spread
 from beamline.plan.timeline import work_out
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument
 
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan, Timeline
 from beamline.plan.timeline import block_seconds, describe, move_seconds, passes, taxi_angle, work_out
-from drivers.errors import DeviceRefused
-from drivers.frame import FrameKind
-from drivers.protocols import CameraTiming, StageLimits
+from drivers.base.errors import DeviceRefused
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraTiming, StageLimits
 from drivers.stages.travel import Travel
 
 DEG = math.pi / 180

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from beamline.plan import angles
 from beamline.plan.triggers import Scale, plan_flight
-from drivers.protocols import TriggerTrain
+from drivers.base.protocols import TriggerTrain
 
 COUNTS = st.sampled_from([7200, 36_000, 360_000, 1_048_576])
 

@@ -13,7 +13,7 @@ from beamline.projections.steps.air import Air
 from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.validate import source_findings
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 

@@ -17,7 +17,7 @@ from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.step import PrepStep
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers import layout
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders()

@@ -18,7 +18,7 @@ from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.flags import FEWEST_VIEWS
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))

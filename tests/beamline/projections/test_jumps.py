@@ -19,8 +19,8 @@ from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 from tests.recon.voxels.balls import ball_views
 
 SHAPE = (8, 48)

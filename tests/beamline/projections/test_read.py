@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from beamline.projections.read import read_binned, read_references
 from beamline.projections.selection import Selection
 from beamline.storage.rules.references import ReferenceGroups, groups_of
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 
 

@@ -17,8 +17,8 @@ from beamline.projections import replay as module
 from beamline.projections.replay import by_kind, context_of, counts_of, judged_flags, replay
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran

@@ -20,7 +20,7 @@ from beamline.projections.rendered import rendered
 from beamline.projections.replay import replay
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 DIAMOND = "diamond_24737_parallel_91x135x160.h5"
 TOOTH = "aps2bm_tooth_181x2x640.h5"

@@ -21,7 +21,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.assess.plans import CURVES, PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry

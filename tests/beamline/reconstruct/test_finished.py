@@ -27,7 +27,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import read_checkpoint
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel

@@ -38,7 +38,7 @@ from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.method import Progress

@@ -25,8 +25,8 @@ from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
-from drivers.clock import Clock, SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import Clock, SystemClock
+from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
 from recon.splatting.r2 import R2
 from tests.beamline.reconstruct.test_follow import INTERLACED, RHYTHM, SCAN, ScanClock, StandingClock

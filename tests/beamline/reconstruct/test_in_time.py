@@ -21,7 +21,7 @@ from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.open import SourceOptions
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.prep.correct import Projections
 from recon.splatting.r2 import R2

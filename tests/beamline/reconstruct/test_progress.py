@@ -9,7 +9,7 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.reconstruct.progress import progress_events
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.method import Progress
 
 

@@ -17,7 +17,7 @@ from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts
 from beamline.reconstruct.result import OutputPaths, write_result
 from beamline.report import figures
 from beamline.storage.readers.open import SourceOptions
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from beamline.core.errors import InstrumentError
 from beamline.plan.plan import Mode, Place
 from beamline.scan.ledger import LedgerError
-from drivers.frame import FrameKind
-from drivers.protocols import CameraTiming
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraTiming
 from tests.beamline.acquired import Run, assert_safe, assert_true_angles
 from tests.beamline.fakes import COUNT, Camera, FakeInstrument, Faults
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from beamline.core.errors import InstrumentError
 from beamline.plan.plan import Place
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceTimeout
 from tests.beamline.acquired import Run, assert_safe
 from tests.beamline.fakes import HOME, FakeInstrument, Faults
 

@@ -16,9 +16,9 @@ from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.states import State, StateMachine
 from beamline.scan.supervision import BacklogGuard, Supervision, Workload
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraFrame
 from drivers.manual import ManualShutter
-from drivers.protocols import CameraFrame
 from tests.beamline.acquired import Run, assert_safe, assert_true_angles
 from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults
 

@@ -15,8 +15,8 @@ from beamline.plan.plan import FieldPlan, Mode, Place, ScanPlan
 from beamline.plan.timeline import work_out
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.ledger import LedgerError
-from drivers.frame import Frame, FrameKind
-from drivers.protocols import CameraSettings, Devices, TriggerSource
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraSettings, Devices, TriggerSource
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures

@@ -12,8 +12,8 @@ from beamline.core.errors import DataError, InstrumentError
 from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.ledger import LedgerError
-from drivers.errors import DeviceError
-from drivers.frame import FrameKind
+from drivers.base.errors import DeviceError
+from drivers.base.frame import FrameKind
 from tests.beamline.acquired import assert_safe, assert_true_angles
 from tests.beamline.fakes import Faults
 from tests.beamline.scan.test_acquisition_paused import FIRST, Paused

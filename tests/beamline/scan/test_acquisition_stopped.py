@@ -11,8 +11,8 @@ from beamline.core.errors import ScanStopped
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.acquisition import Acquisition
-from drivers.frame import FrameKind
-from drivers.protocols import CameraSettings, TriggerSource
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraSettings, TriggerSource
 from tests.beamline.acquired import Run, assert_safe, assert_true_angles
 from tests.beamline.fakes import COUNT, HOME, FakeInstrument, Faults
 

@@ -17,8 +17,8 @@ from beamline.scan import beam_log
 from beamline.scan.beam_log import BeamLog
 from beamline.scan.run import run_scan
 from beamline.storage.writers.layout import BEAM
-from drivers.errors import DeviceError, DeviceTimeout
-from drivers.protocols import BeamReading
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.protocols import BeamReading
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import small
 

@@ -19,7 +19,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, decode
 from tests.beamline.ran import small
 

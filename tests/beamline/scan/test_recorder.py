@@ -19,7 +19,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.watch import start
 from beamline.scan import recorder as module
 from beamline.scan.recorder import Recorder
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument
 
 TIMELINE = FakeInstrument().timeline()

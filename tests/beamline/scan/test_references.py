@@ -17,7 +17,7 @@ from beamline.scan.references import ReferenceLog
 from beamline.scan.run import State, run_scan
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline import fakes
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran

@@ -37,7 +37,7 @@ from beamline.storage.rules.validate import validate
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran, small
 

@@ -29,8 +29,8 @@ from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.errors import DeviceError
-from drivers.frame import FrameKind
+from drivers.base.errors import DeviceError
+from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import small
 

@@ -34,8 +34,8 @@ from beamline.scan.run import run_scan
 from beamline.scan.states import State
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.errors import DeviceError
-from drivers.frame import Frame, FrameKind
+from drivers.base.errors import DeviceError
+from drivers.base.frame import Frame, FrameKind
 from drivers.frame_memory import FrameMemory
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults
 from tests.beamline.ran import SMALL, Ran, small

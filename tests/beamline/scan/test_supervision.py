@@ -31,8 +31,8 @@ from beamline.scan.supervision import (
 )
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.frame import Frame, FrameKind
-from drivers.protocols import BeamReading
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import BeamReading
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
 

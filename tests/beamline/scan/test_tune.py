@@ -14,7 +14,7 @@ from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
 from beamline.monitor.references import ReferenceLimits
 from beamline.scan.tune import TARGET, evaluate, tune
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from simulators.frame.sensor import CONVERSION, OFFSET
 from tests.beamline.acquired import assert_safe
 from tests.beamline.fakes import FakeInstrument, Faults

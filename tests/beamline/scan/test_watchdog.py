@@ -19,7 +19,7 @@ from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan import watchdog
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from beamline.scan.watchdog import BETWEEN, FROZEN, inhibited, until_dead, watched
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.registry import WIRES
@@ -35,7 +35,7 @@ from beamline.config.load import load
 from beamline.instrument.connect import shutter_of, stage_alone
 from beamline.scan import watchdog
 from beamline.scan.watchdog import watched
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 if len(sys.argv) > 2:
     watchdog.COMMAND = (sys.executable, "-c", sys.argv[2])
 folder, by_hand = Path(sys.argv[1]), []

@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError
 from beamline.simulate.energy_scan import open_energy_scan
 from beamline.xafs.edge import find_edge
 from beamline.xafs.series import run_series
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from simulators.light.palette import palette_of
 
 SCENE: dict[str, Any] = {

@@ -16,7 +16,7 @@ from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.simulate.truth import binning_of, truth_of
 from beamline.simulate.write import write_scan
 from beamline.storage.readers.open import open_scan
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
 from recon.voxels.fdk import fdk

@@ -11,7 +11,7 @@ import pytest
 
 from beamline.monitor.digest import digest
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 SHAPE = (12, 16)
 EPOCH = 1.8e9  # s; a day in January 2027

@@ -33,8 +33,8 @@ from beamline.storage.recover import QUIET, recover
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.clock import SystemClock
-from drivers.frame import FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import FrameKind
 from tests.beamline.storage.conftest import INFO, scan_frames
 
 LAST = 100

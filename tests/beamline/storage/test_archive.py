@@ -25,8 +25,8 @@ from beamline.storage.recover import recover
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(64, 40))

@@ -22,8 +22,8 @@ from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.frame import FrameKind
-from drivers.protocols import BeamReading
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import BeamReading
 from recon.base.volume import Grid
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran

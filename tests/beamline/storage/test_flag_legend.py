@@ -21,7 +21,7 @@ from beamline.storage.flag_legend import LEGEND, FlagBit, FrameFlags, counted, m
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import StandingClock
 
 NAMES = [check.name for check in CHECKS]

@@ -15,8 +15,8 @@ from beamline.monitor.digest import digest
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import NotReadyError, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.clock import SystemClock
-from drivers.frame import Frame
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame
 from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock, scan_frames
 
 

@@ -17,7 +17,7 @@ from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 SHAPE = (24, 32)
 N = 9

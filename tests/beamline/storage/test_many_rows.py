@@ -7,8 +7,8 @@ import numpy as np
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 
 N = 1100  # two chunks and a bit
 COUNTS = np.arange(8, dtype=np.uint16).reshape(2, 4)

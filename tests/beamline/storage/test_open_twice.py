@@ -16,8 +16,8 @@ from beamline import api
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import ScanSource, open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 
 N, FIRST = 600, 100  # rows: more than a chunk of 512
 COUNTS = np.arange(8, dtype=np.uint16).reshape(2, 4)

@@ -20,7 +20,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import recover
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal
 
 Write = Callable[[list[Frame]], Path]

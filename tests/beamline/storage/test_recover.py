@@ -25,7 +25,7 @@ from beamline.storage.superblock import superblock
 from beamline.storage.writer_lock import held
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
 
 

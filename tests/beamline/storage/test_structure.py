@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage import structure
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.readers.open import open_scan
-from drivers.frame import Frame
+from drivers.base.frame import Frame
 
 PIPES = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
 

@@ -23,7 +23,7 @@ from beamline.tradeoff.report import text
 from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from beamline.tradeoff.table import TIME
 from beamline.tradeoff.trials import Outcome, Trial
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.scans import TwoCylinders, write_exchange

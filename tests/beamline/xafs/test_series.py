@@ -7,7 +7,7 @@ import numpy as np
 from beamline.core.events import Event
 from beamline.xafs.contrast import ContrastRegions
 from beamline.xafs.series import Series, run_series
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 
 REGIONS = ContrastRegions(np.ones((4, 5), dtype=np.bool_))
 FRAMES = [(8.0 + 0.1 * k, np.full((4, 5), float(k))) for k in range(6)]

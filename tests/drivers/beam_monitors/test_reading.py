@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.base.clock import SystemClock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import BeamMonitor, BeamReading
 from drivers.beam_monitors.page import PageSource
 from drivers.beam_monitors.reading import TextBeamMonitor
-from drivers.clock import SystemClock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import BeamMonitor, BeamReading
 from simulators.devices.clock import VirtualClock
 
 RING = "Ring current: ([-+0-9.eE]+) mA"

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import BeamMonitor
 from drivers.beam_monitors.reading import TextBeamMonitor
 from drivers.beam_monitors.serial import PATTERN, SerialSource
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import BeamMonitor
 from simulators.devices.clock import VirtualClock
 from simulators.wires.electrometer import OVER_RANGE, ElectrometerWire
 from simulators.wires.serial_url import register

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.camera import DcamCamera
-from drivers.protocols import CameraSettings, TriggerSource
 from tests.drivers.dcam.fake import READY_MADE, World, build
 
 

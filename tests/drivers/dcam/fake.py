@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
 from simulators.devices.trigger_line import TriggerLine

@@ -13,9 +13,9 @@ from typing import Self
 from uuid import uuid4
 
 from beamline.instrument.connect import ConnectedDevices
+from drivers.base.protocols import Devices
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.options import DcamOptions
-from drivers.protocols import Devices
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageFigures

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from drivers.base.errors import DeviceError
 from drivers.dcam import abi, codes, structures
-from drivers.errors import DeviceError
 from tests.drivers.dcam.fake import compiler
 
 STRUCTURES = {

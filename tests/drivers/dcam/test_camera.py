@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import Camera, CameraSettings, TriggerSource
 from drivers.dcam.abi import DcamError
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error
 from drivers.dcam.options import DcamOptions
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import Camera, CameraSettings, TriggerSource
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
 FRAME_BYTES = 48 * 72 * 2

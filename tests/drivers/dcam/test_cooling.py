@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Cooler, Property
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
 from tests.drivers.dcam.fake import World
 
 TARGET = -20.0

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import CameraSettings, TriggerSource
 from tests.drivers.dcam.fake import World
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL, roi=(8, 12, 16, 20))

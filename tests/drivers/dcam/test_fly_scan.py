@@ -16,10 +16,10 @@ from beamline.scan import recorder
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource, TriggerTrain
 from drivers.dcam.options import DcamOptions, TriggerPolarity
-from drivers.errors import DeviceError, DeviceTimeout
-from drivers.frame import FrameKind
-from drivers.protocols import CameraFrame, CameraSettings, TriggerSource, TriggerTrain
 from tests.drivers.dcam.fly_rig import COUNTS, SENSOR, FlyRig
 
 EXTERNAL = CameraSettings(0.002, TriggerSource.EXTERNAL)

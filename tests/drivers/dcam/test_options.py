@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error, Property
 from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixels, TriggerActive, TriggerMode, TriggerPolarity
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import CameraSettings, TriggerSource
 from tests.drivers.dcam.fake import World
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)

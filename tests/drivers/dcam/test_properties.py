@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from drivers import orca_quest
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.abi import DcamError
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Property
-from drivers.errors import DeviceRefused
-from drivers.protocols import CameraSettings, TriggerSource
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
 

@@ -8,9 +8,9 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.protocols import CameraFrame, CameraSettings, TriggerSource
 from drivers.dcam.options import DcamOptions
-from drivers.errors import DeviceError, DeviceTimeout
-from drivers.protocols import CameraFrame, CameraSettings, TriggerSource
 from tests.drivers.dcam.fake import World
 
 ROI = (8, 12, 4, 8)

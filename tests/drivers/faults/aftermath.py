@@ -6,8 +6,8 @@ from pathlib import Path
 
 from beamline.scan.run import SAFE, UNSAFE
 from beamline.scan.states import State
-from drivers.errors import DeviceError
-from drivers.frame import FrameKind
+from drivers.base.errors import DeviceError
+from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, VIEWS, Rig, Scanned
 
 PARTS = ("device", "problem", "request", "expected", "advice", "state")

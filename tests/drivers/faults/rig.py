@@ -31,8 +31,8 @@ from beamline.scan.control import verbs_taken
 from beamline.scan.recorder import Recorder
 from beamline.scan.run import RunResult, run_scan
 from beamline.storage.readers.open import open_scan
-from drivers.clock import Clock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import Clock
+from drivers.base.frame import Frame, FrameKind
 from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from beamline.core.errors import ConfigError
 from beamline.scan.ledger import LedgerError
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Phase, Rig
 
 FIRST_VIEW = DARKS + FLATS

@@ -12,7 +12,7 @@ import pytest
 
 from beamline.core.errors import ScanStopped
 from beamline.core.stop import StopRequest
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FIRST, FLATS, KINDS, STEP, Rig, Scanned
 
 RigOf = Callable[[str], Rig]

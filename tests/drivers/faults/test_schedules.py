@@ -20,8 +20,8 @@ from beamline.scan.run import SAFE, UNSAFE
 from beamline.scan.states import State
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.rules.validate import validate
-from drivers.errors import DeviceError
-from drivers.frame import FrameKind
+from drivers.base.errors import DeviceError
+from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Rig, Scanned
 
 RigOf = Callable[[str], Rig]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from beamline.scan.ledger import LedgerError
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.drivers.faults import table
 from tests.drivers.faults.aftermath import (
     assert_at_rest,

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.serial.line import Probe, SerialLine
 from drivers.serial.line_reader import LONGEST_REPLY, Framing
 from simulators.devices.clock import VirtualClock

@@ -11,8 +11,8 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import SystemClock
-from drivers.errors import DeviceError, DeviceTimeout
+from drivers.base.clock import SystemClock
+from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.serial.line import Probe, SerialLine
 from drivers.serial.transcript import RECENT_LINES
 from simulators.devices.clock import VirtualClock

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 import serial
 
-from drivers.clock import SystemClock
-from drivers.errors import DeviceError, DeviceRefused
+from drivers.base.clock import SystemClock
+from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.serial.line import Probe, SerialLine
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register

@@ -7,7 +7,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 from drivers.serial.line import QUIET, Probe, SerialLine
 from drivers.serial.line_reader import Framing
 from simulators.devices.clock import VirtualClock

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.errors import DeviceError
-from drivers.protocols import RotationStage, StageStatus, TriggerTrain
+from drivers.base.errors import DeviceError
+from drivers.base.protocols import RotationStage, StageStatus, TriggerTrain
 from simulators.wires.serial_url import register
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed
 from tests.drivers.stages.rigs import NAMES, AnyRig

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from drivers.clock import Clock
+from drivers.base.clock import Clock
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
 from drivers.testing.stages.bench import StageBench

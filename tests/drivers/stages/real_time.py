@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 from drivers.stages.pi_gcs.stage import PiGcsStage
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.settings import StageDriver

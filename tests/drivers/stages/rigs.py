@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import pytest
 
-from drivers.protocols import RotationStage
+from drivers.base.protocols import RotationStage
 from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine

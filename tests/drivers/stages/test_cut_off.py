@@ -7,7 +7,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from drivers.errors import DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.serial_url import register
 from tests.drivers.stages.rigs import NAMES, RIGS, AnyRig, RigOf, every_stage

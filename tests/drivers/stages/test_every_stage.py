@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED, start_move_by
 from tests.drivers.stages.rigs import RIGS, RigOf, every_stage
 from tests.simulators.wires.transports import serve_pty

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import serial
 
-from drivers.clock import SystemClock
-from drivers.errors import DeviceError
+from drivers.base.clock import SystemClock
+from drivers.base.errors import DeviceError
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
 from drivers.testing.stages.bench import start_move_by

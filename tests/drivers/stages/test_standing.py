@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.protocols import StageLimits
+from drivers.base.protocols import StageLimits
 from drivers.stages.standing import POLL, STOP_MARGIN, longest_stop, until_standing
 from simulators.devices.clock import VirtualClock
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import DeviceError
+from drivers.base.errors import DeviceError
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.serial_url import register
 from tests.drivers.stages.rigs import NAMES, AnyRig, RigOf, every_stage

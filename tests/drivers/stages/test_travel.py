@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceRefused
-from drivers.protocols import StageLimits, TriggerTrain
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.settings import StageFigures
 from drivers.stages.travel import Travel, least_interval
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.clock import Clock, SystemClock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import Camera, CameraFrame, TriggerSource
+from drivers.base.clock import Clock, SystemClock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import Camera, CameraFrame, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
 from simulators.devices.camera import SimulatedOrcaQuest
 from simulators.devices.clock import VirtualClock

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.orca_quest import LINE_TIME, SENSOR_SHAPE
-from drivers.protocols import CameraSettings, TriggerSource
 from simulators.devices.camera_view import CameraView, Exposed
 from simulators.scenes.shots import Scan
 from tests.simulators import shots

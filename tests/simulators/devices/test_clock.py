@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import Clock, SystemClock
+from drivers.base.clock import Clock, SystemClock
 from simulators.devices.clock import ScaledClock, VirtualClock
 
 

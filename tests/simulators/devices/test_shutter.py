@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.protocols import SampleMover, Shutter
+from drivers.base.protocols import SampleMover, Shutter
 from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers import orca_quest
-from drivers.protocols import CameraSettings, TriggerSource
+from drivers.base.protocols import CameraSettings, TriggerSource
 from simulators.effects.rolling_shutter import RollingShutter
 from simulators.frame import sensor
 from simulators.frame.shot import Moments

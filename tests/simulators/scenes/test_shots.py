@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.orca_quest import timing
-from drivers.protocols import CameraSettings, TriggerSource
 from simulators.frame.mapping import SceneError
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import load_scene

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack
 import pytest
 import serial
 
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from simulators.wires.wire import Wire
 from tests.simulators.wires.transports import serve_pty, serve_tcp
 

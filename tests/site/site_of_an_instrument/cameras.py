@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.clock import Clock
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from drivers.stages.settings import key
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 
 class NpyStack(ScanReader):

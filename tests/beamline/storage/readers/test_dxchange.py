@@ -11,7 +11,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 
 Parts = dict[str, np.ndarray]
 

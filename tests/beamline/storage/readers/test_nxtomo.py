@@ -19,7 +19,7 @@ from beamline.storage import hdf5
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import INFO, StandingClock
 
 Write = Callable[[list[Frame]], Path]

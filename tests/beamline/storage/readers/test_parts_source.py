@@ -18,8 +18,8 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import parts_joined
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame
 from tests.beamline.scans import TwoCylinders, frames_of
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 20.0)))

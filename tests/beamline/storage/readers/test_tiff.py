@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import kind_of
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)
 

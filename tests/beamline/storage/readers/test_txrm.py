@@ -15,7 +15,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.scans import BEAM, TwoCylinders
 from tests.beamline.storage.compound import write_compound
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.storage.readers.open import open_scan
-from drivers.frame import FrameKind
+from drivers.base.frame import FrameKind
 from tests.beamline.storage.compound import write_compound
 from tests.beamline.storage.readers.test_txrm import VIEWS, streams
 

@@ -23,7 +23,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
 from beamline.storage.rules.validate import reconstruction_blockers, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import TwoCylinders, seal, write_exchange
 from tests.beamline.storage.conftest import INFO, SHAPE, StandingClock
 

@@ -26,7 +26,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout, to_disk
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.frame import Frame, FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, StandingClock
 
 Write = Callable[[list[Frame]], Path]

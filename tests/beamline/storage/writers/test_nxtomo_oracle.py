@@ -25,8 +25,8 @@ from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recover import QUIET, recover
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from drivers.clock import SystemClock
-from drivers.frame import Frame, FrameKind
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
 
 analyzer = pytest.importorskip("nabu.resources.dataset_analyzer")
 estimators = pytest.importorskip("nabu.pipeline.estimators")

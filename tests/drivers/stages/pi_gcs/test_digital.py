@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceRefused
+from drivers.base.errors import DeviceRefused
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
 from drivers.stages.settings import StageFigures

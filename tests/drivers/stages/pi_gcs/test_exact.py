@@ -7,8 +7,8 @@ import re
 
 import pytest
 
-from drivers.errors import DeviceError
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import start_move_by
 from tests.drivers.stages.pi_gcs_rig import COUNTS, Rig
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.stages.pi_gcs_rig import Rig
 

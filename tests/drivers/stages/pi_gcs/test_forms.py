@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.protocols import TriggerTrain
+from drivers.base.protocols import TriggerTrain
 from drivers.stages.pi_gcs.errors import EVENTS, REFUSALS, advice, meaning
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, is_rounding_of, plain
 from drivers.stages.pi_gcs.train import FirstPulse, is_spent_by, window_of

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import RotationStage
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import RotationStage
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.settings import StageFigures
 from drivers.testing.stages.bench import LONG, SPEED

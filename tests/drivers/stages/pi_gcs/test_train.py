@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.pi_gcs.trigger import FirstPulse
 from tests.drivers.stages.pi_gcs_rig import Rig

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from drivers.testing.stages.bench import emitted
 from simulators.devices.trigger_line import TriggerLine
 from tests.drivers.stages.pi_gcs_rig import controller

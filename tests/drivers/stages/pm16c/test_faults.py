@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceTimeout
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import SPEED
 from tests.drivers.pm16c_rig import QUERIES_TO_OPEN, Rig
 

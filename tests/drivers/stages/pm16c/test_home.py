@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceTimeout
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
 from tests.drivers.pm16c_rig import Rig
 

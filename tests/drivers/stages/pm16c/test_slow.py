@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.stages.pm16c.train import FirstPulse
 from tests.drivers.pm16c_rig import Rig
 

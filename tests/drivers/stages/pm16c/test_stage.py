@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import RotationStage, TriggerTrain
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import RotationStage, TriggerTrain
 from drivers.stages.pm16c.settings import RATES, PM16CSettings, steepest_code
 from drivers.stages.settings import StageFigures
 from drivers.testing.stages.bench import LONG, SPEED

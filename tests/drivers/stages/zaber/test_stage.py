@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.protocols import RotationStage
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import RotationStage
 from drivers.stages.settings import StageFigures
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.testing.stages.bench import LONG, SPEED

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import DeviceError, DeviceRefused
-from drivers.protocols import TriggerTrain
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import TriggerTrain
 from drivers.stages.settings import StageFigures, Wiring
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.train import PulseSettings, TriggerUse, remaining, set_up

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import SystemClock
+from drivers.base.clock import SystemClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers.stages.flat_settings import flat

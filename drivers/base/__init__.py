@@ -1,0 +1,1 @@
+"""Values that other packages may import: protocols of devices, frames, clocks and errors."""
