@@ -150,7 +150,7 @@ def predicts_best(
 
 
 def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | None:
-    """A listener to one trial that says of which method it is; none in a slab, which counts its slices alone."""
+    """A listener to one trial, which adds the name of the method. None in a slab: there only slices are counted."""
     listen = control.on_progress
     if listen is None or control.decide is not None:
         return None

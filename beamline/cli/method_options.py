@@ -274,8 +274,8 @@ _OPTIONS = (
     click.option(
         "--seconds",
         type=POSITIVE,
-        help="Time of the whole call, from reading the scan to the volume and its report, instead of --steps; where "
-        "that is too little, it says so before the fit. With --follow: of the fit after the end of the scan.",
+        help="Time of the whole call, from reading the scan to volume and report, instead of --steps. If it is too "
+        "little, a warning says so before the fit. With --follow: of the fit after the end of the scan.",
     ),
     click.option(
         "--budget",

@@ -177,7 +177,7 @@ def _here() -> str:
 
 
 def _remove_left(path: Path) -> None:
-    """Remove what programs that were killed here left of `path`."""
+    """Remove the hidden files that killed programs left beside `path`."""
     with suppress(OSError):
         for left in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:
             place, _, process = left.name.removeprefix(f".{path.name}.").rpartition("-")[0].partition("-")

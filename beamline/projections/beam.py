@@ -16,8 +16,8 @@ def in_beam(material: str, beam: str) -> tuple[F64, F64]:
 
     Args:
         material: a known one, or a chemical formula.
-        beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1"; or a text file of two columns, keV and
-            weight (without regard to its unit, the detector's response within it). A filter needs its density: it is
+        beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
+            weight, with the detector's response and in any unit. A filter needs its density: it is
             one of the known materials.
 
     Raises:

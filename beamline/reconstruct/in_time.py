@@ -25,7 +25,7 @@ _REPORT = 5.0  # s, its pictures
 _BYTES = 1e8  # of a volume, written and read back in a second
 _BUSIEST = 4.0  # times as long as alone, at most, what others' work makes of that
 _FORWARD = 0.5  # of a sweep
-_LEAST = 0.1  # of a sweep, what a fit takes that starts from coarse views and makes a step
+_LEAST = 0.1  # of a sweep: the time of a start from coarse views and one step
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,7 @@ class Archived:
         frames: in the file.
         sources: the raw file, then those that it draws frames from; raw_bytes: of all of them.
         damaged: rows whose pixels differ from the checksum that was written with them, in the raw file already.
-        altered: rows of which the file says something else than was written, by that checksum; likewise.
+        altered: rows of the frame log that differ from their checksum; likewise.
     """
 
     path: Path
@@ -80,8 +80,8 @@ def archive(
 
     Args:
         codec: a name in `codecs.CODECS`.
-        keep_damaged: frames that differ from their stored checksum, or of which the file says something else than was
-            written, are copied as they are, and so are the checksums.
+        keep_damaged: frames and rows that differ from their stored checksums are copied as they are, with the
+            checksums.
         progress: counts the MB of images twice, when they are written and when they are compared.
 
     Raises:

@@ -93,8 +93,8 @@ class DiskFile(UnderHdf5):
     """A file that h5py writes to.
 
     HDF5 holds chunks and metadata back and writes them when an object goes, where h5py cannot raise; and it may crash
-    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, nothing more
-    is written, and HDF5 reads what it wrote since then from memory, until it has closed the file.
+    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, and nothing
+    more is written. Until HDF5 has closed the file, it reads later writes from memory.
     """
 
     def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:

@@ -53,8 +53,8 @@ class NotReadyError(DataError):
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
-    HDF5 shares a file within a program: who reads the one that is written there would see half of it and write to it at
-    the end, and where two follow one, both read wrong values. So such a file is opened apart from HDF5's own.
+    HDF5 shares a file within a program. A reader beside the writer would see half of the file, and write to it at the
+    end. Two followers of one file would both read wrong values. So such a file is opened apart from HDF5's own.
 
     Raises DataError where it is no readable HDF5 file, or draws on what is no file (see storage.structure),
     NotReadyError where it may become one (`follow`).

@@ -46,7 +46,7 @@ class Recovered:
         missing: views that were planned and not taken; None where the file does not hold its plan.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames, of the last 2 GB, that differ from their checksum; they are kept.
-        altered: frames of which the file says something else than was written, by that checksum; likewise kept.
+        altered: frames whose row in the log differs from its checksum; likewise kept.
         remark: what could not be done though the frames are in order; "" where all was done.
     """
 

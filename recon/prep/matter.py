@@ -1,8 +1,8 @@
 """Matter: how a material attenuates and delays X-rays, for the corrections of phase and beam hardening.
 
 Cross sections are those of xraylib from 0.1 to 800 keV (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). The
-simulator reads the same tables and states the same compositions and densities; all else is computed here anew, so that
-a correction is not tested with the formulas that made its data.
+simulator reads the same tables and states the same compositions and densities. All else is computed here anew: no
+correction is tested with the formulas that made its data.
 """
 
 from __future__ import annotations

@@ -38,8 +38,8 @@ class DensityPolicy:
         prune_below: density (in density units) below which a Gaussian is removed.
         growth: largest number of Gaussians, relative to the number at the start.
         rule: "mass": clones and splits conserve the mass of the Gaussian, see `control`. "published": a clone is two
-            equal Gaussians of half the density; a split draws two centres from the Gaussian, both of half its density
-            and of its width over 1.6; a Gaussian is removed where its centre leaves the box.
+            equal Gaussians of half the density. A split draws two centres from the Gaussian, with half its density and
+            its width over 1.6. A Gaussian is removed where its centre leaves the box.
     """
 
     start: float = 0.05
@@ -130,7 +130,7 @@ def control(
 def _halves(
     log_scales: F32, rotations: F32, split: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[F32, F32, F32, NDArray[np.float64]]:
-    """What becomes of the Gaussians that are split or cloned, by the rule "mass".
+    """Splits and clones Gaussians by the rule "mass".
 
     Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
     Cloning: two of half the density, a small distance apart, since two equal ones would always get equal gradients.

@@ -104,8 +104,9 @@ class R2:
         return run_fit(self, problem, control)
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit of views to come, from this number of Gaussians; settings of `fit` that are not the defaults take the
-        place of those that suit it.
+        """A fit of views to come, from this number of Gaussians.
+
+        Settings of `fit` that differ from the defaults replace those of `WHILE_VIEWS_COME`.
 
         Raises:
             ValueError: as `StreamingFit`, or where the fit would start from Gaussians instead of a number.

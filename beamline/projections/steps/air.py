@@ -44,7 +44,7 @@ def _model(text: str) -> str:
 
 @dataclass(frozen=True)
 class Air:
-    """What is taken off each view so that its air is at zero.
+    """Takes a background off each view, so that its air is at zero.
 
     Attributes:
         model: as the option says it.

@@ -13,8 +13,8 @@ class Flags:
     """How flags are heeded. `beamline.projections.flags` chooses the views, `jumps` corrects them.
 
     Attributes:
-        wanted: "use": views with an alarm are left out, those with a warning weigh less; "judge": the monitor looks at
-            the frames of the file now, and its flags count in place of the file's; "ignore": all are alike.
+        wanted: "use": views with an alarm are left out, those with a warning weigh less. "judge": the monitor looks at
+            the frames now, and its flags count in place of the file's. "ignore": all views are alike.
     """
 
     name: ClassVar[str] = "flags"

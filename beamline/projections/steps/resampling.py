@@ -48,8 +48,8 @@ class TiltAndLens:
     """How views are resampled.
 
     Attributes:
-        tilt: degrees by which the axis leans in the detector's plane: its column grows by tan(tilt) a row; "auto": it
-            is found; None: nobody knows, and views are used as they are.
+        tilt: degrees by which the axis leans in the detector's plane; its column grows by tan(tilt) a row. "auto": it
+            is found. None: it is unknown, and views are used as they are.
         distortion: of the lens; None: none.
     """
 

@@ -109,7 +109,7 @@ def emitted(line: Cable, clock: Clock) -> list[Pulse]:
 
 def start_move_by(stage: Motion, angle: float, speed: float) -> None:
     """Begin a move by `angle` (rad, rounded once to whole counts) from the count where the stage stands, or is held by
-    its servo: what a servo is beside that does not add up.
+    its servo. Deviations of the servo do not add up.
 
     n such moves make exactly n times these counts, however long the sum. Where an angle is no whole number of counts,
     its multiples are not n times them: for equally spaced views give `start_move` the multiples.

@@ -125,7 +125,7 @@ def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
 
 
 def test_the_default_of_steps_is_told_as_it_is() -> None:
-    assert f"Default: {DEFAULT_STEPS};" in " ".join(beamline("recon", "--help").stdout.split())
+    assert f"Default: {DEFAULT_STEPS};" in " ".join(beamline("recon", "--help-all").stdout.split())
 
 
 def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:
