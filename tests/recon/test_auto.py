@@ -182,4 +182,4 @@ def test_progress_counts_the_trials(data: F32) -> None:
     seen: list[Any] = []
     control = recon.RunControl(on_progress=seen.append)
     recon.reconstruct(data, VIEWS, Auto((Scaled(), Scaled(factor=2.0))), control=control)
-    assert [(p.step, p.steps) for p in seen if p.unit != "slices"] == [(1, 2), (2, 2)]
+    assert [(p.step, p.steps) for p in seen if p.unit == "methods tried"] == [(1, 2), (2, 2)]

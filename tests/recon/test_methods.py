@@ -134,5 +134,5 @@ class TestConformance(MethodConformance):
         if request.param == "auto":
             return recon.Auto((fit, recon.FistaTv(iterations=3), recon.Fbp()))
         method = methods.by_name(request.param)
-        short = {"iterations": 5} if methods.has_setting(method, "iterations") else {}
-        return fit if request.param == fit.name else methods.build(method, short)
+        short = {"iterations": 5, "steps": 40, "gaussians": 200, "finish": 2}
+        return methods.build(method, {k: v for k, v in short.items() if methods.has_setting(method, k)})

@@ -148,7 +148,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
     assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
-OTHER_TAKERS = {"--quality": "r2", "--device": "auto, r2, r2-published", "--budget": "auto, r2, fista-tv, os-sirt-tv"}
+OTHER_TAKERS = {"--device": "auto, r2, r2-published", "--budget": "auto, r2, fista-tv, os-sirt-tv"}
 
 
 @pytest.mark.parametrize(

@@ -340,8 +340,8 @@ def test_nothing_is_corrected_twice_where_all_references_came_first(
     corrected: list[int] = []
     line_integrals = Correction.line_integrals
 
-    def count(self: Correction, views: Transmission | None, last: bool = True) -> Projections:
-        part = line_integrals(self, views, last)
+    def count(self: Correction, views: Transmission | None, last: bool = True, *told: Any) -> Projections:
+        part = line_integrals(self, views, last, *told)
         corrected.extend(part.view_ids.tolist())
         return part
 

@@ -92,6 +92,7 @@ def test_the_demo_exposed_for_too_long_stops_and_says_why(tmp_path: Path) -> Non
     """Its flats are saturated everywhere with 95 ms: the electrolyte would read 0.14 instead of 0.48 1/mm."""
     words = [
         "scan.exposure_s=0.095",
+        "scan.period_s=0.1",
         "simulation.clock=virtual",
         "scan.darks.count=3",
         "scan.flats={count: 3, at: start}",

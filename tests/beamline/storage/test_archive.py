@@ -279,4 +279,4 @@ def test_the_memory_is_that_of_a_few_frames(tmp_path: Path) -> None:
     archive(raw, tmp_path / "small.h5")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 40 * 64 * 64 * 2
+    assert peak < 50 * 64 * 64 * 2  # a quarter of the frames

@@ -87,7 +87,7 @@ def test_a_dataset_that_claims_what_no_file_holds(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("real", data=np.zeros(1000))
         file.create_dataset("claimed", (2**40, 2, 2), "f8", chunks=(64, 2, 2))
-    with pytest.raises(DataError, match=r"claimed claims 3\.52e\+04 GB, of which 0 bytes are there"):
+    with pytest.raises(DataError, match=r"claimed claims 3\.52e\+04 GB, but only 0 bytes are there"):
         open_hdf5(tmp_path / "a.h5")
 
 

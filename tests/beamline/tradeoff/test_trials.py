@@ -18,6 +18,7 @@ CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
     "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},
     "loss": {"fit.loss", "fit.ssim_weight"}, "start": {"start"}, "kernel": {"fit.kernel"},
+    "rectification": {"fit.rays.rectified"},
     "iterations": {"iterations"},
 }  # fmt: skip
 
@@ -52,7 +53,7 @@ def test_full_tries_more_than_quick() -> None:
 def test_a_method_or_setting_that_there_is_not_is_refused() -> None:
     with pytest.raises(ValueError, match=r"method must be one of r2, .*, got 'art'"):
         plan(("fbp", "art"), 60, 1000, "quick")
-    with pytest.raises(ValueError, match=r"'sirt' has no setting 'steps' \(r2 has\)"):
+    with pytest.raises(ValueError, match=r"'sirt' has no setting 'steps' \(r2, r2-published has\)"):
         Trial("method", "sirt", 60, settings={"steps": 5}).build()
 
 

@@ -10,16 +10,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-import serial
 
-from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
-from drivers.stages.pi_gcs.settings import PiGcsSettings
-from drivers.stages.pi_gcs.stage import PiGcsStage
 from drivers.testing.stages.bench import start_move_by
-from simulators.wires.serial_url import SCHEME
-from tests.drivers.stages.flat_settings import flat
-from tests.drivers.stages.pi_gcs_rig import USUAL
 from tests.drivers.stages.real_time import FAST, KINDS, PLUGS, SOON, TRANSPORTS, Kind, Real, Serve
 
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
@@ -200,13 +193,3 @@ def test_a_plug_pulled_in_the_middle_of_a_move_is_one_error_that_says_so(kind: K
                 again()
         stage.close()
     gc.collect()
-
-
-def test_a_controller_that_nobody_registered_opens_by_its_name() -> None:
-    url = SCHEME + "pi_gcs?counts_per_turn=90000&axis=ROT&output=2&referenced=no&latency=0.001"
-    stage = PiGcsStage(url, flat(PiGcsSettings, **(USUAL | {"axis": "ROT"})), SystemClock())
-    status = stage.status()
-    assert (status.counts, status.moving, status.homed, status.fault) == (0, False, False, "")
-    stage.close()
-    with pytest.raises(serial.SerialException, match="output=9"):
-        serial.serial_for_url(SCHEME + "pi_gcs?output=9")

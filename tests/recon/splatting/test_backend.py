@@ -132,7 +132,7 @@ def test_bounds_hold_after_an_update_and_none_is_none(rng: np.random.Generator) 
 def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(backend_for("cpu"), Cpu)
     for unknown in ("mps", "gpu", "CUDA", "cuda1", "cuda:", "cuda:one", "cuda:-1", "cuda:0,1", ""):
-        with pytest.raises(ValueError, match=rf"'{unknown}' was asked for.*'cpu' or on 'cuda'.*name one of these"):
+        with pytest.raises(ValueError, match=rf"'{unknown}' was asked for.*'cpu' or on 'cuda'.*Name one of these"):
             backend_for(unknown)
     for name in [name for name in sys.modules if name.startswith("recon.kernels.gpu")]:
         monkeypatch.delitem(sys.modules, name)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.storage.readers.base import WHOLE, Format, ScanReader, frame_indices
+from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
 from drivers.base.frame import FrameKind
 
 
-class NpyStack(ScanReader):
+class NpyStack(BaseSource):
     """Frames of an .npy; the caller brings the angles."""
 
     format = "npy_stack"
@@ -30,4 +30,4 @@ class NpyStack(ScanReader):
         pass
 
 
-NPY_STACK = Format("an .npy stack", lambda path, _: path.suffix == ".npy", lambda path, _: NpyStack(path))
+NPY_STACK = ScanFormat("an .npy stack", lambda path, _: path.suffix == ".npy", lambda path, _: NpyStack(path))

@@ -281,7 +281,7 @@ def test_frames_beyond_any_memory_are_refused(tmp_path: Path) -> None:
         pytest.raises(DataError, match="3 x 1000000000 x 1000000000; expected at most"),
     ):
         hdf5.require_possible(file["exchange/data"])
-    with pytest.raises(DataError, match=r"claims 6e\+09 GB, of which 0 bytes are there"):
+    with pytest.raises(DataError, match=r"claims 6e\+09 GB, but only 0 bytes are there"):
         open_scan(tmp_path / "f.h5")
 
 
