@@ -4,7 +4,7 @@ The commands are those of users, so that the test holds whatever the inside look
 does: after a change that must not change results, no digest may differ. Where one was meant to change, say so in
 CHANGELOG.md and record all of them anew:
 
-    python -m tests.beamline.test_same_bits
+    python -m tests.beamline.test_same_bits [CASE ...]
 
 Digests are of one environment (versions and processor); elsewhere the test is skipped. Real scans that are not beside
 the checkout are skipped one by one.
@@ -17,7 +17,7 @@ import json
 import platform
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -188,11 +188,11 @@ def test_bits_are_those_that_were_recorded(case: str, tmp_path: Path, one_thread
     assert digests(case, tmp_path) == recorded["cases"][case]
 
 
-def _record() -> None:
-    """Write the digests of this state and this environment."""
+def _record(wanted: Sequence[str]) -> None:
+    """Write the digests of this state and this environment, of the cases named; the others stay if it is the same."""
     numba.set_num_threads(1)
-    cases = {}
-    for case in CASES:
+    cases = _recorded()["cases"] if wanted and _recorded()["environment"] == environment() else {}
+    for case in wanted or CASES:
         with tempfile.TemporaryDirectory() as folder:
             cases[case] = digests(case, Path(folder))
         print(case, file=sys.stderr)
@@ -201,4 +201,4 @@ def _record() -> None:
 
 
 if __name__ == "__main__":
-    _record()
+    _record(sys.argv[1:])
