@@ -415,7 +415,7 @@ def test_walnut_from_60_views_is_better_than_fbp(tmp_path: Path, shared_data: Pa
     options = _options(
         tmp_path,
         source=SourceOptions(shared_data / "walnut_parallel_rebinned_240x96x256.h5", quantity="line_integrals"),
-        method=R2(seconds=40.0),
+        method=R2(steps=400),
         selection=Selection(views="fixed:60"),
         truth=f"{shared_data / 'walnut_fdk_256.npz'}:70:166",
         target=OutputPaths(tmp_path / "out.h5", tmp_path / "out.html"),
