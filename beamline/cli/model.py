@@ -95,6 +95,8 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
         made = voxelised(model, grid, counting("slices", sink, clock))
         write_volume(output, replace(model.record, volume=made, time=clock.now()))
         sink(Event("done", clock.now(), {"output": output, "shape": grid.shape, "voxel": grid.voxel_size}))
+    if not as_json:
+        click.echo(f"output  {output}, {' x '.join(map(str, grid.shape))} voxels")
 
 
 @click.command()
@@ -124,3 +126,5 @@ def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_js
         views = model.geometry.angles if angles is None else angles
         write_views(output, model, views, counting("views", sink, clock))
         sink(Event("done", clock.now(), {"output": output, "n_views": views.size}))
+    if not as_json:
+        click.echo(f"output  {output}, {views.size} views")
