@@ -140,7 +140,7 @@ def test_a_time_budget_is_kept(noisy: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"method": "magic"}, "method must be one of r2, fbp, .*, got 'magic'"),
+        ({"method": "magic"}, "method must be one of r2, .*fbp, .*, got 'magic'"),
         ({"projections": np.zeros((3, 20, 40))}, "geometry says"),
         ({"projections": np.full((24, 20, 40), np.nan)}, "no value that is finite"),
         ({"projections": np.full((24, 20, 40), 1e300)}, "no value that is finite"),
@@ -184,15 +184,18 @@ OF_A_FIT: dict[str, dict[str, object]] = {
 }
 
 
-@pytest.mark.parametrize("method", [name for name in names() if name != "r2"])
+OF_FITS = r"\(of r2, r2-published\)"
+
+
+@pytest.mark.parametrize("method", [name for name in names() if not name.startswith("r2")])
 def test_no_argument_silently_does_nothing(noisy: np.ndarray, method: str) -> None:
     for name, argument in OF_A_FIT.items():
-        with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} \(of r2\)"):
+        with pytest.raises(ValueError, match=rf"method '{method}' does not take {name} {OF_FITS}"):
             recon.reconstruct(noisy, VIEWS, method, **argument)  # type: ignore[arg-type]
 
 
 def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> None:
-    with pytest.raises(ValueError, match=r"'sirt' does not take held_out \(of r2\), on_checkpoint \(of r2\)"):
+    with pytest.raises(ValueError, match=rf"'sirt' does not take held_out {OF_FITS}, on_checkpoint {OF_FITS}"):
         recon.reconstruct(
             noisy, VIEWS, "sirt", use=DataUse(held_out=(3,)), control=RunControl(on_checkpoint=print)
         )  # fmt: skip
