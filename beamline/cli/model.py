@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 import numpy as np
@@ -20,7 +21,10 @@ from beamline.cli.terminal import Terminal, counting
 from beamline.core.events import Event, Sink, fan_out
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
-from drivers.base.clock import SystemClock
+from drivers.base.clock import Clock, SystemClock
+
+if TYPE_CHECKING:
+    from beamline.reconstruct.model import Model
 
 Box = tuple[tuple[float, float], ...]
 _MOST_VIEWS = 1_000_000
@@ -54,9 +58,14 @@ def angles_of(text: str) -> NDArray[np.float64]:
 
 
 @contextmanager
-def _told(as_json: bool) -> Iterator[Sink]:
+def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, Sink, Clock]]:
+    """The model behind `volume`, for a new file at `output`."""
+    from beamline.reconstruct.model import read_model  # here: help needs none of it
+
+    refuse_shared({"VOLUME": volume, "--output": output})
     with terminated_like_interrupted(), json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
-        yield fan_out(*(sinks or [terminal]))
+        refuse_existing(output)
+        yield read_model(volume), fan_out(*(sinks or [terminal])), SystemClock()
 
 
 _VOLUME = click.argument("volume", type=click.Path(path_type=Path))
@@ -80,14 +89,10 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
 
     These are the fit's, before its finish on voxels.
     """
-    from beamline.reconstruct.model import box_grid, read_model, voxelised  # here: help needs none of it
+    from beamline.reconstruct.model import box_grid, voxelised
     from beamline.storage.volumes.files import write_volume
 
-    refuse_shared({"VOLUME": volume, "--output": output})
-    clock = SystemClock()
-    with _told(as_json) as sink:
-        refuse_existing(output)
-        model = read_model(volume)
+    with _making(volume, output, as_json) as (model, sink, clock):
         try:
             grid = box_grid(model.record.volume.grid, voxel, box)
         except ValueError as error:
@@ -114,15 +119,11 @@ def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_js
 
     The output is a Data Exchange file, which every command reads.
     """
-    from beamline.reconstruct.model import read_model, write_views  # here: help needs none of it
+    from beamline.reconstruct.model import write_views
 
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise click.UsageError(f"-o {output}: views are HDF5; give a name such as {output.with_suffix('.h5')}.")
-    refuse_shared({"VOLUME": volume, "--output": output})
-    clock = SystemClock()
-    with _told(as_json) as sink:
-        refuse_existing(output)
-        model = read_model(volume)
+    with _making(volume, output, as_json) as (model, sink, clock):
         views = model.geometry.angles if angles is None else angles
         write_views(output, model, views, counting("views", sink, clock))
         sink(Event("done", clock.now(), {"output": output, "n_views": views.size}))
