@@ -22,6 +22,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 if TYPE_CHECKING:
     from recon.auto import Auto
+    from recon.axis_by_views import axis_by_views
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
@@ -71,6 +72,7 @@ __all__ = [
     "StreamingFit",
     "Volume",
     "WithoutRings",
+    "axis_by_views",
     "correct",
     "find_axis",
     "project",
@@ -82,6 +84,7 @@ __all__ = [
 _LAZY = {
     "Auto": "recon.auto",
     "AxisEstimate": "recon.prep.align",
+    "axis_by_views": "recon.axis_by_views",
     "find_axis": "recon.prep.align",
     **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
     "Counts": "recon.prep.counts",

@@ -117,7 +117,7 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
     if config.optics.axis_col is None:
         axis_col = ((width - camera.binning) / 2 + scene.axis_offset_px - col0) / camera.binning
         raise ConfigError(
-            "optics.axis_col: the scene is a cone beam, whose rotation axis is not searched; set its column, here "
+            "optics.axis_col: the scene is a cone beam, whose axis is not searched while views come; set it, here "
             f"{axis_col:g}. Nothing was started."
         )
 

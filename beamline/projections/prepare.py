@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -13,26 +12,24 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
+from beamline.projections.axis import rotation_axis
 from beamline.projections.correction import ScanCorrection, Warn
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
-from beamline.projections.jumps import find_jumps, longest_part
+from beamline.projections.jumps import find_jumps
 from beamline.projections.replay import judged_flags
 from beamline.projections.selection import (
     Selection,
-    check_axis,
     choose_views,
-    cone_of,
     geometry_of,
     pixel_size,
     rows_of,
-    unbinned,
 )
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.references import ReferenceCheck
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import Done, ScanStep
-from beamline.projections.tilt import spread, spread_views, warn_of_tilt, with_tilt
+from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
@@ -43,7 +40,7 @@ from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, areas, masked
 from recon.base.volume import Grid
-from recon.prep.align import AxisEstimate, find_axis
+from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
 from recon.voxels.projector import seen_rays
 
@@ -196,16 +193,8 @@ def prepare_projections(
     selection, sought = with_tilt(source, selection, scan_frames, warn)
     correction = ScanCorrection(source, selection, warn)
     warn_of_tilt(source, selection, correction, scan_frames, warn)
-    axis_col, axis = selection.axis_col, None
     phases.enter("rotation axis")
-    if axis_col is None:
-        if cone_of(source, selection) is not None:
-            axis_col = stated_axis(source)
-        else:
-            whole = selection.axis_rows
-            by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
-            axis_col, axis = _axis_beside_jumps(source, by, usable, warn, phases.told)
-    check_axis(source, axis_col)
+    axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.told)
     phases.enter("jumps", "guesses")
     jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col, phases.told)
     if jumps.said:
@@ -272,23 +261,6 @@ def _shares_of(
     """Weights of the rays in the regions of flags, in some of the binned rows."""
     within = slice(rows.start + part.start * binning, rows.start + part.stop * binning)
     return regions.weights(view_ids, within, binning, (part.stop - part.start, cols))
-
-
-def _axis_beside_jumps(
-    source: ScanSource,
-    correction: ScanCorrection,
-    usable: UsableViews,
-    warn: Warn,
-    told: Callable[[int, int], None],
-) -> tuple[float, AxisEstimate]:
-    """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
-    part = longest_part(usable.frames, usable.jumps)
-    if part.size < usable.frames.size:
-        with suppress(DataError):
-            found = locate_axis(source, correction, part, lambda _: None, told)
-            if found[1].confident:
-                return found
-    return locate_axis(source, correction, usable.frames, warn, told)
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
@@ -375,61 +347,6 @@ def correction_blockers(source: ScanSource, selection: Selection) -> list[Findin
     checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
     rules = (quantity_said, references_present, *checked)
     return [finding for rule in rules for finding in rule(source)]
-
-
-def stated_axis(source: ScanSource) -> float:
-    """The rotation axis that the file states; that of a cone beam is not searched, for its opposite views differ.
-
-    Raises:
-        DataError: it states none.
-    """
-    if source.axis_col is None:
-        raise DataError(
-            f"{source.path} does not say where the rotation axis is, and that of a cone beam is not searched. Give it "
-            "with --axis COLUMN (0 is the centre of the first column)."
-        )
-    return source.axis_col
-
-
-def locate_axis(
-    source: ScanSource,
-    correction: ScanCorrection,
-    frames: NDArray[np.int64],
-    warn: Warn,
-    told: Callable[[int, int], None] = lambda n, total: None,
-) -> tuple[float, AxisEstimate]:
-    """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
-
-    An estimate without a clear optimum gives way to what the file states, if it states it.
-
-    Raises:
-        DataError: no axis in the search range explains the views.
-    """
-    height = (correction.rows.stop - correction.rows.start) // correction.binning
-    start = max(0, (height - _AXIS_ROWS) // 2)
-    frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
-    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), told)
-    try:
-        estimate = find_axis(band.data, source.angles[band.view_ids])
-    except ValueError as error:
-        raise DataError(
-            f"{source.path}: the rotation axis was not found: {error}. Give it with --axis COLUMN (0 is the centre of "
-            "the first column)."
-        ) from error
-    found = unbinned(estimate.value, correction.binning)
-    if estimate.confident:
-        return found, estimate
-    if source.axis_col is not None:
-        warn(
-            f"The rotation axis found, column {found:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
-            "used. Check the slices, or give --axis COLUMN."
-        )
-        return source.axis_col, estimate
-    warn(
-        f"The rotation axis found, column {found:.2f}, is not a clear optimum. Check the slices for doubled edges, or "
-        "give --axis COLUMN."
-    )
-    return found, estimate
 
 
 def report_defects(projections: Projections, warn: Warn) -> None:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Warnings
+from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.prepare import locate_axis, stated_axis
 from beamline.projections.selection import Selection, cone_of
 from beamline.storage.readers.base import ScanSource
 from recon.prep.align import AxisEstimate

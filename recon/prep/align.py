@@ -41,7 +41,7 @@ class AxisEstimate:
         candidates: float64 [n], the columns tested.
         curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 is none.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
-        method: "pair", "opposite views", "double wedge" or "centre of mass".
+        method: "pair", "opposite views", "double wedge", "centre of mass" or "views held out".
     """
 
     value: float

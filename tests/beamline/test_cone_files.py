@@ -81,6 +81,20 @@ def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> 
         assert (weights * axis).sum() / weights.sum() == pytest.approx(expected, abs=0.1 * grid.voxel_size)
 
 
+@pytest.mark.parametrize(("stated", "told"), [(None, []), (AXIS - 2.3, ["than with the file's 20.20"])])
+def test_an_axis_that_is_not_stated_or_wrong_is_found_by_views_held_out(
+    tmp_path: Path, stated: float | None, told: list[str]
+) -> None:
+    path, warnings = tmp_path / "axis.h5", list[str]()
+    _write(path, replace(INFO, axis_col=stated), views=36)
+    with open_scan(path) as source:
+        prepared = prepare_projections(source, PLAIN, warnings.append)
+        given = prepare_projections(source, replace(PLAIN, axis_col=20.2), _never)
+    assert prepared.axis_col == pytest.approx(AXIS, abs=0.05)
+    assert prepared.axis is not None and prepared.axis.confident and given.axis_col == 20.2
+    assert len(warnings) == len(told) and all(words in warning for words, warning in zip(told, warnings, strict=True))
+
+
 def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:
     with open_scan(scan) as source:
         whole = prepare_projections(source, PLAIN, _never).geometry
@@ -102,7 +116,7 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
 
 def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
     for name, info, error, words in (
-        ("axis", replace(INFO, axis_col=None), DataError, "that of a cone beam is not searched. Give it with --axis"),
+        ("axis", replace(INFO, axis_col=None), DataError, "4 views are too few .* Give it with --axis COLUMN"),
         ("pixel", replace(INFO, pixel_size_mm=None), ConfigError, "which a cone beam needs: give --pixel-size-um"),
     ):
         path = tmp_path / f"{name}.h5"

@@ -1,0 +1,168 @@
+"""The rotation axis of a scan: given, found by its views, or stated by the file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.projections.correction import ScanCorrection, Warn
+from beamline.projections.flags import UsableViews
+from beamline.projections.jumps import longest_part
+from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
+from beamline.projections.tilt import spread, spread_views
+from beamline.storage.readers.base import ScanSource
+from recon.axis_by_views import COLS, VIEWS, axis_by_views
+from recon.prep.align import AxisError, AxisEstimate, find_axis
+
+Told = Callable[[int, int], None]
+
+_AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
+_AXIS_ROWS = 64
+_CANDIDATES = 14  # of the axis of a cone, usually
+
+
+def rotation_axis(
+    source: ScanSource,
+    selection: Selection,
+    correction: ScanCorrection,
+    usable: UsableViews,
+    warn: Warn,
+    told: Told,
+) -> tuple[float, AxisEstimate | None]:
+    """The axis in columns of the full detector, and how it was found; None where it was given.
+
+    Raises:
+        DataError: no axis explains the views.
+        ConfigError: it lies outside the detector.
+    """
+    axis_col, axis = selection.axis_col, None
+    if axis_col is None and cone_of(source, selection) is not None:
+        axis_col, axis = _axis_of_cone(source, selection, usable, warn, told)
+    elif axis_col is None:
+        whole = selection.axis_rows
+        by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
+        axis_col, axis = _axis_beside_jumps(source, by, usable, warn, told)
+    check_axis(source, axis_col)
+    return axis_col, axis
+
+
+def _axis_of_cone(
+    source: ScanSource, selection: Selection, usable: UsableViews, warn: Warn, told: Told
+) -> tuple[float, AxisEstimate | None]:
+    """The axis by views held out. What the file states stays, unless they agree better with another one."""
+    stated, cols = source.axis_col, source.shape[1]
+    if selection.axis_rows is not None:
+        selection = replace(selection, rows=selection.axis_rows)
+    rows = rows_of(source, selection)
+    binning = max(selection.binning, min(cols // COLS, rows.stop - rows.start))
+    coarse = replace(selection, binning=binning)
+    views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(usable.frames, VIEWS))
+    begin = (cols - 1) / 2 if stated is None else stated
+    geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])
+    try:
+        found = axis_by_views(
+            views.data, geometry, lambda n: told(n, max(n, _CANDIDATES)), near=stated is not None
+        )  # fmt: skip
+    except ValueError as error:
+        if stated is not None:
+            if isinstance(error, AxisError):
+                warn(f"The file's rotation axis, column {stated:.2f}, was not confirmed: {error}.")
+            return stated, None
+        raise _not_found(source, error) from error
+    axis_col = unbinned(found.value, binning)
+    if stated is None:
+        if not found.confident:
+            warn(_unclear(axis_col))
+        return axis_col, found
+    if not found.confident or found.value == geometry.axis_col:
+        return stated, None
+    warn(
+        f"Views held out agree better with a rotation axis in column {axis_col:.2f} than with the file's {stated:.2f}: "
+        f"the former is used. --axis {stated:g} keeps the file's."
+    )
+    return axis_col, found
+
+
+def _axis_beside_jumps(
+    source: ScanSource,
+    correction: ScanCorrection,
+    usable: UsableViews,
+    warn: Warn,
+    told: Callable[[int, int], None],
+) -> tuple[float, AxisEstimate]:
+    """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
+    part = longest_part(usable.frames, usable.jumps)
+    if part.size < usable.frames.size:
+        with suppress(DataError):
+            found = locate_axis(source, correction, part, lambda _: None, told)
+            if found[1].confident:
+                return found
+    return locate_axis(source, correction, usable.frames, warn, told)
+
+
+def locate_axis(
+    source: ScanSource,
+    correction: ScanCorrection,
+    frames: NDArray[np.int64],
+    warn: Warn,
+    told: Told = lambda n, total: None,
+) -> tuple[float, AxisEstimate]:
+    """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
+
+    An estimate without a clear optimum gives way to what the file states, if it states it.
+
+    Raises:
+        DataError: no axis in the search range explains the views.
+    """
+    height = (correction.rows.stop - correction.rows.start) // correction.binning
+    start = max(0, (height - _AXIS_ROWS) // 2)
+    frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
+    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), told)
+    try:
+        estimate = find_axis(band.data, source.angles[band.view_ids])
+    except ValueError as error:
+        raise _not_found(source, error) from error
+    found = unbinned(estimate.value, correction.binning)
+    if estimate.confident:
+        return found, estimate
+    if source.axis_col is None:
+        warn(_unclear(found))
+        return found, estimate
+    warn(
+        f"The rotation axis found, column {found:.2f}, is not a clear optimum: the file's {source.axis_col:.2f} is "
+        "used. Check the slices, or give --axis COLUMN."
+    )
+    return source.axis_col, estimate
+
+
+def stated_axis(source: ScanSource) -> float:
+    """The rotation axis that the file of a cone beam states, for views that still come.
+
+    Raises:
+        DataError: it states none.
+    """
+    if source.axis_col is None:
+        raise DataError(
+            f"{source.path} does not say where the rotation axis is, and that of a cone beam is not searched while "
+            "views come. Give it with --axis COLUMN (0 is the centre of the first column)."
+        )
+    return source.axis_col
+
+
+def _not_found(source: ScanSource, error: Exception) -> DataError:
+    return DataError(
+        f"{source.path}: the rotation axis was not found: {error}. Give it with --axis COLUMN (0 is the centre of "
+        "the first column)."
+    )
+
+
+def _unclear(axis_col: float) -> str:
+    return (
+        f"The rotation axis found, column {axis_col:.2f}, is not a clear optimum. Check the slices for doubled edges, "
+        "or give --axis COLUMN."
+    )

@@ -1,0 +1,153 @@
+"""axis_by_views: the rotation axis that predicts unseen views best; for a cone beam, whose opposite views differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.volume import Grid
+from recon.prep.align import AxisError, AxisEstimate
+from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+
+COLS = 128
+"""Columns that show the axis to 0.05 of their pixels; more cost time."""
+VIEWS = 90
+"""Views that are enough."""
+_LEAST_VIEWS = 12
+_ONE_IN = 3  # views held out
+_COARSE_COLS, _COARSE_SWEEPS = 32, 3  # enough to come within half a coarse pixel
+_FINE_ROWS, _FINE_SWEEPS = 8, 6
+_WIDEST = 0.1875  # of the columns to either side of the start
+_TV_WEIGHT = 3e-3  # any weight that keeps noise out of the volume shows the same axis
+_STEPS = 8  # of the parabola's middle towards its vertex, at most
+_BETTER = 0.98  # of the residual at the start: what another axis has to leave
+_CLEAR = 0.1  # of the typical residual that the best axis has to take away
+
+
+def axis_by_views(
+    projections: F32, geometry: Geometry, told: Callable[[int], None] = lambda n: None, *, near: bool = False
+) -> AxisEstimate:
+    """The column by which a volume of two thirds of the views leaves least of the others.
+
+    The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
+    best candidate. A parabola through three candidates on finer pixels ends it.
+
+    Args:
+        projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
+        geometry: of these views; the search begins at its `axis_col`.
+        told: is told the number of candidates tried so far.
+        near: the start stays, after three candidates, where no axis beside it leaves 2 % less.
+
+    Returns:
+        Not confident where the best candidate leaves nearly as much as the others.
+
+    Raises:
+        AxisError: no minimum lies within a fifth of the detector's width of the start.
+        ValueError: fewer than 12 views.
+    """
+    if geometry.n_views < _LEAST_VIEWS:
+        raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
+    cols = geometry.detector_shape[1]
+    judges = [_Judge(projections, geometry, each, told) for each in (_COARSE_COLS, COLS)]
+    coarse, fine = judges
+    fine.others = coarse
+    start, half = geometry.axis_col, 0.5 * fine.bin
+    if near and (vertex := _vertex(fine, start, half)) is not None and vertex.least > _BETTER * fine(start):
+        return _estimate(start, fine, confident=True)
+    step = _WIDEST / 3 * cols
+    best = min((start + n * step for n in range(-3, 4)), key=coarse)
+    typical = float(np.median(list(coarse.found.values())))
+    while step > 0.5 * coarse.bin:
+        step /= 2
+        best = min((best, best - step, best + step), key=coarse)
+    if abs(best - start) > _WIDEST * cols:
+        raise AxisError(
+            f"no rotation axis within {_WIDEST * cols:.0f} columns of column {start:.1f}: views held out agree best "
+            f"with column {best:.1f}, at the edge of the search; give the axis"
+        )
+    clear = coarse(best) < (1 - _CLEAR) * typical
+    found = _vertex(fine, best, half)
+    for _ in range(_STEPS):
+        if found is None or abs(found.axis_col - best) <= half:
+            break
+        best += half * np.sign(found.axis_col - best)
+        found = _vertex(fine, best, half)
+    if found is None:
+        return _estimate(best, coarse, confident=False)
+    return _estimate(found.axis_col, coarse, confident=clear)
+
+
+@dataclass(eq=False)
+class _Judge:
+    """The share of unseen views that a volume leaves, for an axis in columns of the data; each is asked once."""
+
+    projections: F32
+    geometry: Geometry
+    cols: int
+    told: Callable[[int], None]
+    others: _Judge | None = None
+    found: dict[float, float] = field(default_factory=dict)
+    _grid: Grid | None = None
+
+    def __post_init__(self) -> None:
+        whole, rows = self.geometry, self.geometry.detector_shape[0]
+        self.bin = max(1, min(rows, whole.detector_shape[1] // self.cols))
+        data, views = self.projections, whole
+        if self.cols > _COARSE_COLS and rows > _FINE_ROWS * self.bin:
+            height = _FINE_ROWS * self.bin
+            first = round(min(max(whole.axis_row - height / 2, 0), rows - height))
+            data, views = data[:, first : first + height], whole.rows(first, first + height)
+        self.binned, self._views = bin_views(np.ascontiguousarray(data), self.bin), views.binned(self.bin)
+        order = np.argsort(np.mod(views.angles, 2 * np.pi), kind="stable")
+        self._unseen = order[1::_ONE_IN]
+        self._seen = np.setdiff1d(order, self._unseen)
+
+    def __call__(self, axis_col: float) -> float:
+        if axis_col not in self.found:
+            self.found[axis_col] = self._residual(axis_col)
+            self.told(len(self.found) + (len(self.others.found) if self.others else 0))
+        return self.found[axis_col]
+
+    def _residual(self, axis_col: float) -> float:
+        moved = (axis_col - self.geometry.axis_col) / self.bin
+        views = replace(self._views, axis_col=self._views.axis_col + moved)
+        coarse = self.cols == _COARSE_COLS
+        # One grid for candidates near each other: another one would move the residual more than they do.
+        grid = self._grid = Grid.matching(views) if coarse or self._grid is None else self._grid
+        method = FistaTv(_COARSE_SWEEPS if coarse else _FINE_SWEEPS, _TV_WEIGHT)
+        part = ReconProblem(self.binned[self._seen], views.select(self._seen), grid, DataUse(), 0, "cpu")
+        volume = method.run(part, RunControl()).volume
+        unseen = self.binned[self._unseen]
+        left = unseen - Projector(views.select(self._unseen), grid).forward(volume.data)
+        return float(np.linalg.norm(left) / np.linalg.norm(unseen))
+
+
+@dataclass(frozen=True)
+class _Vertex:
+    axis_col: float
+    least: float
+
+
+def _vertex(judge: _Judge, middle: float, half: float) -> _Vertex | None:
+    """The vertex of the parabola through three squared residuals; None where they have no minimum."""
+    below, here, above = (judge(middle + n * half) ** 2 for n in (-1, 0, 1))
+    bend = below - 2 * here + above
+    if bend <= 0:
+        return None
+    shift = 0.5 * (below - above) / bend
+    return _Vertex(middle + half * shift, max(here - 0.5 * bend * shift**2, 0.0) ** 0.5)
+
+
+def _estimate(value: float, judge: _Judge, confident: bool) -> AxisEstimate:
+    tried = sorted(judge.found)
+    curve = np.array([judge.found[each] for each in tried])
+    return AxisEstimate(float(value), np.array(tried), curve, confident, "views held out")

@@ -1,0 +1,62 @@
+"""The rotation axis by views held out: of cones and nearly parallel beams, from far, through noise; and noise alone."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.axis_by_views import axis_by_views
+from recon.base.geometry import Geometry
+from recon.prep.align import AxisError
+
+VIEWS, ROWS, COLS, SOD, SDD = 36, 6, 64, 60.0, 90.0
+BALLS = np.array([[9.0, -4.0, 1.0, 5.0], [-7.0, 6.0, -2.0, 4.0], [-2.0, -10.0, 0.0, 3.0]])  # x, y, z, radius in mm
+ANGLES = 2 * np.pi * np.arange(VIEWS) / VIEWS
+
+
+def _views(axis_col: float, sod: float, sdd: float) -> NDArray[np.float32]:
+    """Balls of density 1, seen from a point: 2 √(r² - d²), with d from each centre to the ray."""
+    u, v = np.arange(COLS) - axis_col, np.arange(ROWS) - (ROWS - 1) / 2
+    ray = np.stack(np.broadcast_arrays(u[None, :], sdd, v[:, None]), axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    views = np.zeros((VIEWS, ROWS, COLS))
+    for view, angle in enumerate(ANGLES):
+        c, s = np.cos(angle), np.sin(angle)
+        for x, y, z, radius in BALLS:
+            ball = np.array([x * c + y * s, sod + y * c - x * s, z])
+            views[view] += 2 * np.sqrt(np.clip(radius**2 - ball @ ball + (ray @ ball) ** 2, 0, None))
+    return views.astype(np.float32)
+
+
+@pytest.mark.parametrize(("sod", "sdd"), [(SOD, SDD), (1e5, 1e5)], ids=["cone", "nearly parallel"])
+@pytest.mark.parametrize("start", [31.5, 24.0])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_the_axis_is_found_to_a_tenth_of_a_column(sod: float, sdd: float, start: float, noise: float) -> None:
+    views = _views(29.2, sod, sdd) + np.random.default_rng(1).normal(0, noise, (VIEWS, ROWS, COLS)).astype(np.float32)
+    found = axis_by_views(views, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, start))
+    assert found.value == pytest.approx(29.2, abs=0.1) and found.confident and found.method == "views held out"
+    assert abs(found.candidates[found.curve.argmin()] - 29.2) <= 1
+
+
+def test_a_right_start_stays_after_three_candidates_and_a_wrong_one_does_not() -> None:
+    views, told = _views(29.2, SOD, SDD), list[int]()
+    right = Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, 29.2)
+    assert axis_by_views(views, right, told.append, near=True).value == 29.2 and told == [1, 2, 3]
+    assert axis_by_views(views, replace(right, axis_col=29.9), near=True).value == pytest.approx(29.2, abs=0.1)
+
+
+def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
+    with pytest.raises(AxisError, match=r"within 12 columns of column 50.0: .* agree best with column"):
+        axis_by_views(_views(29.2, SOD, SDD), Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, 50.0))
+    noise = np.random.default_rng(0).normal(0, 1, (VIEWS, ROWS, COLS)).astype(np.float32)
+    with suppress(AxisError):  # the minimum of noise may lie at an edge
+        assert not axis_by_views(noise, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD)).confident
+
+
+def test_few_views_are_refused() -> None:
+    with pytest.raises(ValueError, match="11 views are too few to hold some out; 12 are needed"):
+        axis_by_views(np.ones((11, ROWS, COLS), np.float32), Geometry.cone(ANGLES[:11], (ROWS, COLS), 1.0, SOD, SDD))
