@@ -149,8 +149,8 @@ def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
-        ((), r"optics.axis_col: .* set its column, here 21\. Nothing was started"),
-        (("devices.camera.binning=2",), r"set its column, here 10\.25\. Nothing"),
+        ((), r"optics.axis_col: .* set it, here 21\. Nothing was started"),
+        (("devices.camera.binning=2",), r"set it, here 10\.25\. Nothing"),
         (("devices.camera.roi=[1100, 2028, 32, 40]",), r"32 of them begin at 1136 then, not at 1100\. Nothing"),
     ],
 )
