@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,12 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
 from drivers.base.frame import FrameKind
+from recon.base.masks import Mask
 from recon.prep.correct import Correction, CorrectionSettings, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
+from recon.prep.defects import SHADOW_REACH, shadowed
 
+_SHADOW_VIEWS, _BAND = 16, 64  # by which a shadow is found, and rows at a time
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
 
 Warn = Callable[[str], None]
@@ -232,6 +236,25 @@ class ScanCorrection:
             )
         return " ".join(said)
 
+    @cached_property
+    def _shadow(self) -> Mask:
+        """[row, col] of the rows read, binned: what stands in the beam of all views of a finished scan."""
+        assert self._references is not None
+        references, first = replace(self._references, dynamic=None), self._widened(None)[0].start
+        found = np.zeros(references.dark.shape, np.bool_)
+        views = np.flatnonzero(self._source.image_key == FrameKind.PROJECTION)
+        if not self._source.finished or views.size < _SHADOW_VIEWS:
+            return found
+        views = views[np.linspace(0, views.size - 1, _SHADOW_VIEWS).astype(int)]
+        for start in range(0, len(found), _BAND):
+            rows = slice(max(0, start - SHADOW_REACH), min(len(found), start + _BAND + SHADOW_REACH))
+            read = slice(first + rows.start * self.binning, first + rows.stop * self.binning)
+            data = np.nan_to_num(read_binned(self._source, views, read, self.binning))
+            plain = Correction(references.rows(rows), self._settings)
+            light = plain.transmission(data, views.astype(np.float64)).data
+            found[start : start + _BAND] = shadowed(light, self._settings.floor)[start - rows.start :][:_BAND]
+        return np.zeros_like(found) if found.all() else found
+
     @property
     def _noise(self) -> str:
         """How counts become line integrals, in words; empty where they are logarithms."""
@@ -305,9 +328,12 @@ class ScanCorrection:
         first = self._widened(None)[0].start
         part = self._widened(rows)[0]
         within = slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
-        references = self._references.rows(within)
+        references, shadow = self._references.rows(within), self._shadow[within]
         try:
-            return Correction(references, self._settings, photons=self.photons)
+            found = Correction(references, self._settings, photons=self.photons)
+            if shadow.any():
+                found = Correction(references, self._settings, found.masked | shadow, self.photons)
+            return found
         except ValueError as error:
             raise self._refusal(error) from error
 

@@ -11,6 +11,9 @@ from scipy import ndimage
 from recon.base.masks import NEIGHBOURS, Image, Mask
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
+_DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median
+SHADOW_REACH = 5
+"""Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row."""
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
 
 
@@ -45,6 +48,29 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
         filled = np.where(dead, response, net)
         hot |= outliers(filled / ndimage.median_filter(filled, 3, mode="nearest"), 0.01)
     return dead | hot
+
+
+def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
+    """Mask [row, col] of areas that no view lights though the flats do: a part of the instrument stands in the beam.
+
+    Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. A sample that turns
+    cannot darken these in all views; an opaque rod on the rotation axis darkens the middle. Two pixels beside an area
+    belong to it: its blurred edge.
+
+    Args:
+        light: float32 [view, row, col], transmission of views all around, three at least.
+        floor: lowest transmission that counts as light.
+    """
+    n = len(light)
+    middle = np.median(light, axis=0)
+    spread = np.median(np.abs(light - middle), axis=0) * _MAD
+    dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
+    dark &= np.partition(light, n - 2, axis=0)[n - 2] < _DIM  # one view may have a zinger
+    block = np.ones((3, 3))
+    dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
+    left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
+    found = left | right[:, ::-1]
+    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))))
 
 
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+import recon
 from beamline.core.errors import DataError
-from beamline.projections import prepare as pipeline
+from beamline.projections import axis as axis_module
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.tilt import spread_views
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
+from recon.base.method import DataUse
 from recon.prep.align import AxisError, AxisEstimate
 from tests.beamline.array_source import ArraySource
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, write_exchange
@@ -209,7 +211,7 @@ def _estimate(value: float, confident: bool) -> AxisEstimate:
 
 
 def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "find_axis", lambda data, angles: _estimate(18.0, False))
+    monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: _estimate(18.0, False))
     data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()]).astype(
         np.uint16
     )
@@ -229,7 +231,7 @@ def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.Monke
     def find_axis(data: object, angles: object) -> AxisEstimate:
         raise AxisError("the best axis, column 0, is at the edge")
 
-    monkeypatch.setattr(pipeline, "find_axis", find_axis)
+    monkeypatch.setattr(axis_module, "find_axis", find_axis)
     path = write_exchange(tmp_path / "scan.h5", SCAN)
     with pytest.raises(DataError, match=r"at the edge.*--axis COLUMN"):
         _prepare(path, Selection())
@@ -258,3 +260,20 @@ def test_of_a_full_turn_the_axis_is_given_pairs_of_opposite_views(views: int) ->
     assert some.size <= 360 and (np.pi - apart).max() <= np.pi / views + 1e-9
     half = np.linspace(0, np.pi, views, endpoint=False)
     assert spread_views(half, 360, np.arange(views)).size == 360
+
+
+def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wall() -> None:
+    scan, warnings = TwoCylinders(shape=(6, 40)), list[str]()
+    counts = scan.counts().astype(np.float32)
+    counts[:, :, :12] = DARK + np.random.default_rng(0).normal(0, 3, counts[:, :, :12].shape)
+    data = np.concatenate([np.full((1, 6, 40), DARK), np.full((1, 6, 40), DARK + BEAM), counts])
+    source = ArraySource(data, [2, 1] + [0] * len(counts), np.concatenate([[np.nan] * 2, scan.angles]))
+    prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
+    assert "35.0% of the detector got no beam: its rays count as not measured." in warnings
+    assert prepared.measured is not None and not prepared.measured[:, :14].any() and prepared.measured[:, 14:].all()
+    assert prepared.axis_col == pytest.approx(scan.axis_col, abs=0.3)
+    use = DataUse(prepared.ray_weights())
+    volume = recon.reconstruct(prepared.projections.data, prepared.geometry, "fista-tv", use=use).volume
+    truth = scan.truth(volume.grid)
+    assert volume.data.max() < 1.5 * truth.max()
+    assert float(volume.data[truth == 0].mean()) < 0.1 * float(truth[truth > 0].mean())
