@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ from recon.prep.correct import Correction, CorrectionSettings, Projections, Refe
 from recon.prep.counts import Photons
 from recon.prep.defects import SHADOW_REACH, shadowed
 
-_SHADOW_VIEWS, _BAND = 16, 64  # by which a shadow is found, and rows at a time
+_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # by which a shadow is found, and rows at a time
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
 
 Warn = Callable[[str], None]
@@ -87,6 +86,7 @@ class ScanCorrection:
         wide, _ = self._widened(None)
         self._n_references = _count_references(source)
         self._references: References | None = None
+        self._shadow: Mask | None = None  # [row, col] of the rows read, binned; None: not looked for
         self.photons: Photons | None = None
         if counted and source.quantity != "counts":
             raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
@@ -118,6 +118,7 @@ class ScanCorrection:
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
         """
+        self._look_for_shadow(frames)
         steps = 1 if self._references is None else _STEPS
         data, frames = self._read(frames, rows, lambda n, of: told(n // steps, of))
         if not frames.size:
@@ -143,6 +144,7 @@ class ScanCorrection:
                 f"{self._source.path}: photons are counted, which needs all views in "
                 f"memory. Give --noise log, or --bin {2 * self.binning}."
             )
+        self._look_for_shadow(frames)
         parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._references is None else 2
         stream, columns, alive = None, (0, 0), []
         if self._references is not None:
@@ -236,16 +238,15 @@ class ScanCorrection:
             )
         return " ".join(said)
 
-    @cached_property
-    def _shadow(self) -> Mask:
-        """[row, col] of the rows read, binned: what stands in the beam of all views of a finished scan."""
+    def _look_for_shadow(self, views: NDArray[np.int64]) -> None:
+        """Find what stands in the beam of all views of a finished scan, by some of these; once."""
+        known = self._references is None or self._shadow is not None
+        if known or not self._source.finished or views.size < _LEAST_VIEWS:
+            return
         assert self._references is not None
         references, first = replace(self._references, dynamic=None), self._widened(None)[0].start
-        found = np.zeros(references.dark.shape, np.bool_)
-        views = np.flatnonzero(self._source.image_key == FrameKind.PROJECTION)
-        if not self._source.finished or views.size < _SHADOW_VIEWS:
-            return found
-        views = views[np.linspace(0, views.size - 1, _SHADOW_VIEWS).astype(int)]
+        found = np.zeros(self._references.dark.shape, np.bool_)
+        views = views[np.linspace(0, views.size - 1, min(views.size, _SHADOW_VIEWS)).astype(int)]
         for start in range(0, len(found), _BAND):
             rows = slice(max(0, start - SHADOW_REACH), min(len(found), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * self.binning, first + rows.stop * self.binning)
@@ -253,7 +254,7 @@ class ScanCorrection:
             plain = Correction(references.rows(rows), self._settings)
             light = plain.transmission(data, views.astype(np.float64)).data
             found[start : start + _BAND] = shadowed(light, self._settings.floor)[start - rows.start :][:_BAND]
-        return np.zeros_like(found) if found.all() else found
+        self._shadow = np.zeros_like(found) if found.all() else found
 
     @property
     def _noise(self) -> str:
@@ -328,10 +329,10 @@ class ScanCorrection:
         first = self._widened(None)[0].start
         part = self._widened(rows)[0]
         within = slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
-        references, shadow = self._references.rows(within), self._shadow[within]
+        references = self._references.rows(within)
         try:
             found = Correction(references, self._settings, photons=self.photons)
-            if shadow.any():
+            if self._shadow is not None and (shadow := self._shadow[within]).any():
                 found = Correction(references, self._settings, found.masked | shadow, self.photons)
             return found
         except ValueError as error:

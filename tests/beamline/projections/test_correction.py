@@ -48,7 +48,7 @@ def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pyt
 
     def dividing(*arguments: Any) -> Any:
         found = transmission(*arguments)
-        after["dividing"] = told[-1][0]
+        after["dividing"] = told[-1][0] if told else 0
         return found
 
     correction = ScanCorrection(source, Selection(), pytest.fail)  # type: ignore[arg-type]
