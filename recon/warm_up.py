@@ -67,7 +67,8 @@ def warm_up(
 def warm_up_rest() -> None:
     """Compile the last kernels of an R2 fit beside a process in `warm_up`, which then finds them in numba's cache.
 
-    So two processor cores compile."""
+    So two processor cores compile.
+    """
     views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
     data = np.ones((_VIEWS, *_SHAPE), np.float32) * np.hanning(_SHAPE[1]).astype(np.float32)
     reconstruct(data, views, FistaTv(tv_weight=0.01).toy())

@@ -53,8 +53,8 @@ class Grid:
         With shifted views it covers every position that is seen by at least half as many views as the position seen
         most often: small alignment shifts change nothing, views that step up and down give all heights.
 
-        If the axis stands off the detector's middle (`Geometry.is_off_middle`), the box is as wide as in `of_field`, for a
-        full turn of such views, whatever the angles. Matter that views see but that has no voxel would be put into others.
+        If the axis stands off the detector's middle (`Geometry.is_off_middle`), the box holds the field of a full turn
+        of such views, as in `of_field`. Matter that views see but that has no voxel would be put into others.
         """
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
         if geometry.is_off_middle:

@@ -153,7 +153,8 @@ def _differences(
 ) -> tuple[F32, F32]:
     """The difference of the views from the volume, and its part that edges explain.
 
-    [view, cell, cell] each, averaged over cells, in standard deviations of noise."""
+    [view, cell, cell] each, averaged over cells, in standard deviations of noise.
+    """
     rows, cols = (n // side for n in geometry.detector_shape)
     # Means over cells: the difference in light, its part explained by edges, the known pixels, the view in light, the
     # light, and the difference.

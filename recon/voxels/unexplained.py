@@ -19,7 +19,8 @@ F32 = NDArray[np.float32]
 
 LIMIT = 0.007
 """Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
-edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md)."""
+edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md).
+"""
 
 _SIGMAS = 4.0  # standard deviations of the noise, above which noise has a share below 1e-3
 _FLIPS = 6
