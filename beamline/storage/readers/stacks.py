@@ -33,7 +33,7 @@ class FrameStack:
 
 
 class Closable(Protocol):
-    """What is closed with the scan."""
+    """An object that is closed with the scan."""
 
     def close(self) -> None: ...
 
@@ -41,7 +41,7 @@ class Closable(Protocol):
 class StacksSource(BaseSource):
     """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
 
-    Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
+    Quantity: "counts" if there are darks and flats, otherwise "unknown".
     """
 
     def __init__(
