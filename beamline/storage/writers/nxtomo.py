@@ -152,8 +152,8 @@ class NXtomoWriter:
 
     @property
     def safe(self) -> int:
-        """Committed frames that are known to be on the disk. After a failed fsync the disk may have lost all frames since
-        the last successful one."""
+        """Committed frames that are known to be on the disk: after a failed fsync it may have lost all since the last
+        successful one."""
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
     def flush(self) -> None:

@@ -58,7 +58,7 @@ def test_truth_and_labels_of_tall_voxels() -> None:
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_labels_are_what_is_at_the_centre(name: str) -> None:
+def test_a_label_names_the_solid_at_the_voxels_centre(name: str) -> None:
     grid = Grid((40, 44, 48), 0.021, centre=(0.02, -0.03, 0.04))
     labels = Phantom.of([SOLIDS[name]]).labels(grid)
     assert labels.dtype == np.uint8
