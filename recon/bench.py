@@ -39,7 +39,7 @@ class Timing:
         name: of the timed call.
         ms: median of the repeats.
         spread_ms: between their quartiles.
-        pairs: Gaussian-pixel pairs that it computes; 0 where there are none.
+        pairs: Gaussian-pixel pairs that it computes; 0 without such pairs.
     """
 
     name: str

@@ -166,7 +166,7 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     """The score to prefer: of those that are level the first that hides nothing and dulls no edges. What loses weak
     matter is not asked, unless all do.
 
-    A volume has dull edges if another level one has steeper edges and follows noise no more. Noise alone makes a volume
+    A volume has dull edges if another level one has steeper edges without following more noise. Noise makes a volume
     steeper where edges are soft. Returns it, and for each level one that is passed over the reason, by its number.
 
     A residual is level with the smallest one if it lies within two of its standard errors (by its scatter over the

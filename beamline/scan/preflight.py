@@ -84,7 +84,7 @@ def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = a
 
     Args:
         runs: where the file would be, for the free disk; the configured folder unless given.
-        remaining: what of the plan is still to be taken.
+        remaining: the part of the plan that is still to be taken.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
@@ -163,7 +163,7 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
 
     Args:
         runs: where the file will be, for the free disk.
-        remaining: what of the plan is still to be taken.
+        remaining: the part of the plan that is still to be taken.
 
     Raises:
         ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot

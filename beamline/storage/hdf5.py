@@ -209,7 +209,7 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator
     """A new file. At the end of the block it is on the disk, and was read back and compared with what was written.
 
     Raises:
-        OSError: the disk did not take it, or holds something else, whenever that was; the file is closed and stays.
+        OSError: the disk refused the bytes or holds others; the file is closed and stays.
     """
     with _written(path, "x", libver) as file:
         yield file
@@ -263,7 +263,7 @@ def text(value: Any) -> str:
 
 
 def attribute(item: h5py.HLObject, name: str) -> str:
-    """An attribute as text; "" where there is none."""
+    """An attribute as text; "" if it is missing."""
     return text(item.attrs[name]) if name in item.attrs else ""
 
 
@@ -276,7 +276,7 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
 
 
 def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
-    """The dataset at a path; None where there is none, or one that can hold nothing (a null dataspace).
+    """The dataset at a path; None if it is missing or can hold nothing (a null dataspace).
 
     Raises:
         DataError: a list longer than any scan.
@@ -300,7 +300,7 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
 
 
 def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians by the `units` attribute, or by `default` where there is none; a column of them is a list."""
+    """Angles in radians by the `units` attribute, or by `default` if it is missing; a column becomes a list."""
     unit = attribute(item, "units") or default
     factor = ANGLE_UNITS.get(unit.lower())
     if factor is None:

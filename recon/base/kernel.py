@@ -30,7 +30,7 @@ class Kernel(StrEnum):
         """The kernel of this exponent, infinite for a Gaussian, as files hold it.
 
         Raises:
-            ValueError: there is none.
+            ValueError: no kernel has this exponent.
         """
         for kernel in cls:
             if kernel.exponent == exponent:

@@ -33,7 +33,7 @@ class Progress:
         loss: running mean of the loss, in normalised units.
         residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.
         n_gaussians, n_views: in the model and in the data.
-        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN where there are none.
+        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN without such views.
         unit: name of the steps of a direct method or of a part of the work, such as slices; loss and residual are then
         NaN.
     """
@@ -89,7 +89,7 @@ class RunControl:
 
 @dataclass(frozen=True, eq=False)
 class ReconProblem:
-    """What a method reconstructs.
+    """The data and the grid of a reconstruction.
 
     Attributes:
         projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
@@ -110,7 +110,7 @@ class ReconProblem:
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What a method returns; the attributes are those of `recon.Reconstruction`.
+    """The result of a method; attributes as in `recon.Reconstruction`.
 
     `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import. `method` names the
     chosen method, if a method chose another one.
@@ -126,7 +126,7 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Traits:
-    """What a method can do beyond turning line integrals into a volume.
+    """Abilities of a method, beyond turning line integrals into a volume.
 
     Attributes:
         direct: one pass without iterations: it has no history, and cannot be stopped.
@@ -158,7 +158,7 @@ class Method(Protocol):
     Attributes:
         name: in commands, files and events.
         label: in reports.
-        traits: what it can do.
+        traits: its abilities.
     """
 
     name: ClassVar[str]

@@ -91,7 +91,7 @@ def axis_from_opposites(
     """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
 
     As `axis_from_pair`, but from the views' slopes along the columns, which share no trend if the overlap is narrow.
-     The sum is over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
+    The sum is over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
     29, 17849).
 
     Args:

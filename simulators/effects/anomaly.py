@@ -20,7 +20,7 @@ Views: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True)
 class Label:
-    """What a monitor should find in a frame.
+    """An anomaly that a monitor should find in a frame.
 
     Attributes:
         kind: the anomaly's name.

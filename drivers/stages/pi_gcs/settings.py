@@ -17,7 +17,7 @@ AXIS_NAME = r"^\w{1,16}$"
 
 
 class Reference(StrEnum):
-    """What the search for the reference goes to."""
+    """The target of the search for the reference."""
 
     SWITCH = "switch"
     NEGATIVE_LIMIT = "negative_limit"

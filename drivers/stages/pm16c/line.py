@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 class PM16CLine:
     """Raises (in all methods):
-    DeviceError: a reply or a read-back is not what it must be. DeviceTimeout: no reply.
+    DeviceError: a wrong reply or read-back. DeviceTimeout: no reply.
     """
 
     def __init__(self, url: str, wiring: Wiring, clock: Clock, name: str) -> None:

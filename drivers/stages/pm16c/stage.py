@@ -170,7 +170,7 @@ class PM16CStage:
                 self._channel.close()
 
     def _send_stop(self, hard: bool) -> str:
-        """What was sent."""
+        """Send a stop; returns the command."""
         if (search := self._search) is not None:
             search.cancel()
         return self._channel.emergency_stop() if hard else self._channel.slow_stop()

@@ -15,7 +15,7 @@ LONGEST_PACKET = 80
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a flag or reason says, and what to do."""
+    """Meaning of a flag or reason, and advice."""
 
     text: str
     advice: str

@@ -227,7 +227,7 @@ class ZaberStage:
                 self._axis.close()
 
     def _send_stop(self, hard: bool) -> str:
-        """What was sent."""
+        """Send a stop; returns the command."""
         return self._axis.stop("estop" if hard else "stop")
 
     def _stand_at(self, counts: int, stops: int) -> None:
