@@ -105,7 +105,7 @@ def row_settings(methods: Sequence[str], options: dict[str, Any]) -> dict[str, d
 
 
 def method_with(name: str, options: Mapping[str, Any]) -> Method:
-    """The method of this name, with those of the options that are settings of it.
+    """The method of this name, with the given options that are settings of it.
 
     Args:
         name: in `recon.methods`, or of `recon.Auto`.
@@ -156,7 +156,7 @@ def preset_of(method: str | None, preset: str | None) -> str | None:
 
 
 def _of_kind(method: type[Method], path: str, value: Any) -> Any:
-    """The value of a setting, if its kind is that of the method's default; None leaves the choice to the method."""
+    """The value of a setting, if it has the kind of the method's default; None leaves the choice to the method."""
     if not has_setting(method, path):
         return value  # `build` names the methods that have the setting
     own: Any = method()

@@ -37,11 +37,11 @@ _LEVEL = 0.3  # dB: by the curves of four scans such methods are level
 
 @dataclass(frozen=True, eq=False)
 class Budgeted:
-    """A reconstruction within a time.
+    """A reconstruction within a time limit.
 
     Attributes:
         result: of the reconstruction.
-        prepared: the views it is of, with binned pixels if the choice bins them.
+        prepared: the reconstructed views, with binned pixels if the choice bins them.
         choice, speeds: what was chosen, and the measurements behind it.
         because: why this method, in words; empty if there was no other.
         seconds: of everything, calibration included.

@@ -61,7 +61,7 @@ class Recovered:
     remark: str = ""
 
     def said(self) -> str:
-        """A line for people."""
+        """The result as one line of text."""
         wrong = f"; what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"

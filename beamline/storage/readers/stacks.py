@@ -136,7 +136,7 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
 
 
 def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
-    """The dataset at a path; DataError where there is none, with those that the file has."""
+    """The dataset at a path. Without one, DataError lists the datasets of the file."""
     item = hdf5.dataset(file, where)
     if item is None:
         raise DataError(f"{file.filename} has no dataset {where}. {datasets_text(file)}")
