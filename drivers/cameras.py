@@ -15,20 +15,20 @@ class CameraDriver(Protocol):
     """A driver's class, which the entry point of a package names.
 
     Attributes:
-        Settings: a frozen dataclass of what it is opened with; its fields say with `drivers.stages.settings.key` how a
-            configuration writes them.
+        Settings: a frozen dataclass of its settings; fields say with `drivers.stages.settings.key` how a configuration
+        writes them.
     """
 
     Settings: type[Any]
 
     def __call__(self, settings: Any, clock: Clock) -> Camera:
-        """The driver, connected. Raises DeviceError where there is no such camera."""
+        """The driver, connected. Raises DeviceError if there is no such camera."""
         ...
 
     def timing_of(self, settings: Any, wanted: CameraSettings) -> CameraTiming:
-        """What the camera will say of its timing, before it is connected. ValueError for what it would refuse."""
+        """The camera's timing, before it is connected. ValueError for settings that it would refuse."""
         ...
 
 
 CAMERAS: Mapping[str, CameraDriver] = plugins("camera", ("dcam", "simulated_orca"), with_keys)
-"""Kind, as a configuration names it -> the driver."""
+"""Kind in a configuration -> the driver."""

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class FlatField:
-    """A field that is no dataclass itself, of one type or None. `default` is MISSING where it has to be given."""
+    """A field of a plain type, or that type or None. `default` is MISSING if a value must be given."""
 
     name: str
     type: Any
@@ -32,7 +32,7 @@ class FlatField:
 
     @property
     def optional(self) -> bool:
-        """It may be None."""
+        """Whether it may be None."""
         return self.plain is not self.type
 
 
@@ -55,10 +55,10 @@ def _fields_of(settings: type[Any], defaults: Any) -> list[FlatField]:
 
 
 def from_flat(settings: type[T], values: Mapping[str, Any]) -> T:
-    """The dataclass with these values; what is not given is left at its default.
+    """The dataclass with these values; other fields have their defaults.
 
     Raises:
-        TypeError: a name that no field has, or a field without default that is not given.
+        TypeError: no field has the name, or a field without default is missing.
         ValueError: values that the dataclass, or a nested one, refuses.
     """
     known = {field.name for field in flat_fields(settings)}

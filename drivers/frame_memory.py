@@ -1,4 +1,4 @@
-"""FrameMemory: memory of frames that is used again. To get new memory for each costs more than to copy its pixels."""
+"""FrameMemory: reused memory of frames. New memory for each frame would cost more than copying its pixels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if sys.platform == "win32":
 
     def _lock(address: int, size: int) -> None:
         kernel, this = ctypes.WinDLL("kernel32", use_last_error=True), ctypes.c_void_p(-1)
-        least, most = ctypes.c_size_t(), ctypes.c_size_t()  # of the pages that Windows keeps of the process
+        least, most = ctypes.c_size_t(), ctypes.c_size_t()  # pages that Windows keeps of the process
         if not (
             kernel.GetProcessWorkingSetSize(this, ctypes.byref(least), ctypes.byref(most))
             and kernel.SetProcessWorkingSetSize(
@@ -41,9 +41,9 @@ else:
 
 
 class FrameMemory:
-    """Gives memory for frames, and takes it back when nobody holds the frame, or a part of it, any longer.
+    """Gives memory for frames, and takes it back when the frame and all its parts are released.
 
-    Keeps as many buffers as there were frames at one time. May be used from any thread.
+    It keeps as many buffers as there were frames at one time. May be used from any thread.
     """
 
     def __init__(self) -> None:
@@ -51,15 +51,15 @@ class FrameMemory:
         self._bytes = 0
 
     def prepare(self, n: int, shape: tuple[int, int]) -> str:
-        """Get memory for so many frames of a shape now, with every page of it there, and locked: not to be swapped out.
+        """Allocate memory for so many frames of a shape, with all pages present and locked against swapping.
 
-        In place of what was kept so far; memory for further frames is got when they come.
+        It replaces the kept buffers. Further frames allocate memory when they come.
 
         Returns:
-            why it is not locked, in the system's words, such as that the user may not; "" where it is.
+            the system's reason if it is not locked, such as a missing permission; "" if it is locked.
 
         Raises:
-            OSError: there is not so much memory. Then none is kept.
+            OSError: there is too little memory. No buffer is kept then.
         """
         wanted = 2 * shape[0] * shape[1]
         self._free, self._bytes = deque(), wanted
@@ -69,7 +69,7 @@ class FrameMemory:
         memory = _mapped(n * slot)
         pages, why = np.frombuffer(memory, np.uint8), ""
         try:
-            _lock(pages.ctypes.data, pages.size)  # until it is given back to the system
+            _lock(pages.ctypes.data, pages.size)  # until the system gets it back
         except OSError as error:
             why = error.strerror or str(error)
         pages[:: mmap.PAGESIZE] = 0
@@ -77,14 +77,14 @@ class FrameMemory:
         return why
 
     def take(self, shape: tuple[int, int]) -> NDArray[np.uint16]:
-        """An array uint16 [row, col] of any content, in memory that no other array shares."""
+        """An array uint16 [row, col] of arbitrary content, in memory of its own."""
         wanted = 2 * shape[0] * shape[1]
-        if wanted != self._bytes:  # frames of another size that come back go to the list that is dropped here
+        if wanted != self._bytes:  # frames of another size return to the list that is dropped here
             self._free, self._bytes = deque(), wanted
         try:
             memory = self._free.pop()
         except IndexError:
             memory = bytearray(wanted)
-        whole = np.frombuffer(memory, "<u2")  # every view of it, and of its views, holds it: a bytearray is no array
+        whole = np.frombuffer(memory, "<u2")  # every view holds the bytearray, also views of views
         weakref.finalize(whole, self._free.append, memory).atexit = False
         return whole.reshape(shape)

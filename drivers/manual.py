@@ -12,7 +12,7 @@ class ManualShutter:
     """Implements `drivers.base.protocols.Shutter` by asking the operator.
 
     The state of the shutter at the start is not known, so the first `open` or `close` always asks. Later ones ask only
-    where the state changes.
+    if the state changes.
     """
 
     by_hand = True

@@ -1,6 +1,6 @@
 """ORCA-Quest data sheet: limits of settings and timing, for planning without a camera.
 
-C15550-20UP: limits and line times from the vendor's property table; where a camera is connected, its own values take
+C15550-20UP: limits and line times from the vendor's property table; the values of a connected camera take
 precedence. Two rows are read together in one line time, so row r starts r / 2 line times after row 0.
 """
 
@@ -47,7 +47,7 @@ def refusal(settings: CameraSettings) -> str:
 def timing(settings: CameraSettings, link: str = "usb3") -> CameraTiming:
     """Frame shape and timing under external or software triggers: readout does not overlap the next exposure.
 
-    The shortest period is exposure + readout, or the transfer time of a frame where that is longer.
+    The shortest period is exposure + readout, or the transfer time of a frame if that is longer.
 
     Raises:
         ValueError: the camera would refuse the settings.

@@ -1,7 +1,7 @@
-"""Plug-ins: what other installed packages add to a registry, by entry points of the group `splatline.KIND`.
+"""Plug-ins: additions of other installed packages to a registry, by entry points of the group `splatline.KIND`.
 
 KIND is method, correction, reader, volume_format, stage, wire, camera, check or effect; the entry point's name is the
-name of what it adds. A registry asks when it is first used, so that a program which needs none of them starts quickly.
+name of the addition. A registry asks at its first use, so that programs without it start quickly.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ _PREFIX = "splatline."
 def plugins(
     kind: str, taken: Collection[str], made: Callable[[str, Any], Any] = lambda name, found: found
 ) -> dict[str, Any]:
-    """What other packages add to a registry, by name, in the order of the names.
+    """The additions of other packages to a registry, by name, in the order of the names.
 
     Args:
         kind: of the registry, as above.
         taken: names that the registry has itself.
-        made: entry of the registry for a name and what its entry point loads; ValueError where it does not fit.
+        made: makes the registry's entry from a name and the loaded object; ValueError if the object does not fit.
 
     Warns:
-        UserWarning: for each plug-in that is left out: its name is taken, or it cannot be loaded, or it does not fit.
+        UserWarning: a plug-in is left out because its name is taken, it cannot be loaded, or it does not fit.
     """
     announced = sorted(point for point in _announced() if point.group == _PREFIX + kind)
     times, found = Counter(point.name for point in announced), dict[str, Any]()
@@ -49,6 +49,6 @@ def plugins(
 
 @cache
 def _announced() -> tuple[EntryPoint, ...]:
-    """Of all installed packages; reading them takes a tenth of a second, once a process."""
+    """Entry points of all installed packages; reading them takes a tenth of a second, once a process."""
     found = entry_points()
     return tuple(point for group in found.groups if group.startswith(_PREFIX) for point in found.select(group=group))

@@ -13,7 +13,7 @@ class OutputShutter:
     """Implements `drivers.base.protocols.Shutter` on a controller's output.
 
     Reading back checks the output, not the blade: only the beam shows whether the shutter moved. `close` always sends
-    its command, also where the shutter is known to be closed.
+    its command, even if the shutter is known to be closed.
 
     Args:
         output: the line that drives the shutter.
@@ -39,7 +39,7 @@ class OutputShutter:
         if not (math.isfinite(settle) and settle >= 0):
             raise DeviceRefused(name, f"the settling time of {settle} s is not valid", expected="0 or more seconds")
         self._output, self._clock, self._open_high, self._settle = output, clock, open_high, settle
-        self._open: bool | None = None  # as last sent; None before that, and after a failure
+        self._open: bool | None = None  # level last sent; None before the first command, and after a failure
 
     def open(self) -> None:
         """Open and wait for the blade. Raises DeviceError: the output refused the level or does not hold it."""
@@ -80,7 +80,7 @@ class OutputShutter:
         self._open = opened
 
     def _not_set(self, opened: bool, level: bool, cause: DeviceError) -> DeviceError:
-        """The error of the output as an error of the shutter."""
+        """Turn an error of the output into an error of the shutter."""
         return DeviceError(
             self.name,
             f"it could not be {'opened' if opened else 'closed'}: {cause.device}: {cause.problem}",

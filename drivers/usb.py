@@ -51,7 +51,7 @@ class Preflight:
 def preflight(
     vendor: int = HAMAMATSU, product: int | None = None, serial: str | None = None, backend: Any = None
 ) -> Preflight:
-    """Look for one camera on USB; every outcome is a verdict, none an exception.
+    """Look for one camera on USB; every outcome is a verdict, never an exception.
 
     Args:
         vendor, product: USB ids; without the product id other devices of the vendor match too.
@@ -66,7 +66,7 @@ def preflight(
         return Preflight(Verdict.UNKNOWN, "USB cannot be checked: libusb is not installed on this machine.")
     except usb.core.USBError as error:
         return Preflight(Verdict.UNKNOWN, f"USB cannot be checked: {error}.")
-    # A device whose serial number cannot be read may be the one wanted.
+    # A device whose serial number cannot be read may be the requested one.
     devices = tuple(device for device in found if not (serial and device.serial and device.serial != serial))
     if not devices:
         which = f"{wanted} with serial number {serial}" if serial else wanted
@@ -91,7 +91,7 @@ def _describe(device: Any) -> UsbDevice:
     for index in (device.iProduct, device.iSerialNumber):
         try:
             texts.append(usb.util.get_string(device, index) or "")
-        except (usb.core.USBError, ValueError, NotImplementedError):  # no permission, or no language: no name
+        except (usb.core.USBError, ValueError, NotImplementedError):  # no name without permission or language
             texts.append("")
     usb.util.dispose_resources(device)  # so that the vendor's driver can open it
     name, serial = (text.strip("\0 ") for text in texts)

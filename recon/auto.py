@@ -52,9 +52,9 @@ class Auto:
 
     @property
     def longer_fit(self) -> Method | None:
-        """A fit with more sweeps, tried where the fit is not taken, and preferred to all others.
+        """A fit with more sweeps, tried if the fit is not taken, and then preferred to all others.
 
-        A fit chooses its sweeps by views that it knows already, which asks for too few where it is far off.
+        A fit chooses its sweeps by views that it already knows, so it makes too few if it is far off.
         """
         first = self.candidates[0]
         return with_settings(first, {"finish": 3 * SWEEPS}) if getattr(first, "finish", 0) is None else None
@@ -80,7 +80,7 @@ class Auto:
         return replace(found, settings=settings, method=chosen.name)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> tuple[int, str]:
-        """Which of the methods to take, and why."""
+        """The chosen method and the reason."""
         wider = [n for n, method in enumerate(self.methods) if method.traits.any_grid]
         if wider and is_wider(problem):
             name = self.methods[wider[0]].name
@@ -101,6 +101,6 @@ class Auto:
 
 
 def is_wider(problem: ReconProblem) -> bool:
-    """Whether the sample leaves the field, by some of the views: only methods with the trait `any_grid` model that."""
+    """Whether some views show that the sample leaves the field; only methods with the trait `any_grid` model this."""
     some = of_views(problem, np.arange(0, problem.geometry.n_views, max(1, problem.geometry.n_views // 32)))
     return leaves_the_field(masked(some.projections, some.use.weights)[0], some.geometry)

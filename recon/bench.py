@@ -36,10 +36,10 @@ class Timing:
     """The time that a call takes.
 
     Attributes:
-        name: of what was timed.
+        name: of the timed call.
         ms: median of the repeats.
         spread_ms: between their quartiles.
-        pairs: Gaussian-pixel pairs that it computes; 0 where there are none.
+        pairs: Gaussian-pixel pairs that it computes; 0 without such pairs.
     """
 
     name: str
@@ -85,7 +85,7 @@ def standard_case(n: int = N_GAUSSIANS, side: int = SIDE) -> tuple[Gaussians, Ge
 
 
 def kernel_timings(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: int = 21) -> list[Timing]:
-    """Footprints, a view (footprints and image), and its way back, of the standard case."""
+    """Times of footprints, a view (footprints and image) and its backward pass, of the standard case."""
     gaussians, view = standard_case(n, side)
     a = gaussians.arrays()
     active = Active.of(a["means"], a["log_scales"], a["quaternions"], a["raw_densities"], gaussians.density_unit)
@@ -120,7 +120,7 @@ def step_timing(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: int
         result = reconstruct(data, views, fit, grid=point, control=RunControl(now=now))
         first, last = result.history[0], result.history[-1]
         paces.append(1e3 * (last.seconds - first.seconds) / max(1, last.step - first.step))
-    low, middle, high = np.percentile(paces[1:], (25, 50, 75))  # the first one may compile
+    low, middle, high = np.percentile(paces[1:], (25, 50, 75))  # the first step may compile
     return Timing("step", float(middle), float(high - low))
 
 

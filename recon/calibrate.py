@@ -28,7 +28,7 @@ Clock = Callable[[], float]
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60
 _STEP_VIEWS, _STEPS = 4, 6
-_SWEPT_ROWS = 64  # fewer rows take longer each: 1.5 times at 16
+_SWEPT_ROWS = 64  # fewer rows take longer for each row: 1.5 times at 16
 
 
 def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
@@ -41,7 +41,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     Args:
         projections: [view, row, col], line integrals.
         geometry: of the views.
-        grid: of the volume that is wanted.
+        grid: of the requested volume.
         now: a clock in s.
 
     Raises:
@@ -80,7 +80,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
 
 
 def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
-    """A few views of the rows with most in them."""
+    """A few views of the rows with most matter."""
     rows = geometry.detector_shape[0]
     height = min(_SLAB_ROWS, rows)
     views = _around(geometry, _SLAB_VIEWS)
@@ -94,7 +94,7 @@ def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
 
 
 def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
-    """So many Gaussians where a coarse first volume shows matter, as wide as placing makes them."""
+    """`count` Gaussians where a coarse first volume shows matter, with the widths of placed ones."""
     factor = max(1, min(-(-geometry.detector_shape[1] // _COARSE_COLS), geometry.detector_shape[0]))
     views = _around(geometry, _COARSE_VIEWS)
     coarse = geometry.select(views).binned(factor)
@@ -108,7 +108,7 @@ def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
     k, j, i = np.unravel_index(rng.choice(cells, count), grid.shape)
     z, y, x = grid.coordinates()
     means = np.stack((x[i], y[j], z[k]), 1) + (rng.random((count, 3)) - 0.5) * grid.spacing[::-1]
-    # Root mean square distance of a random point to its three nearest neighbours: 0.75 of a cell for one of them each.
+    # Root mean square distance of a random point to its three nearest neighbours: 0.75 of a cell with one point each.
     distance = 0.75 * (cells.size * float(np.prod(grid.spacing)) / count) ** (1 / 3)
     width = max(0.8 * distance, 0.5 * geometry.sample_pitch)
     return Gaussians.from_physical(
@@ -117,7 +117,7 @@ def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:
 
 
 def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians, now: Clock) -> tuple[float, float]:
-    """(s a step, s for each view before the first one): what a short fit's own record says."""
+    """(s a step, s for each view before the first step), from a short fit's own record."""
     views = _around(geometry, _STEP_VIEWS)
     point = Grid((1, 1, 1), grid.voxel_size)  # filling a volume is measured elsewhere
     fit = R2(steps=_STEPS, gaussians=gaussians, fit=FitSettings(policy=None))
@@ -129,7 +129,7 @@ def _step(projections: F32, geometry: Geometry, grid: Grid, gaussians: Gaussians
 
 
 def _around(geometry: Geometry, most: int) -> NDArray[np.int64]:
-    """Some views from all around, so that they need the same kind of first volume as all of them."""
+    """Some views from all around, so that they need the same kind of first volume as all views."""
     n = geometry.n_views
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     return np.sort(order[np.arange(min(n, most)) * n // min(n, most)])

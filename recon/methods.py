@@ -1,6 +1,6 @@
 """The registry of reconstruction methods: one line a method. Adding one takes its file and its line here.
 
-A line says where the method's class is, so that its name is known without loading what it computes with.
+A line says where the method's class is, so that its name is known without loading its libraries.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Entry:
     Attributes:
         module, cls: of its settings class, see `recon.base.method.Method`.
         streams: it has `stream`, so that its volume can grow while views arrive.
-        compared: a trade-off tries it where no methods are named; not one that takes many times as long as all others.
+        compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
     """
 
     module: str
@@ -45,19 +45,19 @@ REGISTRY: dict[str, Entry] = {
 }
 
 DEFAULT = "r2"
-"""The method where none is named."""
+"""The default method."""
 
 BASELINE = "fbp"
-"""The method that reports compare all others with."""
+"""Reports compare all methods with this one."""
 
 
 def names() -> tuple[str, ...]:
-    """Names of all methods; loads none of ours."""
+    """Names of all methods; loads no module of ours."""
     return tuple(_entries())
 
 
 def names_compared() -> tuple[str, ...]:
-    """Names of the methods that a trade-off tries where none are named; loads none of them."""
+    """Names of the methods that a trade-off tries by default; loads no module of ours."""
     return tuple(name for name, entry in REGISTRY.items() if entry.compared)
 
 
@@ -95,10 +95,10 @@ def has_setting(method: type[Method], field: str) -> bool:
 
 
 def build(method: type[Method], settings: Mapping[str, Any]) -> Method:
-    """A method with these settings, by name as in `taking`, and its defaults for all others.
+    """A method with these settings, by name as in `taking`; other settings have their defaults.
 
     Raises:
-        ValueError: the method does not have such a setting, or not with such a value.
+        ValueError: the method lacks the setting, or refuses the value.
     """
     for name in settings:
         if not has_setting(method, name):
@@ -122,13 +122,13 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
 
 
 def with_trait(trait: str) -> tuple[str, ...]:
-    """Names of the methods that can do something, by a field of `recon.base.method.Traits`."""
+    """Names of the methods with a trait, a field of `recon.base.method.Traits`."""
     return tuple(name for name in _entries() if getattr(by_name(name).traits, trait))
 
 
 @cache
 def _entries() -> Mapping[str, Entry]:
-    """Ours, and those of other packages."""
+    """Our methods, and those of other packages."""
 
     def made(name: str, method: type[Method]) -> Entry:
         if method.name != name:

@@ -51,7 +51,7 @@ class Reconstruction:
         return f"Reconstruction({self.method}: {self.volume!r}, {self.seconds:.3g} s{model})"
 
     def _repr_html_(self) -> str:
-        """For a notebook: the volume's middle slices, and how they came about."""
+        """For a notebook: the volume's middle slices, its method and its settings."""
         pixels, (low, high) = middle_slices(self.volume.data)
         facts = {"result": repr(self)[15:-1], "grey": f"black {low:.4g}, white {high:.4g}"}
         if self.history and np.isfinite(self.history[-1].residual):
@@ -62,7 +62,7 @@ class Reconstruction:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
 
         Arrays: `volume` float32 [z, y, x] in 1/mm, `voxel_mm`, `centre_zyx_mm`, `method`, `seconds`, and `settings`,
-        JSON of those that are no arrays. Written as a whole or not at all.
+        JSON of those that are not arrays. Written as a whole or not at all.
 
         Raises:
             ValueError: another suffix.
@@ -112,15 +112,15 @@ def reconstruct(
             small box holds what the whole volume holds there.
         seed: of every random choice; the same seed gives the same volume on the same machine and number of threads.
         device: that the method computes on, "cpu" or "cuda" (the current CUDA device).
-        use: weights of the rays and views held out; None: all rays alike, all views used.
+        use: weights of the rays and views held out; None: equal weights, all views used.
         control: how to watch, end and continue the reconstruction.
 
     Raises:
-        ValueError: for an unknown method, shapes that disagree, views from one side only, data without matter, or
-            what the method does not take: views held out, a device, checkpoints, or these views.
+        ValueError: for an unknown method, shapes that disagree, views from one side only, or data without matter. Also
+        for an argument that the method does not take: views held out, a device, checkpoints, or these views.
 
     Warns:
-        UserWarning: where angles look like degrees or projections like counts; the reconstruction goes on.
+        UserWarning: angles look like degrees, or projections like counts; the reconstruction goes on.
     """
     if isinstance(method, type):
         raise ValueError(
@@ -176,7 +176,7 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
 
 
 def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
-    """Line integrals, and their weights beside those that were given."""
+    """Line integrals, and their weights times the given ones."""
     shape, expected = np.shape(counts.counts), (geometry.n_views, *geometry.detector_shape)
     if shape != expected:
         raise ValueError(f"counts have shape {shape}, the geometry says {expected} [view, row, col]")
@@ -193,5 +193,5 @@ def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.fl
     expected = (geometry.n_views, *geometry.detector_shape)
     if given.shape != expected:
         raise ValueError(f"projections have shape {given.shape}, the geometry says {expected} [view, row, col]")
-    with np.errstate(over="ignore"):  # what float32 cannot hold counts as not finite
+    with np.errstate(over="ignore"):  # values beyond float32's range count as not finite
         return np.ascontiguousarray(given, np.float32)

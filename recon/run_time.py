@@ -1,4 +1,4 @@
-"""How long a reconstruction will take, from a second or two of small runs on this machine."""
+"""Run time: predicts how long a reconstruction will take, from a second or two of small runs on this machine."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Decided = Mapping[str, Sequence[Any]]
 _SWEPT_ROWS, _SWEPT_COLS, _VIEWS = 32, 256, (72, 216)
 _SWEEPS = 4  # iterations that are timed
 _TRIED = 72, 192, 16  # views, columns and rows of trials of a weight
-_COMPILED = 24, 64, 16  # likewise, of a run that compiles
+_COMPILED = 24, 64, 16  # the same for a run that compiles
 _FEW_ROWS = 16  # of FBP and fits
 _FIT_COLS, _FIT_VIEWS = 128, 108
 _FBP_COLS, _FBP_VIEWS = 512, 180
@@ -43,12 +43,12 @@ _STEPS = 12  # of a small fit
 
 @dataclass(frozen=True)
 class Extent:
-    """How much a reconstruction works on.
+    """The size of a reconstruction.
 
     Attributes:
         views, cols: of the scan.
         heights: slices of each slab, with its halo.
-        decided: another slab has already decided what follows from the data.
+        decided: another slab has already made the decisions that follow from the data.
     """
 
     views: int
@@ -62,9 +62,9 @@ class Extent:
 
 
 def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
-    """Seconds that the method takes, without reading and correction; of `auto`, where it chooses its first candidate.
+    """Seconds that the method takes, without reading and correction; `auto` is taken to choose its first candidate.
 
-    Iterations cost views times voxels and, for what they do to the volume alone, voxels; a weight of total variation is
+    Iterations cost views times voxels, plus voxels for their work on the volume alone. A weight of total variation is
     chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover.
     """
     if isinstance(method, IterativeMethod):
@@ -94,7 +94,7 @@ def _of_iterations(method: Method, iterations: int, extent: Extent, now: Clock) 
 
 
 def _of_sweeps(method: Method, size: tuple[int, int, int], decided: Decided, now: Clock) -> tuple[float, float]:
-    """Seconds of an iteration, and of what goes before the first."""
+    """Seconds of an iteration, and seconds before the first one."""
     one, last = (_took(method, size, n, Decisions(0, decided), now)[0] for n in (1, 1 + _SWEEPS))
     sweep = (last - one) / _SWEEPS
     return sweep, one - sweep
@@ -103,7 +103,7 @@ def _of_sweeps(method: Method, size: tuple[int, int, int], decided: Decided, now
 def _took(
     method: Method, size: tuple[int, int, int], iterations: int, decide: Decisions, now: Clock
 ) -> tuple[float, Decided]:
-    """Seconds of so many iterations, and what was decided."""
+    """Seconds of so many iterations, and their decisions."""
     geometry, data = _sample(*size)
     one = with_settings(method, {"iterations": iterations})
     begin = now()

@@ -1,4 +1,4 @@
-"""MethodConformance: what every reconstruction method does, as a pytest class that a method's tests subclass.
+"""MethodConformance: the laws of every reconstruction method, as a pytest class that a method's tests subclass.
 
 class TestMine(MethodConformance):
     @pytest.fixture
@@ -87,7 +87,7 @@ class MethodConformance:
             assert result.history == ()
         else:
             assert told and result.history
-            assert result.history[-1].step <= 2  # it asked before the third
+            assert result.history[-1].step <= 2  # it stopped before the third
 
     def test_its_toy_runs_and_its_memory_grows_with_the_volume(self, method: Method) -> None:
         assert type(method.toy()) is type(method)

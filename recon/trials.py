@@ -24,12 +24,12 @@ from recon.voxels.unexplained import LIMIT, unexplained
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-ROWS = 32  # of a slab; enough for total variation along z
+ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
-_MATTER = 0.1  # of the largest line integrals
-_ENOUGH = 0.5  # of the matter in the fullest rows
+_MATTER = 0.1  # share of the largest line integrals
+_ENOUGH = 0.5  # share of the matter in the fullest rows
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
-_DULL = 0.8  # of the steepness of another volume that is as good in all else
+_DULL = 0.8  # share of the steepness of another volume that is otherwise as good
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class Score:
         residual_seen: the same of views that it was made from, their mean.
         steepness: of its edges, over those of the steepest volume that was tried, see `edge_steepness`.
         loses: it lost weak matter that a direct method shows, see `lost_mass`.
-        hides: says whether it leaves structure in its own views, see `unexplained`; asked where others are level.
+        hides: tells whether it leaves structure in its own views, see `unexplained`; called only if others are level.
     """
 
     at: int
@@ -61,7 +61,7 @@ class Score:
 
     @property
     def overfit(self) -> float:
-        """By what factor it misses views held out by more than its own: above 1 it follows the noise of its own."""
+        """Ratio of the residuals of views held out and of its own views; above 1 it follows the noise of the latter."""
         return max(1.0, self.residual / self.residual_seen) if self.residual_seen > 0 else 1.0
 
     @property
@@ -166,7 +166,7 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     """The score to prefer: of those that are level the first that hides nothing and dulls no edges. What loses weak
     matter is not asked, unless all do.
 
-    A volume has dull edges if another level one has steeper edges and follows noise no more. Noise alone makes a volume
+    A volume has dull edges if another level one has steeper edges without following more noise. Noise makes a volume
     steeper where edges are soft. Returns it, and for each level one that is passed over the reason, by its number.
 
     A residual is level with the smallest one if it lies within two of its standard errors (by its scatter over the
@@ -208,7 +208,7 @@ def _standard_error(values: F64) -> float:
 def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
     """A part of the problem for trials, and its name: a slab of so many rows, or all rows with binned pixels.
 
-    None where nothing can be held out or projected, and why.
+    None if nothing can be held out or projected, with the reason.
     """
     geometry, (rows, cols) = problem.geometry, problem.geometry.detector_shape
     data, weights = problem.projections, problem.use.weights
@@ -239,7 +239,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
 
 
 def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
-    """So many rows in the middle of a cone and the box that holds their rays; None where little matter is there."""
+    """So many rows in the middle of a cone and the box that holds their rays; None if they have little matter."""
     geometry, grid, weights = problem.geometry, problem.grid, problem.use.weights
     first = round(geometry.axis_row - (height - 1) / 2)
     rows = slice(first, first + height)

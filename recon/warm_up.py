@@ -40,7 +40,7 @@ def warm_up(
     """Reconstruct a toy: a fit takes 1 to 2 minutes the first time on a machine, a fraction of a second later.
 
     numba keeps what it compiles beside the package (or in the user's cache folder), once for each kind of processor.
-    What another kind of geometry, first volume or ray needs is compiled for it alone. Leaning views, a cone or weights
+    Kernels for another kind of geometry, first volume or ray are compiled only for it. Leaning views, a cone or weights
     add a sixth of that time. A start by TV adds a third, a short scan of a cone with exact rays two thirds.
 
     Args:
@@ -48,7 +48,7 @@ def warm_up(
         geometry: of the run to come; None: a parallel beam, straight.
         device: that it will compute on.
         weighted: its rays have weights, or values that are not finite.
-        on_kernel: called with the number of functions compiled so far, after each; never where all are there.
+        on_kernel: called with the number of functions compiled so far, after each; never if all are cached.
 
     Raises:
         ValueError: the method does not take such views.
@@ -65,8 +65,10 @@ def warm_up(
 
 
 def warm_up_rest() -> None:
-    """Compile what an R2 fit needs last, beside a process in `warm_up`, which finds it in numba's cache when it comes
-    to it: two processor cores compile."""
+    """Compile the last kernels of an R2 fit beside a process in `warm_up`, which then finds them in numba's cache.
+
+    So two processor cores compile.
+    """
     views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
     data = np.ones((_VIEWS, *_SHAPE), np.float32) * np.hanning(_SHAPE[1]).astype(np.float32)
     reconstruct(data, views, FistaTv(tv_weight=0.01).toy())
@@ -96,7 +98,7 @@ def _counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
 def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
     """Line integrals [view, row, col] of a blob in four small views for which the same kernels run as for `geometry`.
 
-    They are so in the beam, in whether views lean or are shifted, and in whether they stand all around.
+    The views agree with `geometry` in the beam, in roll, tilt and shifts, and in whether they stand all around.
     """
     if geometry is None or not geometry.is_cone:
         views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
@@ -107,7 +109,7 @@ def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
         views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
     if geometry is not None:
         leaning = (geometry.roll != 0) | (geometry.tilt != 0)
-        # Where some views lean and others do not, so it is here.
+        # If only some views lean, the same holds here.
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
     width = 2 * views.sample_pitch

@@ -1,8 +1,8 @@
 """Python for operators: connect to the instrument, scan, watch, judge and reconstruct, from a script or a notebook.
 
-`docs/python.md` begins with three scripts. Everything here calls what the commands call: files, checks, messages and
-errors are the same. Importing this package loads neither torch nor a driver; what a function needs is loaded when it is
-called first.
+`docs/python.md` begins with three scripts. Everything here calls the functions behind the commands: files, checks,
+messages and errors are the same. Importing this package loads neither torch nor a driver; each function loads
+its modules at its first call.
 """
 
 from __future__ import annotations

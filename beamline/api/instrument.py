@@ -1,4 +1,4 @@
-"""The instrument of a script: devices that stay open over many scans, and what a scan gave."""
+"""The instrument of a script: devices that stay open over many scans, and the results of scans."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from drivers.manual import Ask
 
 Tell = Callable[[str], None]
 
-_OF_A_SCAN = ("roi", "binning", "readout")  # of the camera, which each scan sets anew
+_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets anew
 
 
 def to_stderr(text: str) -> None:
     """Print a sentence as the commands do."""
-    with suppress(OSError, ValueError, AttributeError):  # the terminal was closed, or there is none
+    with suppress(OSError, ValueError, AttributeError):  # the terminal is closed or missing
         sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
 
 
 @dataclass(frozen=True)
 class ScanResult:
-    """What a scan gave.
+    """The result of a scan.
 
     Attributes:
         path: the scan file; its folder holds everything else of the run.
@@ -45,13 +45,13 @@ class ScanResult:
         frames: in the file.
         missing: planned rows without a frame.
         flags: frames that the monitor flagged: their number by check, then by level.
-        alarms: frames with an alarm, without those that were taken again.
-        retaken: views that were taken again, because they had an alarm or gave no frame.
-        reference_faults: what is wrong with darks and flats, a text for each group.
+        alarms: frames with an alarm, without repeated ones.
+        retaken: views that were repeated, because they had an alarm or gave no frame.
+        reference_faults: faults of darks and flats, a text for each group.
         status: `complete`, `stopped` or `failed`.
         seconds: real time of the scan.
         bytes: of the file.
-        volume: file of the reconstruction; None without one, or where it failed.
+        volume: file of the reconstruction; None without one, or if it failed.
     """
 
     path: Path
@@ -74,7 +74,7 @@ class ScanResult:
 
     @property
     def clean(self) -> bool:
-        """Complete, and the monitor has nothing against frames, darks and flats."""
+        """Whether the scan is complete, without a fault of frames, darks or flats."""
         return self.status == "complete" and not (self.missing or self.alarms or self.reference_faults)
 
 
@@ -82,8 +82,8 @@ class Instrument:
     """Connected devices. Leaving a `with` block closes them; `connect` makes one.
 
     Attributes:
-        config: what the devices were opened with.
-        last: result of the newest scan, also of one that raised; None before the first, and where it took no frame.
+        config: the configuration of the devices.
+        last: result of the newest scan, also of one that raised; None before the first, and if it took no frame.
     """
 
     def __init__(self, config: Config, connected: devices.ConnectedDevices, tell: Tell | None = to_stderr) -> None:
@@ -117,16 +117,16 @@ class Instrument:
         """Run a scan, as `beamline scan` does: a folder of its own, every frame checked, a file readable in any case.
 
         The first Ctrl-C stops the scan cleanly, the second aborts it; either ends a loop over samples too. (Python
-        catches signals in the main thread alone: elsewhere `stop` does it.)
+        catches signals only in the main thread: use `stop` in others.)
 
         Args:
             sample: name of the sample, in the file and in the folder's name; None: the configured one.
-            energy_kev: of the beam, as the file will say it. It moves no monochromator.
-            set: other values of the configuration for this scan alone, such as {"scan.angles.views": 90}.
+            energy_kev: of the beam, written to the file. It moves no monochromator.
+            set: other values of the configuration for this scan only, such as {"scan.angles.views": 90}.
             output: folder for the folders of runs; None: `storage.folder`.
             live: False: without a reconstruction, even where `recon.live` is on.
             stop: ends the scan from another thread.
-            on_event: gets every event of the run, in a thread of its own.
+            on_event: gets every event of the run, in its own thread.
 
         Raises:
             ConfigError: a wrong value, a broken limit, or one that needs devices opened anew; nothing has moved.
@@ -134,8 +134,8 @@ class Instrument:
             DataError: frames are missing, or the disk failed.
             ReferencesError: darks or flats cannot be used.
             ScanStopped: Ctrl-C, `stop`, or a check of the monitor ended it; ScanAborted: at once.
-            What was acquired is in the file in all these cases: see `last`. A scan that ends because its views were
-            enough (`recon.stop_when`) raises nothing.
+            In all these cases the acquired frames are in the file: see `last`. A scan that ends because its views were
+            enough (`recon.stop_when`) does not raise.
         """
         if not self._one_at_a_time.acquire(blocking=False):
             raise ConfigError("a scan of this instrument still runs: wait for its end. Nothing was started.")
@@ -203,7 +203,7 @@ def connect(
         set: values that replace those of the file, such as {"scan.angles.views": 90}.
         ask: puts a request to the operator, where shutter or sample are moved by hand, and returns when it is done;
             None: at the terminal.
-        tell: gets a sentence on what happens, as the commands print it (`print`, a logger's `info`); None: nobody does.
+        tell: gets the sentences that the commands print, as `print` or a logger's `info`; None: they are dropped.
 
     Raises:
         ConfigError: every fault with file, line, key and legal values.
@@ -226,7 +226,7 @@ def scan(
 
 
 def _of_devices(config: Config) -> Mapping[str, Any]:
-    """What of a configuration devices were opened with."""
+    """The part of a configuration that opens devices."""
     used = config.model_dump(mode="json", include={"devices", "simulation"})
     camera = {name: value for name, value in used["devices"]["camera"].items() if name not in _OF_A_SCAN}
     pitch = None if config.simulation is None else config.optics.pixel_size_um
@@ -234,7 +234,7 @@ def _of_devices(config: Config) -> Mapping[str, Any]:
 
 
 def _result(config: Config, said: Mapping[str, Mapping[str, Any]]) -> ScanResult | None:
-    """The result of a scan by its events; None where it ended before its file was made."""
+    """The result of a scan by its events; None if it ended before its file was made."""
     done = said.get("scan_done")
     if done is None:
         return None

@@ -30,12 +30,12 @@ from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame
 from recon.base.volume import Volume
 
-_PATIENCE = 120.0  # real s until a scan that is followed has begun
+_PATIENCE = 120.0  # real s to wait for the begin of a followed scan
 _POLL = 0.25  # real s
 
 
 def scan_file(path: str | Path) -> Path:
-    """The scan of a path: the file itself; of the folder of a run, the file with all its parts."""
+    """The scan of a path: the file itself, or for the folder of a run the file with all its parts."""
     path = Path(path)
     if not (path / SCAN).is_file():
         return path
@@ -45,7 +45,7 @@ def scan_file(path: str | Path) -> Path:
 def monitor(
     path: str | Path, *, config: str | Path | None = None, set: Mapping[str, object] | None = None, follow: bool = False
 ) -> ScanVerdict:
-    """What the checks of the monitor say of every frame of a scan of any format, as `beamline monitor` prints it.
+    """The findings of the monitor's checks on every frame of a scan of any format, as `beamline monitor` prints them.
 
     Args:
         path: a scan file, or the folder of a run.
@@ -67,12 +67,12 @@ def monitor(
 def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
     """Every frame of a scan as it is stored, with its kind, angle and time; of a running scan until its end.
 
-    Frames are counts: `frame.counts` uint16 [row, col]. It only reads: who takes them slowly does not hold the scan up.
-    In the program that takes the scan, reading and writing wait for each other: a fast scan is read from another one.
+    Frames are counts: `frame.counts` uint16 [row, col]. It only reads: a slow reader does not slow the scan down. But
+    in the scan's own program, reading and writing wait for each other: read a fast scan from another program.
 
     Args:
-        path: a scan file, or the folder of a run (its newest part). It may not be there yet.
-        follow: False: the frames that are there.
+        path: a scan file, or the folder of a run (its newest part). It may not exist yet.
+        follow: False: only the present frames.
 
     Raises:
         DataError: no scan, none that begins within 120 s, or one that died.
@@ -85,7 +85,7 @@ def stream(path: str | Path, *, follow: bool = True) -> Iterator[Frame]:
 
 
 def volumes(run: str | Path) -> Iterator[Volume]:
-    """The live volume of a run each time that it is written anew, at last the finished one; ends with the run.
+    """The live volume of a run after each update, and finally the finished one; ends with the run.
 
     Args:
         run: its folder. A run that is over gives its last volume.
@@ -96,10 +96,10 @@ def volumes(run: str | Path) -> Iterator[Volume]:
     folder, shown = Path(run), None
     files = watched(folder).volumes
     while True:
-        over = describe(folder).state in _OVER  # asked before the volume, so that none can slip in between
+        over = describe(folder).state in _OVER  # asked before the volume, so that none is missed
         found = newest(files)
         if found is not None and found != shown:
-            with suppress(DataError), opened_volume(found.path) as record:  # the next one just takes its place
+            with suppress(DataError), opened_volume(found.path) as record:  # the next volume is taking its place
                 volume = replace(record.volume, data=np.array(record.volume.data))
                 shown = found
             if shown is found:
@@ -113,7 +113,7 @@ _OVER = frozenset({"died", *(state.value for state in State if state.ended)})
 
 
 def _opened(path: Path, follow: bool) -> ScanSource:
-    """The scan, as soon as there is one where it is followed."""
+    """The scan; with `follow` it waits until there is one."""
     deadline = time.monotonic() + _PATIENCE
     while True:
         try:

@@ -42,10 +42,10 @@ class ReconResult:
         figures: figures of merit by name (residual, snr, seconds, ...), see docs/tradeoff.md.
         settings: everything that the volume depends on, by name.
         axis_col: rotation axis in columns of the full detector.
-        units: of the volume, 1/mm, or 1/px where the pixel size is not known.
+        units: of the volume, 1/mm, or 1/px if the pixel size is unknown.
         warnings: sentences.
         ended_early: Ctrl-C ended it with the volume so far.
-        output, report: files; None where none were wanted.
+        output, report: files; None if not requested.
     """
 
     method: str
@@ -61,7 +61,7 @@ class ReconResult:
 
     @cached_property
     def volume(self) -> Volume:
-        """The attenuation, `volume.data` float32 [z, y, x]; read from `output`, where that was wanted, on first use."""
+        """The attenuation, `volume.data` float32 [z, y, x]; read from `output`, if requested, on first use."""
         if self._held is not None:
             return self._held
         assert self.output is not None
@@ -94,15 +94,15 @@ def reconstruct(
         rows: detector rows to use, such as slice(500, 756); the volume has one slice a row.
         views: all, fixed:90, first:60, every:2, ... as the option --views takes them.
         binning: pixels that are averaged, a side.
-        selection: everything else, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
-            `beamline.projections.steps`; the arguments above go before it.
+        selection: other options, such as Selection(axis_col=1023.5, steps=(Rings("vo"),)) with a step of
+        `beamline.projections.steps`; the arguments above take precedence.
         output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
             A scan that does not fit into the memory needs one.
-        tell: gets a sentence on what happens; None: nobody does.
+        tell: gets sentences on the progress; None: they are dropped.
 
     Raises:
-        ConfigError: a method or a selection that cannot be. DataError: no scan, data that give no volume, or an output
-            that exists or cannot be written. Nothing is written then.
+        ConfigError: an impossible method or selection. DataError: no scan, data that give no volume, or an output
+        that exists or cannot be written. Nothing is written then.
     """
     place, chosen = scan_file(path), _method(method)
     done: dict[str, Any] = {}
@@ -121,7 +121,7 @@ def reconstruct(
     def take(record: ReconRecord) -> None:
         settings.update(record.parameters)
         if output is None:
-            held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a file that goes
+            held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a temporary file
 
     source = SourceOptions(place)
     said: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}

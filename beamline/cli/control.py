@@ -17,7 +17,7 @@ def _command(verb: str, help_text: str) -> click.Command:
     @click.command(verb, help=f"{help_text}\n\n{_EXIT_CODES}")
     @click.argument("run", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
     def send(run: Path | None) -> None:
-        from beamline.config.models import StorageSection  # here: help needs none of it
+        from beamline.config.models import StorageSection  # here: help does not need it
         from beamline.scan.control import Verb, tell
 
         run = run or _only(Path(StorageSection.model_fields["folder"].default))

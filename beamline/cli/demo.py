@@ -59,7 +59,7 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
 
 @contextmanager
 def _compiling() -> Iterator[None]:
-    """A process of low priority that compiles, from now on, what the fit needs last: once on a machine."""
+    """A process of low priority that compiles the last kernels of the fit: once on a machine."""
     with Path(os.devnull).open("w", encoding="utf-8") as nowhere:
         words = [sys.executable, "-c", "from recon.warm_up import warm_up_rest; warm_up_rest()"]
         with ChildProcess(words, nowhere, lambda line: None, behind=True):
@@ -157,7 +157,7 @@ class _Snapshots:
             try:
                 volume = read_reconstruction(Path(event.data["path"])).volume
             except DataError:
-                return  # the run is over and it is gone
+                return  # the run is over and the snapshot is gone
             self.volumes.append((float(event.data["seconds"]), volume))
         elif event.event in ("flag", "warning"):
             text = sentence(event)

@@ -9,11 +9,11 @@ import sys
 from typing import Any, TextIO
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
-"""Nobody reads it any more (Windows says EINVAL of a closed pipe): who closed it knows."""
+"""Errors of a pipe without a reader (EINVAL on Windows): whoever closed it knows."""
 
 
 class _Lasting(io.FileIO):
-    """Takes all that is written; from the first error on, nowhere."""
+    """Accepts all output; after the first error it drops it."""
 
     error: OSError | None = None
 
@@ -29,7 +29,7 @@ class _Lasting(io.FileIO):
 class Outputs:
     """Puts `sys.stdout` and `sys.stderr` on files that last. Both, and stdin, are open from now on.
 
-    A number of a closed one (`>&-`) would be that of the next file to be opened: a scan file that gets what is printed.
+    The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Outputs:
         sys.stderr = _lasting(sys.stderr) or _nowhere()
 
     def lost(self) -> str:
-        """Why not all of stdout was written; "" where it was, or where its reader wanted no more. Both are flushed."""
+        """Why stdout is incomplete; "" if it is complete, or its reader has closed it. Both are flushed."""
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         buffer = getattr(sys.stdout, "buffer", None)
@@ -49,7 +49,7 @@ class Outputs:
 
 
 def _lasting(stream: TextIO | None) -> TextIO | None:
-    """The same stream without errors; itself where it is no file of the system, as is the console of Windows."""
+    """The same stream without errors; the stream itself if the system has no file for it (console of Windows)."""
     buffer = getattr(stream, "buffer", None)
     raw = getattr(buffer, "raw", buffer)  # unbuffered (`python -u`) it is the same
     if not (isinstance(stream, io.TextIOWrapper) and type(raw) is io.FileIO):

@@ -33,7 +33,7 @@ class _Entry:
     """The module of a command and its help line, which `beamline --help` prints without importing it (and torch).
 
     Attributes:
-        files: its results are files, or what moved; what it prints is a summary.
+        files: its results are files or moves; its output is only a summary.
     """
 
     module: str
@@ -143,15 +143,15 @@ def run() -> NoReturn:
     """Run the command as a process that always ends with its own exit code.
 
     HDF5 crashes at exit where a file could not be closed, as on a full disk: the code would be -11 instead of 5. A
-    terminal that is closed, or a disk that takes no output, ends no command: what is left to be printed is lost.
+    closed terminal, or a disk that takes no output, does not end a command: the rest of its output is lost.
     """
-    warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: what rests on them is judged, in words
+    warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     outputs, code = Outputs(), 0
     try:
         main(prog_name="beamline")
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else BeamlineError.exit_code if end.code else 0
-    except KeyboardInterrupt:  # beside the work of a command, as while its result is printed
+    except KeyboardInterrupt:  # outside the work of a command, as while its result is printed
         code = INTERRUPTED
     if lost := outputs.lost():
         click.echo(f"beamline: the output on stdout is not whole ({lost}).", err=True)

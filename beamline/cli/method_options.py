@@ -1,4 +1,4 @@
-"""Options of reconstruction methods, and which of them go together."""
+"""Options of reconstruction methods, and their allowed combinations."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TRAITS = {
 _INVERTED = ("plain_splatting",)  # flags that switch their setting off
 
 PRESETS_OF_METHODS = ("published",)
-"""Endings of names of methods that are another one with other settings, such as r2-published."""
+"""Endings of names of methods that are variants of another method, such as r2-published."""
 
 _ROW_SETTINGS = ("steps", "gaussians", "finish", "iterations", "tv_weight")
 _PLANS = ("budget", "quality")
@@ -52,7 +52,7 @@ _OF_A_FIT = (
     "checkpoint",
     "resume",
 )
-# The options that exclude each of those that choose a plan.
+# For each option that chooses a plan: the options that it excludes.
 _CHOSEN = {"budget": ("quality", *_OF_A_FIT, "iterations"), "quality": ("budget", *_TIMED, "finish")}
 _STREAMED = (*_TIMED, "loss", "kernel", "plain_splatting")
 _FINISHED = (*(name for name in _OF_A_FIT if name not in _STREAMED), "allow_negative")  # of finished scans only
@@ -83,7 +83,7 @@ def method_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def row_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of methods that hold for every row of a table: how long each works, and from what."""
+    """Adds the options of methods for every row of a table: length and start of the work."""
     for option in reversed(_OF_ROWS):
         command = option(command)
     return command
@@ -105,14 +105,14 @@ def row_settings(methods: Sequence[str], options: dict[str, Any]) -> dict[str, d
 
 
 def method_with(name: str, options: Mapping[str, Any]) -> Method:
-    """The method of this name, with those of the options that are settings of it.
+    """The method of this name, with the given options that are settings of it.
 
     Args:
         name: in `recon.methods`, or of `recon.Auto`.
         options: values by option; None stands for the method's own.
     """
     if name == AUTO:
-        from recon.auto import Auto  # here: it loads all methods
+        from recon.auto import Auto  # here, because it loads all methods
 
         return Auto(tuple(method_with(method.name, options) for method in Auto().candidates))
     method = by_name(name)
@@ -156,9 +156,9 @@ def preset_of(method: str | None, preset: str | None) -> str | None:
 
 
 def _of_kind(method: type[Method], path: str, value: Any) -> Any:
-    """The value of a setting, if it is of the same kind as the method's own; None stays the method's choice."""
+    """The value of a setting, if it has the kind of the method's default; None leaves the choice to the method."""
     if not has_setting(method, path):
-        return value  # `build` names the methods that have it
+        return value  # `build` names the methods that have the setting
     own: Any = method()
     for name in path.split("."):
         own = getattr(own, name)
@@ -174,14 +174,14 @@ def _of_kind(method: type[Method], path: str, value: Any) -> Any:
 
 
 def options_of_a_method(ctx: click.Context) -> list[str]:
-    """Those of the options of methods that the user gave; any method resumes a partial volume."""
+    """The options of methods that the user gave; any method resumes a partial volume."""
     given = [name for name in (*_TRAITS, *SETTINGS) if ctx.get_parameter_source(name) != ParameterSource.DEFAULT]
     return [name for name in given if name != "resume" or not resumes_slabs(ctx.params["resume"])]
 
 
 def resumes_slabs(path: Path | None) -> bool:
     """Whether the file of --resume is a partial volume."""
-    from beamline.storage.writers.partial_volume import is_partial  # here: help needs none of it
+    from beamline.storage.writers.partial_volume import is_partial  # here: help does not need it
 
     return path is not None and is_partial(path)
 

@@ -22,9 +22,9 @@ _OF_ONE_CALL = (
     "output", "as_json", "report", "config", "write_config", "log", "verbose", "dry", "checkpoint", "resume",
     "follow", "earlier", "unfinished", "truth", "cluster", "angles", "angle_rows", "darks", "flats", "preset",
 )  # fmt: skip
-"""Options that are of one scan or one call, not of a recipe; a preset is in the name of the method."""
+"""Options of a single scan or call, which are not part of a recipe; a preset is in the name of the method."""
 _NOT_REPEATED = ("output", "as_json", "config", "write_config", "log", "verbose", "dry", "checkpoint")
-_PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML takes as they are
+_PLAIN = re.compile(r"[\w.][\w.:,/+-]*(?<!:)")  # scalars that YAML writes as they are
 
 
 class Repeatable(click.Command):
@@ -53,7 +53,7 @@ def name_of(option: click.Option) -> str:
 
 
 def recipe_text(ctx: click.Context, method: str) -> str:
-    """The recipe of this call, as YAML: the method, and the options given that hold for any scan."""
+    """The recipe of this call, as YAML: the method, and the given options that hold for any scan."""
     values = {
         name_of(option): _recipe_value(option, value)
         for option, value in given(ctx).items()
@@ -63,7 +63,7 @@ def recipe_text(ctx: click.Context, method: str) -> str:
 
 
 def _recipe_value(option: click.Option, value: Any) -> Any:
-    """The value of an option as a recipe has it; those of one that may be repeated are apart by spaces."""
+    """The value of an option in a recipe; values of a repeatable option are separated by spaces."""
     if option.multiple:
         return " ".join(value)
     return _from_anywhere(str(value), option.type) if isinstance(option.type, click.Path) else value
@@ -75,11 +75,11 @@ def _scalar(value: Any) -> str:
 
 
 def repeating(ctx: click.Context, argument: Path, output: Path, without: Collection[str] = ()) -> str:
-    """The command line that does the same again, from any folder: with absolute paths, and an output of its own.
+    """The command line that repeats a call from any folder: with absolute paths and another output.
 
     Args:
-        argument: the file that the command is about.
-        output: of this call; the line names another one, as nothing is overwritten.
+        argument: the file of the command.
+        output: of this call; the line names another one, because nothing is overwritten.
         without: options that will not work again.
     """
     again = f"{output.stem}_again{output.suffix}"
@@ -147,7 +147,7 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    """What a recipe says, all values as text: YAML's own rules would make 3664 of 61:04."""
+    """The content of a recipe, all values as text: YAML's own rules would turn 61:04 into 3664."""
     try:
         text = _text(path)
         said = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - builds text, lists and mappings only

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 def parsed(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, str | None], Any]:
-    """A callback that gives what `parse` makes of an option; its ValueError is bad usage."""
+    """A callback that parses an option by `parse`; its ValueError becomes bad usage."""
 
     def callback(ctx: click.Context, param: click.Parameter, value: str | None) -> Any:
         try:
@@ -69,7 +69,7 @@ def volume_path(text: str) -> Path:
 
 
 def output_path(text: str) -> Path:
-    """That of a volume, or of the picture that --axis try draws. ValueError for another."""
+    """The path of a volume, or of the picture of --axis try. ValueError for another suffix."""
     return Path(text) if Path(text).suffix.lower() == _SHEET else volume_path(text)
 
 
@@ -339,7 +339,7 @@ def recon(
     stop = StopOnSignal(ready=follow or budget is not None)
 
     def made(event: Event) -> None:
-        """From the first step or iteration on there is a volume; what has a unit is a trial, or slices."""
+        """Whether there is a volume: from the first step or iteration on. Progress with a unit is trials or slices."""
         if event.event == "progress" and event.data.get("stage") == "recon" and not event.data.get("unit"):
             stop.ready = True
 
@@ -385,7 +385,7 @@ def require(metrics: Mapping[str, float], max_residual: float) -> None:
 
 
 def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
-    """Say what a reconstruction will take."""
+    """Print the time, memory and disk space of a reconstruction."""
     from beamline.reconstruct.estimate import estimate
 
     with json_events(as_json) as sinks:
@@ -397,7 +397,7 @@ def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
 
 
 def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: bool) -> None:
-    """One slice by each of some axes, as a picture."""
+    """Write a picture of one slice by each of some axes."""
     from beamline.reconstruct.axis_trials import try_axes
 
     last: list[Event] = []
@@ -420,9 +420,9 @@ def _write_recipe(path: Path, text: str) -> None:
 
 @contextmanager
 def _logged(path: Path | None, tell: Sink) -> Iterator[list[Sink]]:
-    """The sink that writes a log; none where none is wanted. An error in the block is its last line.
+    """The sink that writes a log, if one is requested. An error in the block becomes its last line.
 
-    Where its disk takes no more, `tell` gets a warning, and the work goes on.
+    If its disk is full, `tell` gets a warning, and the work goes on.
     """
     if path is None:
         yield []

@@ -1,6 +1,6 @@
 """The process that reconstructs the scans of a batch one after the other: python -m beamline.cli.recon_worker.
 
-Each line of stdin is a JSON list, the arguments of `beamline`. What that prints goes to stdout, then the event `ended`
+Each line of stdin is a JSON list, the arguments of `beamline`. Its output goes to stdout, then the event `ended`
 with its exit code. The process ends with its stdin.
 """
 

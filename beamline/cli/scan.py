@@ -141,7 +141,7 @@ def _faults(result: RunResult) -> list[str]:
 
 
 def _treated(path: Path) -> str:
-    """What a reconstruction does with flagged views, in its own words; empty where the file does not tell."""
+    """The treatment of flagged views by a reconstruction, in its own words; "" if the file does not tell."""
     from beamline.storage.readers.open import open_scan
     from beamline.storage.rules.treatment import treatment_of
 

@@ -1,4 +1,4 @@
-"""Options that say of a scan what its file does not; the same for every command that opens one."""
+"""Options for facts that a scan file does not state; the same for every command that opens one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PATH = click.Path(path_type=Path)
 
 
 def underscored(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
-    """`line-integrals` on the command line is line_integrals inside."""
+    """`line-integrals` on the command line becomes `line_integrals`."""
     return None if value is None else value.replace("-", "_")
 
 

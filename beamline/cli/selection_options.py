@@ -1,4 +1,4 @@
-"""Options that choose a part of a scan and say how it is to be read; the same for every command that reconstructs."""
+"""Options that choose a part of a scan and its corrections; the same for every command that reconstructs."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOption
 
 
 def steps_said(said: Mapping[str, Any]) -> tuple[PrepStep, ...]:
-    """The steps by their options in `said`."""
+    """The steps for the options in `said`."""
     try:
         return steps_of(said)
     except ValueError as error:
@@ -112,12 +112,12 @@ def steps_said(said: Mapping[str, Any]) -> tuple[PrepStep, ...]:
 
 
 def _step_options() -> list[Option]:
-    """Those of all steps, in the order of the registry."""
+    """The options of all steps, in the order of the registry."""
     return [option for step in registered() for option in options_of(step).values()]
 
 
 def _of_step(option: Option) -> Callable[..., Any]:
-    """An option of a step as one of the command line."""
+    """An option of a step as an option of the command line."""
     return click.option(
         option.name,
         type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if option.path else str,

@@ -129,7 +129,7 @@ def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) 
 
 
 class _Output:
-    """Prints results as lines for people, and sends them as events to programs."""
+    """Prints results as lines, and sends them as events to programs."""
 
     def __init__(self, sink: Sink, clock: Clock, *, plain: bool) -> None:
         self._sink, self._clock, self._plain = sink, clock, plain

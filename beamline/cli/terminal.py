@@ -24,19 +24,19 @@ from drivers.manual import Ask
 from recon.methods import BASELINE
 
 LONG = 2.0
-"""Real s after which a phase that tells no progress is named on a stream that is no terminal."""
+"""Real s after which a line names a phase without progress, on a stream that is not a terminal."""
 SAY_EVERY = 0.2
-"""s between events on how far many frames are."""
+"""s between events on the progress of many frames."""
 PLAIN_EVERY = 5.0
-"""Real s between progress lines on a stream that is no terminal."""
+"""Real s between progress lines on a stream that is not a terminal."""
 _OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
-_OF_ITSELF = ("axes", "slices", "views")  # stages named after what their progress counts
+_OF_ITSELF = ("axes", "slices", "views")  # stages named after the unit of their progress
 _OF_TRIALS = {
     "tradeoff": "trials",
     "study": "trials",
     "batch": "scans",
     "bench": "runs",
-}  # stage: what its progress counts
+}  # stage: unit of its progress
 
 
 class Terminal:
@@ -62,7 +62,7 @@ class Terminal:
         self._last_text = ""
         self._lock = threading.Lock()  # events come from one thread, questions from another
         self._asking = False
-        self._long: threading.Timer | None = None  # names the phase when it has taken LONG
+        self._long: threading.Timer | None = None  # names the phase after LONG
 
     def __enter__(self) -> Self:
         return self
@@ -89,7 +89,7 @@ class Terminal:
             self._take(event)
 
     def say(self, text: str) -> None:
-        """Print a line that is no event."""
+        """Print a line that is not an event."""
         with self._lock, _closed_terminal_ignored():
             self._console.print(printable(text))
 
@@ -114,9 +114,9 @@ class Terminal:
             self._show("kernels", event.data["n"], 0, note)
         elif event.event == "progress":
             self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
-        elif event.event not in ("failed", "done"):  # the command prints these itself
+        elif event.event not in ("failed", "done"):  # the command prints these events itself
             text = sentence(event)
-            if text and text != self._last_text:  # a snapshot of the same views replaces the one before
+            if text and text != self._last_text:  # a snapshot of the same views replaces the last one
                 self._last_text = text
                 self._console.print(printable(text))
 
@@ -153,7 +153,7 @@ class Terminal:
 
 @contextmanager
 def _closed_terminal_ignored() -> Iterator[None]:
-    """Errors from a terminal that was closed are ignored, so that the work goes on."""
+    """Ignores errors from a closed terminal, so that the work goes on."""
     try:
         yield
     except OSError as error:
@@ -162,7 +162,7 @@ def _closed_terminal_ignored() -> Iterator[None]:
 
 
 class LogLines:
-    """A sink that writes every event as a line: time, kind, and the sentence for people or else its values."""
+    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._lock = stream, threading.Lock()
@@ -189,7 +189,7 @@ def rate_text(data: Mapping[str, Any], what: str = "frames") -> str:
 
 
 def phase_text(data: Mapping[str, Any]) -> str:
-    """n/N, rate and time left, of a `progress` event of a phase; that it has begun where that is all that is known."""
+    """n/N, rate and time left, of a `progress` event of a phase, or only its begin."""
     known = data["of"] and data["per_s"] and data["eta_s"] is not None
     return rate_text(data, data["counted"]) if known else "begun"
 
@@ -212,7 +212,7 @@ def fit(data: Mapping[str, Any]) -> str:
     parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []
     if data["residual"] is not None and math.isfinite(data["residual"]):
         parts.append(f"residual {data['residual']:.4f}")
-    unseen = data.get("held_out")  # another process's NaN comes as None
+    unseen = data.get("held_out")  # NaN from another process comes as None
     if unseen is not None and math.isfinite(unseen):
         parts.append(f"held out {unseen:.4f}")
     if data.get("eta_s") is not None:
@@ -221,7 +221,7 @@ def fit(data: Mapping[str, Any]) -> str:
 
 
 def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]:
-    """A listener that says how far a stage of the work is, a few times a second."""
+    """A listener that reports the progress of a stage of the work, a few times a second."""
     began, said = clock.now(), -math.inf
 
     def listen(n: int, total: int) -> None:

@@ -22,7 +22,7 @@ from recon.methods import names, names_compared
 
 
 def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    """Names of methods, separated by commas; those that are compared unasked if none are given."""
+    """Names of methods, separated by commas; by default those that are compared unasked."""
     if value is None:
         return names_compared()
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))

@@ -20,7 +20,7 @@ from beamline.core.process import ChildProcess
 
 LOOPBACK, PORT = "127.0.0.1", 8642
 LOOK, ACT = "watch", "control"
-"""What an address is for: the first word of its line."""
+"""Purpose of an address: the first word of its line."""
 
 
 @click.command()
@@ -38,7 +38,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
-    from beamline.page.run_files import Reader, watched  # they load HDF5 and the server, which `scan -h` needs not
+    from beamline.page.run_files import Reader, watched  # they load HDF5 and the server, which `scan -h` does not need
     from beamline.page.serve import open_port, start
     from beamline.scan.runs import newest
 
@@ -64,7 +64,7 @@ class PageBeside:
     """A sink that serves the page of a run from a process of its own, as long as the context lasts.
 
     Args:
-        tell: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
+        tell: takes the addresses, a line each. They contain the tokens, so do not log them.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:

@@ -43,7 +43,7 @@ _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigg
 
 
 def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    """What keeps a fly scan from having one frame a pulse, each of the exposure that the plan reckons with."""
+    """Faults by which a fly scan would not have one frame a pulse, with the planned exposure."""
     camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
     if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
         return

@@ -1,4 +1,4 @@
-"""Keys of a section that a driver's settings declare with `drivers.stages.settings.key`."""
+"""Keys of a configuration section, declared by a driver's settings with `drivers.stages.settings.key`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def declared(settings: type[Any]) -> dict[str, Any]:
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
-    """The driver's settings by a section that has their keys."""
+    """The driver's settings from a section with their keys."""
     return from_flat(
         settings, {field.name: _inside(field, getattr(section, _name(field))) for field in flat_fields(settings)}
     )
@@ -39,7 +39,7 @@ def _name(field: FlatField) -> str:
 
 
 def _inside(field: FlatField, value: Any) -> Any:
-    """A key's value as the driver takes it: radians, and the type of the field."""
+    """A key's value for the driver: radians, and the type of the field."""
     if value is None:
         return None
     if _key(field).unit in ANGULAR:

@@ -38,7 +38,7 @@ Roi = Annotated[
 
 
 class _Orca(Section):
-    """What the real and the simulated ORCA-Quest have in common."""
+    """The keys that the real and the simulated ORCA-Quest share."""
 
     kind: str
     roi: Roi | None = None

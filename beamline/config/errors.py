@@ -1,4 +1,4 @@
-"""Configuration errors: what pydantic found, said with file and line, the key, what was there and what is legal."""
+"""Configuration errors: pydantic's findings with file and line, the key, its value and the legal values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
     """
     faults: dict[KeyPath, str] = {}
     for found in error.errors(include_url=False):
-        missing = found["type"] == "missing" and isinstance(found["loc"][-1], str)  # not an item that a list lacks
+        missing = found["type"] == "missing" and isinstance(found["loc"][-1], str)  # not a missing item of a list
         path = _path(found["loc"], tree.data, missing)
         if found["type"].startswith("union_tag"):
             path = (*path, found["ctx"]["discriminator"].strip("'"))
@@ -87,7 +87,7 @@ def _shown(value: Any) -> str:
 
 
 def _at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
-    """The schemas that the value at `path` may follow, given the kinds and schemes that the data chose."""
+    """The schemas for the value at `path`, by the kinds and schemes that the data choose."""
     branches = _branches(schema, data, schema)
     for part in path:
         data = data[part] if _has(data, part) else None
@@ -97,7 +97,7 @@ def _at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
 
 
 def _branches(node: Schema, data: Any, root: Schema) -> list[Schema]:
-    """The alternatives of a node, none of them a reference; only the one whose tag the data names, where it does."""
+    """The alternatives of a node, with references resolved; only the one whose tag the data name, if they do."""
     while "$ref" in node:
         node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
     alternatives = node.get("anyOf") or node.get("oneOf")
@@ -127,7 +127,7 @@ def _number(value: float) -> str:
 
 
 def _words(branch: Schema) -> str:
-    """The legal values where they are no short list of choices."""
+    """The legal values, if they are not a short list of choices."""
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"

@@ -164,7 +164,7 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     scene = config.simulation.scene if config.simulation else {}
     if isinstance(scene, dict):
         return scene
-    path = config_folder() / scene  # an absolute path stays itself
+    path = config_folder() / scene  # an absolute path stays as it is
     try:
         text = text_in(path, SETTINGS)
     except (OSError, UnicodeDecodeError) as error:
@@ -201,15 +201,15 @@ def _locate(data: Any, folder: Path) -> None:
         found, shipped = (folder / simulation["scene"]).resolve(), config_folder().resolve()
         if found.is_relative_to(shipped):  # a short name, so that the resolved configuration works elsewhere
             simulation["scene"] = found.relative_to(shipped).as_posix()
-        elif found.is_file():  # else it is taken for one of those that come with the package
+        elif found.is_file():  # otherwise it counts as a shipped one
             simulation["scene"] = str(found)
-    for key in ("file", "labels"):  # of a volume in a scene that stands in the configuration itself
+    for key in ("file", "labels"):  # file of a volume in a scene inside the configuration
         if (phantom := _group(data, "simulation", "scene", "phantom", key)) is not None:
             phantom[key] = str((folder / phantom[key]).resolve())
 
 
 def _group(data: Any, *path: str) -> dict[str, Any] | None:
-    """The group that holds the key at the end of `path`, where the key holds text."""
+    """The group with the key at the end of `path`, if the key holds text."""
     for name in path[:-1]:
         data = data.get(name) if isinstance(data, dict) else None
     return data if isinstance(data, dict) and isinstance(data.get(path[-1]), str) else None

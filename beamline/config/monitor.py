@@ -1,4 +1,4 @@
-"""Section `monitor` of the configuration: what an alarm does, and the limits of every check, as the registry has them.
+"""Section `monitor` of the configuration: effects of alarms, and the limits of every check in the registry.
 
 The keys `monitor.<check>.<limit>` are derived from the fields of the checks: a check that enters the registry can be
 configured without an edit here.

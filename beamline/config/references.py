@@ -1,4 +1,4 @@
-"""Section `references` of the configuration: what bad darks and flats do to a scan, and the limits by which they are.
+"""Section `references` of the configuration: limits of darks and flats, and what a fault does to a scan.
 
 The limits are the fields of `beamline.monitor.references.ReferenceLimits`.
 """
@@ -15,7 +15,7 @@ from beamline.monitor.references import ReferenceLimits
 
 
 class ReferencesBase(Section):
-    """The keys that are no limits."""
+    """The keys that are not limits."""
 
     on_fault: Literal["stop", "log"] = "stop"
     """Darks or flats with a fault stop the scan before its first projection, or the fault is logged."""

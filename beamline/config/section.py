@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 
 class Section(BaseModel):
-    """A frozen group of keys. Unknown keys are refused, and so is `yes` where a number belongs."""
+    """A frozen group of keys. It refuses unknown keys, and `yes` for a number."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 

@@ -1,4 +1,4 @@
-"""Configuration text: YAML, --set and BEAMLINE_* variables as one tree, with where each value was said."""
+"""Configuration text: YAML, --set and BEAMLINE_* variables as one tree, with the origin of each value."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _MOST_VALUES, _MOST_DIGITS = 100_000, 1000
 
 @dataclass(frozen=True)
 class Tree:
-    """Plain values, and for each key path where it was said ("my.yaml:12", "--set scan.period_s=0.2", ...)."""
+    """Plain values, and for each key path its origin ("my.yaml:12", "--set scan.period_s=0.2", ...)."""
 
     data: dict[str, Any]
     origins: Mapping[KeyPath, str]
 
     def origin(self, path: KeyPath) -> str:
-        """Where the value at `path`, or the nearest group around it, was said."""
+        """The origin of the value at `path`, or of the nearest group around it."""
         while path not in self.origins and path:
             path = path[:-1]
         return self.origins[path]
@@ -45,7 +45,7 @@ def read(text: str, name: str) -> Tree:
 
 
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
-    """The values in a YAML text, and where each is."""
+    """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
     loader = None
     try:
@@ -76,14 +76,14 @@ def _line(node: yaml.Node) -> int:
 
 
 def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
-    if len(origins) > _MOST_VALUES:  # aliases of aliases make billions of a few lines
+    if len(origins) > _MOST_VALUES:  # aliases of aliases can turn a few lines into billions of values
         raise ConfigError(f"{name} holds more than {_MOST_VALUES} values: it is no configuration. Nothing was started.")
     if isinstance(node, yaml.ScalarNode):
         if "\0" in node.value:
             raise ConfigError(f"{name}:{_line(node)}: a text holds a NUL character. Nothing was started.")
         if (
             node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS
-        ):  # Python neither reads nor writes very long ones
+        ):  # Python neither reads nor writes very long numbers
             raise ConfigError(f"{name}:{_line(node)}: a number has {len(node.value)} digits. Nothing was started.")
     if isinstance(node, yaml.SequenceNode):
         for index, child in enumerate(node.value):
@@ -107,7 +107,7 @@ def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]
 def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str]) -> Tree:
     """The tree with BEAMLINE_SECTION__KEY variables and then `section.key=value` overrides put over it.
 
-    Values are YAML. A variable without a double underscore is somebody else's and left alone.
+    Values are YAML. A variable without a double underscore is ignored.
 
     Raises:
         ConfigError: an override without `=`, or with a value that is not YAML.

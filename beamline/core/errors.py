@@ -1,4 +1,4 @@
-"""Errors with exit codes: each class says which part failed and whether the data are safe; what a defect leaves."""
+"""Errors with exit codes: each class says which part failed and whether data are safe. A defect leaves a traceback."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from drivers.base.errors import DeviceError
 
 
 class BeamlineError(Exception):
-    """An error for the operator. Its message says what happened, what was expected, what to do, what is untouched."""
+    """An error for the operator: its message says what happened, what was expected, what to do, what is unchanged."""
 
     exit_code = 1
 
@@ -57,7 +57,7 @@ class QualityError(BeamlineError):
 
 
 class AlarmError(BeamlineError):
-    """Finished and written, but the monitor raised alarms: some frames are not what they should be."""
+    """Finished and written, but the monitor raised alarms: some frames are bad."""
 
     exit_code = 7
 
@@ -81,13 +81,13 @@ def exit_code(error: BaseException) -> int:
 
 
 def damaged(error: BaseException) -> bool:
-    """HDF5 could not read or follow what a file holds; h5py has no class of its own for that."""
+    """Whether HDF5 could not read or follow the content of a file; h5py has no error class for this."""
     said = str(error)
     return isinstance(error, OSError | RuntimeError | KeyError) and "ynchronously" in said and "exist" not in said
 
 
 def is_defect(error: BaseException) -> bool:
-    """Nobody foresaw it: the program is wrong, whatever the input was."""
+    """Whether the error is a defect of the program, whatever the input."""
     return exit_code(error) == BeamlineError.exit_code and not isinstance(error, BeamlineError)
 
 
@@ -112,8 +112,8 @@ def user_message(error: BaseException) -> str:
 
 
 def leave_traceback(error: BaseException, folder: Path) -> Path | None:
-    """The new file that has the traceback of a defect: in `folder`, else in the folder for temporary files. None where
-    neither can be written to. An error that already has such a file keeps it."""
+    """The new file with the traceback of a defect: in `folder`, or in the folder for temporary files. None if neither
+    can be written to. An error that already has such a file keeps it."""
     if (left := getattr(error, "traceback_file", None)) is not None:
         return Path(left)
     text = "".join(traceback.format_exception(error))

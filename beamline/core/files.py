@@ -20,11 +20,11 @@ from beamline.core.errors import DataError
 PART = "part-{}"
 """The folder of a later part of a scan that was resumed, in that of the run."""
 OURS = 0o755
-"""Mode of a run's folder: nobody else may put one file in the place of another there, whatever the umask."""
+"""Mode of a run's folder: only the owner may replace files there, whatever the umask."""
 RUNS = "runs"
-"""The folder for the folders of runs, where a configuration names no other."""
+"""The default folder for the folders of runs."""
 EVENTS = "events.jsonl"
-"""What happened in a run, or in a later part of it, in its folder."""
+"""The log of events of a run, or of a later part of it, in its folder."""
 
 
 def parts_of(run: Path) -> list[Path]:
@@ -44,21 +44,21 @@ def _numbered(run: Path) -> dict[int, Path]:
     return {int(number): part for number, part in found.items() if number.isdecimal()}
 
 
-_NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # of systems and file systems that cannot tell
+_NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems and file systems without this call
 
 
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
-"""What PyYAML stumbles over itself, beside its YAMLError: a 13th month, a number of 5000 digits, `!!bool x`."""
+"""Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
 TEXT = 2**26
-"""Bytes that a text file has at most which a user names: angles of a million views take 20 MB."""
+"""Most bytes of a text file that a user names: angles of a million views take 20 MB."""
 SETTINGS = 2**20
-"""Bytes that a text file of settings has at most: YAML of 1 MB takes seconds to read."""
+"""Most bytes of a text file of settings: YAML of 1 MB takes seconds to read."""
 
 
 def require_regular(path: Path, largest: float = math.inf) -> None:
-    """Raise OSError where `path` is there and is no regular file, or has more bytes than `largest`.
+    """Raise OSError if `path` exists and is not a regular file, or has more bytes than `largest`.
 
-    A pipe makes whoever opens it wait for ever, and a device may never end.
+    Opening a pipe may wait for ever, and a device may never end.
     """
     try:
         found = path.stat()
@@ -75,14 +75,14 @@ def text_in(path: Path, largest: int = TEXT, encoding: str = "utf-8") -> str:
     """The content of a text file of so many bytes at most.
 
     Raises:
-        OSError: as `require_regular`, or it cannot be read. UnicodeDecodeError: it is no such text.
+        OSError: as `require_regular`, or it cannot be read. UnicodeDecodeError: it is not text of this encoding.
     """
     require_regular(path, largest)
     return path.read_text(encoding=encoding)
 
 
 def refuse_existing(path: Path) -> None:
-    """Raise DataError where `path` exists (results are never overwritten) or its folder does not."""
+    """Raise DataError if `path` exists (results are never overwritten) or its folder does not."""
     if path.exists():
         raise DataError(f"{path} exists and results are never overwritten. Name another output, or move it away.")
     if not path.parent.is_dir():
@@ -108,7 +108,7 @@ if sys.platform == "darwin":
     import fcntl
 
     def _fsync(handle: int) -> None:
-        os.fsync(handle)  # which does not wait for the cache in the disk
+        os.fsync(handle)  # fsync on macOS does not wait for the disk's own cache
         fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
 
 else:
@@ -118,7 +118,7 @@ else:
 
 
 def to_disk(handle: int) -> None:
-    """Wait until what was written to an open file is on the disk. OSError where the disk did not take it."""
+    """Wait until all data written to an open file are on the disk. OSError if the disk did not take them."""
     try:
         _fsync(handle)
     except OSError as error:
@@ -127,17 +127,17 @@ def to_disk(handle: int) -> None:
 
 
 def bring_to_disk(path: Path) -> None:
-    """Wait until a file, or every file in a folder, is on the disk. OSError where the disk did not take it."""
+    """Wait until a file, or every file in a folder, is on the disk. OSError if the disk did not take it."""
     for part in path.rglob("*") if path.is_dir() else (path,):
         if part.is_file():
-            with part.open("r+b") as file:  # Windows wants a file that may be written
+            with part.open("r+b") as file:  # Windows needs a file opened for writing
                 to_disk(file.fileno())
 
 
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A temporary name beside `path` to write to, a file or a folder. It becomes `path` at the end of the block, when
-    it is on the disk; an error removes it. One that a killed program left for the same `path` is removed first.
+    """A temporary name beside `path`, for a file or a folder. At the end of the block it is brought to the disk and
+    renamed to `path`; an error removes it. Leftovers of a killed program for the same `path` are removed first.
 
     Args:
         path: the file to write. Without `replace` it must not exist.
@@ -168,7 +168,7 @@ def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def _here() -> str:
-    """Where the numbers of processes are ours: this machine, and in it this container."""
+    """The scope of process numbers: this machine, and in it this container."""
     try:
         namespace = Path("/proc/self/ns/pid").readlink()
     except OSError:  # not Linux
@@ -182,14 +182,14 @@ def _remove_left(path: Path) -> None:
         for left in [entry for entry in path.parent.iterdir() if entry.name.startswith(f".{path.name}.")]:
             place, _, process = left.name.removeprefix(f".{path.name}.").rpartition("-")[0].partition("-")
             if left.suffix == ".partial" and place == _here() and process.isdecimal():
-                import psutil  # here, as most commands find nothing
+                import psutil  # here, because most commands find nothing
 
                 if not psutil.pid_exists(int(process)):
                     remove(left)
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
-    """Write a file that is in memory as `whole_file` does, and compare what is read back.
+    """Write a file from memory as `whole_file` does, read it back and compare.
 
     Raises:
         DataError: as `whole_file`, or the disk holds something else.
@@ -212,9 +212,9 @@ def remove(path: Path) -> None:
 
 @contextmanager
 def result_folder(folder: Path) -> Iterator[Path]:
-    """Make the folder of a result, and in it one to work in, which is gone at the end of the block.
+    """Make the folder of a result, and a temporary folder in it, which is removed at the end of the block.
 
-    So is the folder itself where nothing was left in it: an empty one would refuse the next run.
+    An empty result folder is removed, too, because the next run would refuse it.
     """
     folder.mkdir()
     work = folder / "work"

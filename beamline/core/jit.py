@@ -1,4 +1,4 @@
-"""njit: numba's, loaded with a kernel's first call: a command that calls none starts sooner."""
+"""njit: numba's decorator, loaded at a kernel's first call, so that commands without kernels start sooner."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Kernel:
         import numba
 
         around = self._function.__globals__
-        for name in self._function.__code__.co_names:  # numba calls from a kernel only kernels of its own
+        for name in self._function.__code__.co_names:  # from a kernel, numba calls only its own kernels
             if isinstance(kernel := around.get(name), _Kernel) and kernel is not self:
                 around[name] = kernel._dispatcher
         return numba.njit(**self._options)(self._function)

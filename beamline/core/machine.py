@@ -1,4 +1,4 @@
-"""This machine: what figures were measured on, and how much memory there is and was used."""
+"""This machine: its description for measured figures, and its free and used memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CGROUP_1 = (r"\d+:memory:/(.*)", "memory", "memory.limit_in_bytes", "memory.usa
 
 
 def machine() -> dict[str, str | int]:
-    """Processor, cores this process may use, numba's threads, and the versions of what computes."""
+    """Processor, cores this process may use, numba's threads, and the versions of computing libraries."""
     import numba  # not for callers that only ask for memory
     import torch
 
@@ -46,7 +46,7 @@ def machine_line(found: dict[str, str | int] | None = None) -> str:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on, where the system tells; else all there are."""
+    """Cores that this process may use, if the system tells; otherwise all cores."""
     if sys.platform == "darwin":  # has no affinity
         return os.cpu_count() or 1
     return len(psutil.Process().cpu_affinity())
@@ -58,7 +58,7 @@ def free_memory() -> int:
 
 
 def peak_memory() -> int | None:
-    """Largest resident set of this process so far, in bytes; None where the system does not tell."""
+    """Largest resident set of this process so far, in bytes; None if the system does not tell."""
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     if _STATUS.is_file():
@@ -70,7 +70,7 @@ def peak_memory() -> int | None:
 
 
 def reset_peak_memory() -> None:
-    """Let `peak_memory` count from now on, where the system can do that (Linux); elsewhere nothing happens."""
+    """Let `peak_memory` start again, if the system can (Linux); otherwise do nothing."""
     with suppress(OSError):
         _CLEAR.write_text("5", encoding="ascii")  # proc_pid_clear_refs(5): reset the peak resident set size
 
@@ -97,7 +97,7 @@ def _high_water(status: str) -> int | None:
 
 
 def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
-    """What each limit above this process leaves (cgroup v1 and v2), which psutil does not know.
+    """Memory that each limit above this process leaves (cgroup v1 and v2), which psutil does not know.
 
     A container may see its own limit at the root.
     """
@@ -110,13 +110,13 @@ def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
         for place in (folder, *folder.parents):
             if not place.is_relative_to(top):
                 break
-            with suppress(OSError, ValueError):  # no limit is the word "max", or more than there is
+            with suppress(OSError, ValueError):  # without a limit it is the word "max", or more than the machine has
                 limit, used = (int((place / name).read_text("ascii")) for name in (most, now))
                 yield max(limit - used + _entry(place / "memory.stat", cache), 0)
 
 
 def _entry(stat: Path, wanted: str) -> int:
-    """The value of a line "name value" of a file; 0 where it has none."""
+    """The value of a line "name value" of a file; 0 without such a line."""
     for line in stat.read_text("ascii").splitlines():
         name, _, value = line.partition(" ")
         if name == wanted:

@@ -1,4 +1,4 @@
-"""Phases: what a long work does at the moment, told as it begins, and the seconds of each; together all of them."""
+"""Phases: the parts of a long work, reported as they begin, with the seconds of each; they add up to the whole."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import math
 from beamline.core.events import Event, Sink
 from drivers.base.clock import Clock, SystemClock
 
-_SAY_EVERY = 0.2  # s between events on how far a phase is
+_SAY_EVERY = 0.2  # s between events on the progress of a phase
 
 
 class Phases:
     """One phase follows the other without a gap, so that their seconds add up to the time since the start.
 
     Args:
-        sink: gets an event `progress` of the stage "phase" as each begins, and some of how far it is.
-        clock: that they are timed by.
+        sink: gets an event `progress` of the stage "phase" as each begins, and some on its progress.
+        clock: for their times.
 
     Attributes:
-        seconds: of each phase that has ended; of one that came again, in all.
+        seconds: of each phase that has ended; the sum for a repeated phase.
     """
 
     def __init__(self, sink: Sink = lambda event: None, clock: Clock | None = None) -> None:
@@ -27,13 +27,13 @@ class Phases:
         self.seconds: dict[str, float] = {}
 
     def enter(self, name: str, counted: str = "views") -> None:
-        """The phase before has ended; this one begins, and tells of so many `counted` how many are done."""
+        """End the last phase and begin this one; its progress counts up to `counted`."""
         self.end()
         self._name, self._counted, self._said = name, counted, -math.inf
         self._say({"phase": name, "n": 0, "of": 0, "per_s": None, "eta_s": None})
 
     def told(self, n: int, total: int) -> None:
-        """So much of the phase is done; of nothing nothing is said."""
+        """Report the progress of the phase, if there is any."""
         now = self._clock.now()
         if not n:
             return
@@ -44,7 +44,7 @@ class Phases:
             self._say({"phase": self._name, "n": n, "of": total, "per_s": rate, "eta_s": left})
 
     def end(self) -> None:
-        """The last phase has ended, now."""
+        """End the last phase now."""
         now = self._clock.now()
         if self._name:
             self.seconds[self._name] = self.seconds.get(self._name, 0.0) + now - self._begun

@@ -20,8 +20,8 @@ import psutil
 
 _POLL = 0.2  # real s between two questions whether the process should stop
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
-"""A Python with this in its environment, and those that it starts, import nothing from the working folder."""
-_LAST_LINES = 5.0  # real s to read what a killed process has left; a child of its own may hold the pipe open
+"""With this environment a Python, and Pythons that it starts, import nothing from the working folder."""
+_LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 
 
 class Ending(Enum):
@@ -44,7 +44,7 @@ class ChildProcess:
         stderr: an open file for what it writes to stderr.
         on_line: receives each line.
         environment: of the process; None: as ours.
-        tether: give it a stdin that stays open as long as this process lives, so that it can notice when we die.
+        tether: give it a stdin that stays open while this process lives, so that it notices our end.
         on_end: is called after its last line, in the same thread.
         behind: it gets less processor time than others (nice 10; Windows: the class below normal).
 
@@ -80,7 +80,7 @@ class ChildProcess:
             | (getattr(subprocess, "CREATE_NO_WINDOW", 0) if tether else 0),
         )
         if behind:
-            with suppress(psutil.Error):  # it has ended already, or the system does not allow it
+            with suppress(psutil.Error):  # it has ended, or the system does not allow it
                 child = psutil.Process(self._process.pid)
                 child.nice(getattr(psutil, "BELOW_NORMAL_PRIORITY_CLASS", min(19, int(child.nice()) + 10)))
         self._reader = threading.Thread(target=self._read, name=f"output of process {self._process.pid}", daemon=True)
@@ -116,7 +116,7 @@ class ChildProcess:
 
         Args:
             stop: polled a few times a second; True ends the process.
-            hurry: polled likewise while the process ends; True kills it at once.
+            hurry: polled in the same way while the process ends; True kills it at once.
             seconds: real s after which it is killed.
             silence: real s without a line, from now on, after which it is ended.
             grace: real s between the request to end and the kill; 0 kills at once.
@@ -148,13 +148,13 @@ class ChildProcess:
         self._process.stdin.flush()
 
     def beat(self) -> None:
-        """Write a byte to the stdin of a tethered process, as a sign that we live."""
+        """Write a byte to the stdin of a tethered process, as a sign of life."""
         assert self._process.stdin is not None
         with suppress(OSError, ValueError):  # it has ended
             os.write(self._process.stdin.fileno(), b".")
 
     def let_go(self) -> None:
-        """Close the stdin of a tethered process: it sees what it would see if we died."""
+        """Close the stdin of a tethered process, as our end would."""
         self._close_stdin()
 
     def end(self, grace: float = 0.0) -> None:
@@ -190,21 +190,21 @@ class ChildProcess:
 
 
 def with_our_path() -> dict[str, str]:
-    """Our environment, for a child process that imports what we import."""
+    """Our environment, for a child process with the same imports."""
     given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    # The working folder stands there where we were started by `python -m`.
+    # The path contains the working folder if we were started by `python -m`.
     path = [folder for folder in sys.path if folder and (folder != str(Path.cwd()) or folder in given)]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 
 def last_line(log: Path, start: int = 0) -> str:
-    """The last line that a process wrote to a file, from byte `start` on; "" where it wrote none."""
+    """The last line that a process wrote to a file, from byte `start` on; "" without one."""
     lines = log.read_bytes()[start:].decode("utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else ""
 
 
 def json_object(line: str) -> dict[str, Any] | None:
-    """The JSON object in a line of output; None for any other line, such as what a library prints."""
+    """The JSON object in a line of output; None for any other line, such as the output of a library."""
     try:
         found = json.loads(line)
     except ValueError:

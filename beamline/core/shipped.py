@@ -1,4 +1,4 @@
-"""What comes with the package beside its code: configurations and scenes."""
+"""Configurations and scenes that come with the package."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Signals that end work early: the first asks for a stop with the data so far, the second ends at once.
 
-Python lets only the main thread catch signals: in any other thread nothing is caught, and whoever holds the request to
-stop asks it.
+Python lets only the main thread catch signals. Other threads catch nothing; there the request to stop must come from
+its owner.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _ENDING = (
     "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
     "SIGPWR",
 )  # fmt: skip
-"""What would end the process, on any system: a batch system's warning, a time limit, a failing mains."""
+"""Signals that would end the process, on any system: of a batch system, a time limit, a power failure."""
 _SAID_WITHIN = 0.2  # s
 
 
@@ -88,11 +88,11 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 @contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
-    """Within the context signals have these handlers, where this is the main thread; afterwards those of before."""
+    """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones."""
     with ExitStack() as restore:
         if threading.current_thread() is threading.main_thread():
             for number, handler in handlers.items():
-                if signal.getsignal(number) is not None:  # None: not Python's, and could not be given back
+                if signal.getsignal(number) is not None:  # None: not Python's, and could not be restored
                     restore.callback(signal.signal, number, signal.signal(number, handler))
         yield
 
@@ -105,13 +105,13 @@ def _asking_to_end() -> list[signal.Signals]:
 
 
 def _say(text: str) -> None:
-    """Print in a thread of its own: where nobody reads the terminal, that would hold up the scan that is to stop."""
+    """Print in a thread of its own: a terminal without a reader must not delay the stop of the scan."""
     thread = threading.Thread(target=_print, args=(text,), daemon=True)
     thread.start()
     thread.join(_SAID_WITHIN)
 
 
 def _print(text: str) -> None:
-    with suppress(OSError, ValueError, AttributeError):  # the terminal was closed, or there is none
+    with suppress(OSError, ValueError, AttributeError):  # the terminal is closed or missing
         sys.stderr.write(f"{text}\n")
         sys.stderr.flush()

@@ -38,7 +38,7 @@ class StopLatch:
         return self.stopped
 
     def cut(self, done: int, planned: int) -> bool:
-        """Whether the stop left some of the `planned` steps or iterations undone; 0 where none were planned."""
+        """Whether the stop left some of the `planned` steps or iterations undone; 0: without a planned number."""
         return self.stopped and not 0 < planned <= done
 
 
@@ -49,7 +49,7 @@ class ScanAborted(ScanStopped):
 
 
 class Cause(Enum):
-    """What holds a scan back until it is over."""
+    """A cause that pauses a scan until it is over."""
 
     BEAM = "beam"
     SPACE = "space on the disk"
@@ -57,7 +57,7 @@ class Cause(Enum):
 
 
 class PauseRequest:
-    """A request to pause a scan, from any thread: until somebody resumes it, or until what holds it back is over."""
+    """A request to pause a scan, from any thread: until somebody resumes it, or until its causes are over."""
 
     def __init__(self) -> None:
         self._by_operator = ""
@@ -66,12 +66,12 @@ class PauseRequest:
 
     @property
     def reason(self) -> str:
-        """Why the scan should wait, and how the wait ends; "" where it should not wait."""
+        """Why the scan should wait, and how the wait ends; "" if it should not wait."""
         return self._by_operator or next(iter([*self._held_by.values()]), "")
 
     @property
     def ends_by_itself(self) -> bool:
-        """The causes are the disk alone: nobody is needed to end the pause."""
+        """Whether the disk is the only cause, so that the pause ends without the operator."""
         return not self._by_operator and self._held_by.keys() <= {Cause.SPACE, Cause.BACKLOG}
 
     def pause(self, reason: str = "the operator asked for it") -> None:
@@ -80,11 +80,11 @@ class PauseRequest:
         )
 
     def resume(self) -> None:
-        """End the pause that was asked for; one for want of beam or disk goes on."""
+        """End the operator's pause; a pause for missing beam or a slow disk goes on."""
         self._by_operator = ""
 
     def no_beam(self, reason: str, since: float) -> None:
-        """There is none, and may have been none since that time (s since the Unix epoch)."""
+        """Report that the beam is missing, perhaps since that time (s since the Unix epoch)."""
         with self._lock:
             self._unlit_since = min(self._unlit_since, since)
         self.hold(Cause.BEAM, reason)
@@ -100,17 +100,17 @@ class PauseRequest:
         self._held_by.pop(by, None)
 
     def take_unlit_since(self) -> float:
-        """The time since which frames may have had no beam, asked once; inf where all had."""
+        """The time since which frames may lack beam, returned once; inf if none do."""
         with self._lock:
             since, self._unlit_since = self._unlit_since, math.inf
         return since
 
 
 class StopRequest:
-    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once); it stays requested.
+    """A request to stop a scan (finish cleanly with fewer frames) or to abort it (end at once); it cannot be undone.
 
-    Can be set from any thread and from signal handlers: each flag is set by one assignment, without a lock, because a
-    handler may interrupt another one here.
+    Any thread and signal handlers can set it. Each flag is set by one assignment, without a lock, because a handler may
+    interrupt another one here.
 
     Args:
         now: a clock in real s.
@@ -127,7 +127,7 @@ class StopRequest:
         self._stop = True
 
     def stop_as_enough(self, reason: str) -> None:
-        """As `stop`, because the frames so far serve their purpose: nobody is in a hurry."""
+        """As `stop`, but without hurry: the frames so far serve their purpose."""
         self._enough = not self._stop
         self.stop(reason)
 
@@ -145,7 +145,7 @@ class StopRequest:
 
     @property
     def enough(self) -> bool:
-        """It is stopped, and nobody asked for that but `stop_as_enough`."""
+        """Whether it is stopped only by `stop_as_enough`."""
         return self._enough and not self._abort
 
     @property

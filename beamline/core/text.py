@@ -20,7 +20,7 @@ def size(n_bytes: float) -> str:
 
 
 def printable(text: str) -> str:
-    """The text as a terminal can show it: control characters but line ends and tabs as `\\x1b`, so that none acts."""
+    """The text for a terminal: control characters become `\\x1b`, except line ends and tabs, so that none acts."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 

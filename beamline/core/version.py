@@ -1,4 +1,4 @@
-"""The version that outputs are signed with."""
+"""The version that is written to outputs."""
 
 from __future__ import annotations
 

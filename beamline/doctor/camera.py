@@ -120,7 +120,7 @@ def _cameras(dcam: Dcam) -> list[dict[str, str]]:
             for index in range(dcam.api_init())
         ]
     finally:
-        with suppress(DeviceError):  # also a session that did not start must be ended; its error is reported already
+        with suppress(DeviceError):  # a session that did not start must be ended, too; its error is already reported
             dcam.api_uninit()
 
 

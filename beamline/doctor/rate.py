@@ -1,4 +1,4 @@
-"""Rate: frames of a made-up scan taken through more and more of the acquisition, beside a plain write of their bytes.
+"""Rate: passes frames of an invented scan through more and more of the acquisition, beside a plain write of bytes.
 
 Each stage is measured in turn, several times over, because disks and machines change their speed while they are
 measured: the ratios are those of stages in the same round.
@@ -37,17 +37,17 @@ from drivers.base.protocols import TriggerTrain
 from drivers.frame_memory import FrameMemory
 
 REFERENCES = 2  # darks, and as many flats
-RING = 8  # views that differ; they come by turns
+RING = 8  # different views, used in turn
 FEWEST = 32  # frames of a warm-up, which compiles the kernels and tells how many the time allows, and of a stage
 DARK, FLAT, ABSORPTION, RADIUS = 200, 12_000, 1.5, 0.8  # counts; line integral at the axis; share of half the width
 SATURATION = 65_535
-_LONG = 1000  # frames: a scan of more has no more of them in memory
-PERIOD = 1 / 120  # s that the frames say lie between them; they come as fast as they are taken
+_LONG = 1000  # frames: a longer scan has no more of them in memory
+PERIOD = 1 / 120  # s between the frames' time stamps; they come as fast as they are taken
 
 
 @dataclass(frozen=True)
 class Load:
-    """What is written.
+    """The frames to write.
 
     Attributes:
         shape: (rows, cols) of a frame.
@@ -65,8 +65,9 @@ class Load:
 
     @cached_property
     def images(self) -> Sequence[NDArray[np.uint16]]:
-        """Frames with photon noise, REFERENCES darks, as many flats, and RING views of a cylinder on the axis. Those of
-        a kind are the same noise, shifted along the cylinder."""
+        """Frames with photon noise: REFERENCES darks, as many flats, and RING views of a cylinder on the axis.
+
+        Frames of a kind have the same noise, shifted along the cylinder."""
         random, u = np.random.default_rng(0), np.linspace(-1, 1, self.shape[1]) / RADIUS
         light = FLAT * np.exp(-ABSORPTION * np.sqrt(np.clip(1 - u**2, 0, None)))
         images = list[NDArray[np.uint16]]()
@@ -94,14 +95,14 @@ class Load:
 
     @cached_property
     def memory(self) -> FrameMemory:
-        """Of the frames that are taken, as a scan has it before its first frame."""
+        """Memory of the frames, as a scan has it before its first frame."""
         memory = FrameMemory()
         memory.prepare(frames_in_memory(self.timeline(_LONG)), self.shape)
         return memory
 
     def prepare(self) -> None:
-        """Make images, digests and memory now: else the first stage that needs them would be measured with it."""
-        _ = self.memory  # it needs the timeline, that the digests, and they the images
+        """Make images, digests and memory now, so that no stage's time includes this work."""
+        _ = self.memory  # it needs the timeline, which needs the digests, which need the images
 
     @property
     def context(self) -> ScanContext:
@@ -216,7 +217,7 @@ def _pipeline(load: Load, folder: Path, n: int, clock: Clock) -> int:
         status = "complete"
     finally:
         if status == "failed":
-            with suppress(DataError):  # the first one counts
+            with suppress(DataError):  # the first one is measured, too
                 recorder.finish()
         writer.close(status)
     return _lost(load, writer.path, n)

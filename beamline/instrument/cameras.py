@@ -1,4 +1,4 @@
-"""Cameras: a configured real camera becomes its driver, and what it is waited for before a scan."""
+"""Cameras: a configured real camera becomes its driver; waits for a cold sensor before a scan."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from drivers.dcam.options import DcamOptions
 
 TELL_EVERY = 30.0
-"""s between words on a sensor that is cooling down."""
+"""s between messages on a sensor that is cooling down."""
 
 
 def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
@@ -38,7 +38,7 @@ def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, check_stop
 
     Args:
         seconds: at most.
-        check_stop: called once a second; what it raises ends the wait.
+        check_stop: called once a second; its exception ends the wait.
 
     Raises:
         DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
@@ -57,7 +57,7 @@ def wait_until_cold(camera: DcamCamera, seconds: float, clock: Clock, check_stop
 
 
 def options_of(camera: DcamOrca) -> DcamOptions:
-    """What the configuration says, as the driver takes it."""
+    """The configuration in the driver's terms."""
     from drivers.dcam import options
 
     return options.DcamOptions(

@@ -42,13 +42,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ConnectedDevices:
-    """Connected devices and what goes with them; leaving a `with` block closes them.
+    """Connected devices and their surroundings; leaving a `with` block closes them.
 
     Attributes:
-        clock: what every wait of the run goes by.
-        simulated: what the simulator knows; None at a real instrument.
+        clock: for every wait of the run.
+        simulated: facts of the simulator; None at a real instrument.
         close: frees ports and camera; a second time does nothing.
-        beam_monitor: None where none is configured.
+        beam_monitor: None if none is configured.
         frame_memory: of the camera's frames; None for a simulated camera.
     """
 
@@ -116,9 +116,9 @@ def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[Rotation
 
 
 def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float], int]]:
-    """What the devices will say once connected, from the configuration and the data sheet alone: for dry runs.
+    """The limits and timing of the devices by the configuration and the data sheet alone: for dry runs.
 
-    A simulated scene is read too, so that what is wrong with it is said now.
+    A simulated scene is read, too, so that its faults are reported now.
 
     Returns:
         the stage's limits, the camera's timing with the views' exposure, and the stage's radians to whole counts.

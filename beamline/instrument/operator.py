@@ -1,4 +1,4 @@
-"""Ask: requests to the operator at the terminal, for what no device does by itself."""
+"""Ask: requests to the operator at the terminal, for manual work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def ask_operator(request: str) -> None:
     """Ask the operator at the terminal, and wait for Enter.
 
     Raises:
-        DeviceError: nobody sits there.
+        DeviceError: there is no terminal, or no confirmation.
     """
     if not sys.stdin.isatty():
         raise DeviceError(
@@ -42,7 +42,7 @@ def ask_operator(request: str) -> None:
 
 
 def enter_pressed() -> bool:
-    """Whether Enter was pressed at the terminal since the last look; False where there is none. Does not wait."""
+    """Whether Enter was pressed at the terminal since the last call; False without a terminal. Does not wait."""
     pressed = False
     if not sys.stdin.isatty():
         return False

@@ -1,4 +1,4 @@
-"""Simulated instrument: the stand-ins that take the devices' places, behind the same drivers where there are any.
+"""Simulated instrument: simulated devices, behind the real drivers where these exist.
 
 Simulators are imported where they are needed, so that an instrument loads none.
 """
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SimulatedScene:
-    """What is known of a simulated scene and cannot be known at an instrument.
+    """Facts about a simulated scene that an instrument cannot know.
 
     Attributes:
         truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
@@ -106,7 +106,7 @@ def scene_of(config: Config) -> Scene:
 
 
 def _refuse_unrecordable(config: Config, scene: Scene) -> None:
-    """Raises ConfigError where the file of a cone's scan could not be reconstructed: what it has no words for."""
+    """Raises ConfigError for a cone's scan that its file could not describe, and that could not be reconstructed."""
     camera, (height, width) = config.devices.camera, orca_quest.SENSOR_SHAPE
     row0, col0, rows, _ = camera.roi or (0, 0, height, width)
     if 2 * row0 + rows != height:

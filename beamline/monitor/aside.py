@@ -1,4 +1,4 @@
-"""Aside: which checks could not look at views of a scan, and why; without it a scan without findings reads as good."""
+"""Aside: which checks skipped views of a scan, and why. Otherwise a scan without findings would count as good."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class Aside:
     """Views with light so far, and those that checks left out.
 
     Attributes:
-        views: of them.
-        alone: that were not compared with those before.
+        views: their number.
+        alone: views that were not compared with earlier ones.
         without_flats, cones, wider: views of a scan without flats, of a cone beam, of a sample wider than the field.
     """
 
@@ -37,7 +37,7 @@ class Aside:
         )
 
     def said(self) -> tuple[str, ...]:
-        """Checks, views and reason, one each; the first views only where all are: they have none before them."""
+        """Checks, views and reason, a text each. First views, which have no earlier ones, count only if all do."""
         alone = self.alone if self.alone > min(SPAN, self.views - 1) else 0
         reasons = (
             ("drift of beam, field, opposite, mass", self.without_flats, "no flats"),

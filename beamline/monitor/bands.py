@@ -1,9 +1,9 @@
-"""Bands: rows or columns that lose or gain light at once while the others do not: a lost packet, a slit that moved.
+"""Bands: rows or columns that suddenly lose or gain light while others do not: a lost packet, a slit that moved.
 
 A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
-column is compared with the value expected from the views before. A change that all have in
-common is the beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their neighbours
-as they did at its beginning.
+column is compared with the value expected from the views before. A change of
+all lines is the beam's. A band begins where a few lines jump. It lasts as long as these lines differ from their
+neighbours as at its beginning.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ BEFORE = 3  # frames whose mean step is a line's velocity
 MEMORY = 0.1  # weight of the newest frame in a line's usual change
 SIGMAS = 10.0
 PATIENCE = 20  # flagged frames in a row after which the band is the new normal
-NARROW = 0.25  # of the lines: more of them that jump are no band but the beam or the sample
-REMAINS = 0.5  # of the jump, while the band lasts
-STANDS_OUT = 0.25  # of the jump, from both neighbours: an edge that passes is like one of them
+NARROW = 0.25  # share of the lines: if more lines jump, the beam or the sample changed
+REMAINS = 0.5  # share of the jump that remains while the band lasts
+STANDS_OUT = 0.25  # share of the jump from both neighbours: a passing edge is like one of them
 LEAST_LIGHT = 0.5  # counts
 
 Lines = NDArray[np.float64]
@@ -44,8 +44,8 @@ class Profile:
         last: logarithms of the light of the last frames without a band, oldest first.
         change: each line's usual change that its velocity does not explain.
         blocks: [line, block] counts of the last frame without a band.
-        first, after: lines of the band that lasts; equal where there is none.
-        jump: by which they differ from the lines beside them, more than before it.
+        first, after: lines of the present band; equal without one.
+        jump: change of their difference from the lines beside them.
         flagged: frames in a row with this band.
     """
 
@@ -59,7 +59,7 @@ class Profile:
     flagged: int = 0
 
     def apart(self) -> Profile:
-        """Before a frame that is no neighbour of the last one: two frames more give velocities first."""
+        """Prepare for a frame that is not a neighbour of the last one: two frames must give velocities first."""
         return Profile((), self.change, min(self.seen, CALIBRATION - 3))
 
 
@@ -190,10 +190,10 @@ def _run(lines: NDArray[np.intp], inside: int) -> tuple[int, int]:
 
 
 def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
-    """By how much the darkest (or brightest) of some lines differs from those on both sides: difference of logarithms.
+    """Difference of the darkest (or brightest) of some lines from those on both sides, in logarithms.
 
-    An edge of the sample lies between the two; at the frame's edge there is one. The outer lines of a band may be in it
-    by a part only.
+    An edge of the sample lies between the two sides; at the frame's edge there is only one side. The outer lines of a
+    band may be only partly in it.
     """
     left, right = lines[max(first - 1, 0) : first], lines[after : after + 1]
     beside = [float(side.mean()) for side in (left, right) if side.size]
@@ -204,5 +204,5 @@ def _contrast(lines: Lines, first: int, after: int, darker: bool) -> float:
 
 
 def _typical(now: Blocks, before: Blocks) -> float:
-    """Median change of the logarithm of the light along a line: a zinger is no band."""
+    """Median change of the logarithm of the light along a line, so that zingers do not count."""
     return float(np.median(np.log(np.maximum(now, LEAST_LIGHT)) - np.log(np.maximum(before, LEAST_LIGHT))))

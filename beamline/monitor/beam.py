@@ -1,7 +1,7 @@
-"""Beam: is as much light coming as when the flats were taken, and does it stay?
+"""Beam: drift of the light against the flats, and its dips and flashes.
 
-Against the flats it is judged where there is air: the brightest of the places in a view. It is a drift: said once, and
-again only after it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
+The drift against the flats is judged in air: the brightest place of a view. It is reported once, and again only after
+it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
 air. These changes have errors of one sign where dense particles turn fast; these would sum up to a dip. A change counts
 only where the light of the whole view moved with it.
 """
@@ -24,25 +24,25 @@ from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.base.frame import Frame, FrameKind
 
 PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
-COVERED = 0.1  # light that the brightest place has less than the flats: there is no air, or the beam fell before
+COVERED = 0.1  # loss of light at the brightest place: with more there is no air, or the beam fell earlier
 LASTS = 5  # views that a drift must last
-GONE = 0.5  # of the limit, below which a drift has gone
+GONE = 0.5  # share of the limit below which a drift has gone
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual light
-CONFIRMED = 0.5  # of a change of the light, that the whole view's light must show: the rest may be the sample's turning
-SIGMAS = 6.0  # of the changes, that a dip must have
+CONFIRMED = 0.5  # share of a change that the whole view's light must show: the rest may be the sample's turning
+SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 
 
 @dataclass(frozen=True)
 class BeamState:
-    """What it remembers.
+    """State of the check.
 
     Attributes:
-        drifting: views in a row beyond the limit; after `said` those are counted that are back.
+        drifting: views in a row beyond the limit; after `said`, views in a row within it.
         said: the drift was flagged.
-        covered: that there is no air was said.
+        covered: the missing air was reported.
         level: logarithm of the light over that of the first view, from its confirmed changes.
-        usual: level that is normal.
+        usual: the normal level.
         dipping: views in a row with a dip.
         whole: logarithm of the light of the whole view before; NaN before any.
         changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the
@@ -61,7 +61,7 @@ class BeamState:
 
 @dataclass(frozen=True)
 class BeamCheck:
-    """Score: fraction of the light that is gone (negative: there is more).
+    """Score: lost fraction of the light (negative: gained).
 
     The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, as air beside the sample
     allows. 10 % at once are no drift of a ring.

@@ -1,4 +1,4 @@
-"""Blur: have the views lost their finest detail, by focus or by motion while a frame was exposed?
+"""Blur: loss of the finest detail, by defocus or by motion during the exposure.
 
 The figure is the contrast of second differences over two pixels against that of first differences over four, along the
 rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
@@ -23,20 +23,20 @@ from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
 
-PIXELS = 2**16  # of a frame that are looked at, about
-STRIP = 6  # neighbouring rows that are looked at together
+PIXELS = 2**16  # approximate number of rows of a frame that are used
+STRIP = 6  # neighbouring rows that are used together
 FAR = 4  # pixels that a difference spans; even
-STEEPEST = 0.5  # of the open beam: a larger difference is a zinger or a hot pixel
+STEEPEST = 0.5  # share of the open beam: a larger difference is a zinger or a hot pixel
 SIGMAS = 8.0
-LEAST = 0.9  # a limit above which nothing can be said: too few photons, or too few edges
-GONE = 0.5  # of the limit: below it, sharpness is back
+LEAST = 0.9  # highest useful limit; above it there are too few photons or edges
+GONE = 0.5  # share of the limit below which sharpness is back
 PATIENCE = 40  # views after which it is the new normal
-DARKEST = 0.05  # of the flat's mean: a pixel with less light says nothing
+DARKEST = 0.05  # share of the flat's mean: pixels with less light are not used
 
 
 @dataclass(frozen=True, eq=False)
 class BlurState:
-    """What it remembers.
+    """State of the check.
 
     Attributes:
         kind, counted: of the latest group of frames.
@@ -44,7 +44,7 @@ class BlurState:
         across, down: the usual figures along the rows and along the columns.
         first: the same of the first views, which stay.
         blurred: views in a row that are flagged.
-        said: that the detail fell slowly was said.
+        said: the slow loss was reported.
     """
 
     kind: FrameKind = FrameKind.INVALID
@@ -82,7 +82,7 @@ class BlurCheck:
             return Look(_with_reference(state, frame))
         if context.view is None:
             return Look(state)
-        if not context.follows:  # a sample may be less sharp from there
+        if not context.follows:  # a sample may be less sharp from that side
             state = replace(state, across=FrameScatter(), down=FrameScatter(), blurred=0)
         across, down = sharpness(_lines(frame), state.dark, state.flat)
         after = replace(state, kind=frame.kind, across=_updated(state.across, across), down=_updated(state.down, down))
@@ -143,7 +143,7 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
 
 
 def _lines(frame: Frame) -> NDArray[Any]:
-    """The rows that are looked at: all of a small frame, strips of STRIP rows of a large one."""
+    """The rows that are used: all of a small frame, strips of STRIP rows of a large one."""
     counts = frame.counts if frame.counts.dtype == np.uint16 else frame.counts.astype(np.float32)
     rows, cols = counts.shape
     strips = max(1, min(rows // STRIP, PIXELS // (STRIP * cols)))

@@ -1,11 +1,11 @@
-"""Change: the part of a view that the turning of the sample since the views before does not explain.
+"""Change: the difference of a view from earlier ones that the turning of the sample does not explain.
 
 Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the
 stage other than the last ones (turn). For the columns of the fit: d depth = -gain - across d/dx - down d/dy + turn
 velocity. All cells take part, so that each figure is 10 to 100 times finer than one cell's noise. The first pass
 weights cells by how far they are from the median change, the second by their residuals of the first (Huber 1964). So a
-floater, a zinger or a band moves nothing.
+floater, a zinger or a band hardly affects the fit.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from beamline.monitor.view import CellGrid, CellValues, CellView
 
 SPAN = 4  # views before; the velocity is the mean of their three steps
 HUBER = 2.0  # standard deviations of the residual up to which a cell has its full weight
-LEAST_VARYING = 0.1  # of what a shift changes, which must differ from row to row
-MOST_STEPS = 4  # steps that a gap may have: after a longer one, velocities say nothing
+LEAST_VARYING = 0.1  # share of a shift's change that must differ from row to row
+MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +34,11 @@ class SampleChange:
 
     Attributes:
         gain: relative change of the light, of all cells alike.
-        across, down: pixels of the frame by which the sample is right of, or below, where it should be.
-        turn: steps by which the stage turned further than its last ones; NaN where nothing turns visibly.
+        across, down: pixels of the frame by which the sample is displaced to the right, and downwards.
+        turn: excess rotation of the stage, in steps; NaN if nothing turns visibly.
         residual: float32 [row, col], change of the depth that these do not explain.
         noise: robust standard deviation of the residual times the square root of the weight, over the lit cells.
-        causes: what the fit knew, for `beside_columns`.
+        causes: inputs of the fit, for `beside_columns`.
     """
 
     gain: float
@@ -50,10 +50,10 @@ class SampleChange:
     causes: Causes | None = None
 
     def beside_columns(self) -> tuple[float, float, float] | None:
-        """Across, down and turn by what differs from row to row; None where the rows are too much alike to tell.
+        """Across, down and turn by differences between rows; None if the rows are too much alike.
 
-        A hump of light that is as high as the frame, such as a ghost, changes all rows of a column alike. It shifts
-        nothing here, and a sample that moves moves here, too.
+        A hump of light as high as the frame, such as a ghost, changes all rows of a column alike. It has no effect
+        here, while the motion of a sample has.
         """
         if self.causes is None or min(self.residual.shape) < 2:
             return None
@@ -72,7 +72,7 @@ class SampleChange:
 
 @dataclass(frozen=True, eq=False)
 class Causes:
-    """What a fit of a view to those before knew.
+    """Inputs of the fit of a view to earlier ones.
 
     Attributes:
         image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed.
@@ -88,7 +88,7 @@ class Causes:
     cell: int
 
     def basis(self) -> CellValues:
-        """[cause, row, col]: what a pixel across, a pixel down and a turn of a step change."""
+        """[cause, row, col]: changes by a pixel across, a pixel down and a turn of a step."""
         down, across = np.gradient(self.image)
         return np.stack([-across / self.cell, -down / self.cell, self.turning * np.float32(self.steps)])
 
@@ -112,7 +112,7 @@ def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> Sam
 
 
 def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
-    """Steps since the view before: 1, more where views between were not used; None where the angles are uneven."""
+    """Steps since the last view: 1, or more if views between were not used; None if the angles are uneven."""
     usual = (last[-1].angle - last[0].angle) / (SPAN - 1)
     if not math.isfinite(usual) or usual == 0:
         return 1.0 if view.angle == last[-1].angle or not math.isfinite(view.angle) else None
@@ -160,7 +160,7 @@ def _deviation(change: CellValues, usual: float, weight: CellValues) -> tuple[Ce
 
 
 def _median(values: CellValues) -> float:
-    """As np.median, which takes longer to begin than for a few thousand values."""
+    """As np.median, but faster for a few thousand values."""
     half = values.size // 2
     low = half - 1 + values.size % 2
     ordered = np.partition(values, (low, half), axis=None)
@@ -197,7 +197,7 @@ def _add_normal(smooth, image, turning, weight, share, normal, right):  # type: 
 
 @njit(nogil=True, cache=True)
 def _take_off(change, smooth, image, turning, weight, solution, residual, left_over):  # type: ignore[no-untyped-def]
-    """Fills `residual` and `left_over`, what the causes do not explain of the change and of the smooth one."""
+    """Fills `residual` and `left_over`: the change, and the smoothed change, without the causes' part."""
     rows, cols = change.shape
     for row in range(rows):
         above, below = max(row - 1, 0), min(row + 1, rows - 1)
@@ -214,7 +214,7 @@ def _take_off(change, smooth, image, turning, weight, solution, residual, left_o
 
 
 class _Fit(NamedTuple):
-    """What explains the change best: minus gain, across, down in cells, turn in steps; and what it leaves."""
+    """The best fit of the change: minus gain, across, down in cells, turn in steps; and its residual."""
 
     solution: NDArray[np.float64]
     residual: CellValues
@@ -242,7 +242,7 @@ def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, we
         normal, right = np.zeros((4, 4)), np.zeros(4)
         _add_normal(smooth, image, turning, weight, share, normal, right)
         normal += np.triu(normal, 1).T
-        # A cause that moves nothing (no sample, one row, a disc that turns) gets no share of the change.
+        # A cause without any effect (no sample, one row, a turning disc) gets no share of the change.
         normal += (1e-9 * normal[0, 0] + 1e-12) * np.eye(4)
         solution = np.asarray(np.linalg.solve(normal, right), np.float64)
         _take_off(change, smooth, image, turning, weight, solution, residual, left_over)

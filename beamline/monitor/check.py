@@ -1,4 +1,4 @@
-"""Check: what every check of the monitor is, what it may know about the scan, and what it finds.
+"""Check: the interface of every check of the monitor, its knowledge of the scan, and its findings.
 
 A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It looks at one
 frame after another and carries what it needs to remember as an immutable state, so that a scan can be replayed.
@@ -31,10 +31,10 @@ class Level(StrEnum):
 
 
 class Policy(StrEnum):
-    """What alarms of a check do to the scan."""
+    """Effect of a check's alarms on the scan."""
 
     LOG = "log"  # write it down: file, events, report
-    WARN = "warn"  # and say it on the terminal
+    WARN = "warn"  # and print it on the terminal
     PAUSE = "pause"  # and hold the scan until the operator or the check says that it may go on
     STOP = "stop"  # and end the scan cleanly, as the first Ctrl-C does
 
@@ -72,7 +72,7 @@ class Flag:
 
 @dataclass(frozen=True, eq=False)
 class ScanContext:
-    """What checks may know besides the frame: the scan, the references so far, and what all checks need of the frame.
+    """Knowledge of the checks: the scan, the references so far, and quantities of the frame that all checks need.
 
     Attributes:
         saturation: the count from which a pixel is saturated.
@@ -88,14 +88,14 @@ class ScanContext:
         dark, flat: float32 [preview row, preview col] mean of the latest group of darks and of flats, None before any.
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
-        spots: bright pixels that the frame before had not, of views and flats.
-        follows: the view before it in the file is its neighbour in angle, or there is none. Not so where views are
-            taken again, at a new pass, or after views of another file: checks that compare neighbours begin anew there.
+        spots: bright pixels of views and flats that the previous frame lacks.
+        follows: the previous view in the file is its neighbour in angle, or there is none. False for repeated views, at
+        a new pass, or after views of another file: checks that compare neighbours begin anew there.
             True where `step` is not known.
         light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
             projection.
         view: the frame on this grid; None where it is no projection, or has no light.
-        truncated: the sample is wider than the field, in this view or those before; or there are no flats to tell.
+        truncated: the sample is wider than the field, in this view or earlier ones; or flats are missing.
         change: the part that turning since the views before does not explain; None where these are too few, or at
             uneven steps.
     """

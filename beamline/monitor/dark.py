@@ -1,4 +1,4 @@
-"""Dark: are the darks dark, and do they stay the same?"""
+"""Dark: light in the darks, and their drift."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DarkState:
 
 @dataclass(frozen=True)
 class DarkCheck:
-    """Score: dark over flat where the shutter seems open, else counts of drift.
+    """Score: dark over flat if the shutter seems open, otherwise counts of drift.
 
     The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.
     """
@@ -76,7 +76,7 @@ class DarkCheck:
         return Look(state, Flag(self.name, Level.WARN, view, drift, self.drift, advice))
 
     def _lit(self, dark: float, flat: float, noise: float) -> bool:
-        """The dark has light: not an offset below flats of few photons, which are bright against readout noise only."""
+        """Whether the dark has light; an offset below flats that are bright only against readout noise is ignored."""
         few = noise < READOUT and SHUT * noise < flat - dark < FEW * noise
         return dark > self.light * flat and not few
 

@@ -1,11 +1,11 @@
-"""Fan: filters that are blind to whatever turns with the stage within the field, and see what moves otherwise.
+"""Fan: filters that suppress everything that turns with the stage within the field, and pass other motion.
 
 A point of the sample at the distance r from the axis moves by at most r times the angle's step from view to view. In a
 few neighbouring views the sample's line integrals are therefore a sum of patterns, each moving steadily at a speed
 between -limit and +limit. In the Fourier domain that is a fan, the "bow tie" of a sinogram (Rattey & Lindgren 1981,
 IEEE Trans. ASSP 29:994). With the covariance C of such patterns plus noise, the linear filter that finds a signal s
-with the best ratio to both is C^-1 s. (Matched filter; North 1943, Robey et al. 1992, IEEE Trans. AES 28:208). What the
-sample holds need not be known.
+with the best ratio to both is C^-1 s. (Matched filter; North 1943, Robey et al. 1992, IEEE Trans. AES 28:208). The
+sample itself need not be known.
 
 Lengths are cells, times are views.
 """
@@ -24,17 +24,17 @@ Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
 FREQUENCIES = 120  # up to Nyquist, over which the covariance is summed
 ROUGHNESS = 0.05  # cycles-of-2-pi a cell below which the sample's spectrum is flat; above it falls as its third power
-CONSTANT = 1.0  # variance of what does not change: rings, flats that do not fit
+CONSTANT = 1.0  # variance of constant differences: rings, flats that do not fit
 
 
 @dataclass(frozen=True)
 class Clutter:
-    """What the filters are to be blind to.
+    """The signals that the filters suppress.
 
     Attributes:
         speed: cells a view that the sample's fastest point moves.
         structure: variance of the sample's line integrals on the scale of the window.
-        common: variance of changes that a whole row or view has in common, as of the beam's.
+        common: variance of changes of a whole row or view, such as the beam's.
         noise: variance of a cell's noise.
     """
 
@@ -101,7 +101,7 @@ def correlate(views, weights, out):  # type: ignore[no-untyped-def]  # numba inf
     for row in range(rows):
         for lag in range(lags):
             wide[:REACH] = views[lag, row, 0]
-            for i in range(cols):  # an assignment of slices compiles numba's check of shapes, for seconds
+            for i in range(cols):  # assigning slices would compile numba's check of shapes, which takes seconds
                 wide[REACH + i] = views[lag, row, i]
             wide[REACH + cols :] = views[lag, row, cols - 1]
             for signal in range(signals):

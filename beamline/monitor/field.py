@@ -1,4 +1,4 @@
-"""Field: does light reach all of the frame, and is the sample within it?"""
+"""Field: parts of the frame without light, and a sample beyond its edges."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from beamline.monitor.view import BRIGHT, UNLIT, CellGrid, CellView
 from drivers.base.frame import Frame, FrameKind
 
 LASTS = 5  # views in a row with matter at an edge
-NO_BEAM = 3.0  # times the noise, up to which the bright part of a flat is no light: of noise alone it is 1.3
-NAMED = 4  # shadows that are named
+NO_BEAM = 3.0  # times the noise: a flat's bright part below this has no light; noise alone gives 1.3
+NAMED = 4  # most shadows that are named
 
 
 @dataclass(frozen=True)
 class FieldState:
-    """Unlit flats were said; views in a row with matter at the edges; that was said."""
+    """Unlit flats were reported; views in a row with matter at the edges; that was reported."""
 
     unlit: bool = False
     cut: int = 0

@@ -1,6 +1,6 @@
-"""Floater: a particle that crosses the field in some views, faster than the sample's turning carries anything.
+"""Floater: a particle that crosses the field in some views, faster than anything that turns with the sample.
 
-It is found by filters that are blind to all that turns within the field (beamline.monitor.fan). It shows as peaks of
+It is found by filters that suppress everything that turns within the field (beamline.monitor.fan). It shows as peaks of
 absorption that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of
 the sample obeys col = a cos + b sin + c with sqrt(a² + b²) within the sample; a floater's line is steeper than any of
 these at its place.
@@ -28,14 +28,19 @@ LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
 LATER = LAGS[-1]  # views after the one that is judged
 SPAN = LATER - LAGS[0] + 1
 SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
-SPEEDS = (1.4, 2.0, 3.0, 4.5)  # of the sample's fastest point; faster ones are in one view of the window only
+SPEEDS = (
+    1.4,
+    2.0,
+    3.0,
+    4.5,
+)  # of the sample's fastest point; faster ones are in only one view of the window
 STRUCTURE, COMMON = 1.0, 0.02**2  # line integrals of about 1; a beam that changes by 2 %
 WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
 MARGIN = 1.15  # the axis may be off the middle, and the sample a little wider than the field
-FASTER = 1.25  # than the sample's point at the same place: a floater
+FASTER = 1.25  # times as fast as the sample's point at the same place
 RULES = Rules(span=12, least=4, share=0.4, total=30.0, rows=1.0, cols=1.0, slack=0.03)
 SPIKE = 4.0  # standard deviations by which a cell may be brighter than in the views before and after: a zinger
-CROWD = 12  # peaks in one view: the sample jumped, or a band
+CROWD = 12  # peaks in one view: with more the sample jumped, or it is a band
 MEMORY = 0.1  # weight of the newest view in a place's usual output
 VELOCITY_NOISE = 1.7  # of a change's residual over that of a view: sqrt(1 + (4/3)² + (1/3)²), see change
 LEAST_NOISE = 2e-3  # line integral
@@ -48,7 +53,7 @@ FASTEST = 1e3  # cells a view: what moves faster is in one view only
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    """What it remembers.
+    """State of the check.
 
     Attributes:
         raw: the last two views.
@@ -56,7 +61,7 @@ class FloaterState:
         depths: their line integrals, without zingers and smoothed along the columns; oldest first.
         filters: for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight
             `light`.
-        usual: what the filters usually give at each cell: the sample's sharpest edges are not nulled completely.
+        usual: usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely.
         peaks: of the last views.
     """
 
@@ -137,7 +142,7 @@ class FloaterCheck:
 
 
 def _with_view(state: FloaterState, view: CellView, noise: float) -> FloaterState:
-    """The state with the view before the newest, without its zingers: they are in neither of its neighbours."""
+    """The state with the second newest view, without its zingers, which are in neither of its neighbours."""
     if len(state.raw) < 2:
         return replace(state, raw=(*state.raw, view))
     before, middle = state.raw

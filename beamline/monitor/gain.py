@@ -1,4 +1,4 @@
-"""Gain: does the light, or the camera's gain, step between two views?"""
+"""Gain: a step of the light, or of the camera's gain, between two views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drivers.base.frame import Frame
 
 SIGMAS = 8.0
 PARTS = 5  # of the field, from left to right
-ALIKE = 0.5  # of the gain, by which the parts may differ: a ghost is in some of them only
+ALIKE = 0.5  # share of the gain by which the parts may differ: a ghost is only in some of them
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class GainCheck:
 
 
 def _everywhere(change: SampleChange, view: CellView | None) -> float:
-    """The gain, if it is the same in all fifths of the field, from left to right; else 0: it is a ghost."""
+    """The gain, if it is equal in all fifths of the field, from left to right; otherwise 0, because it is a ghost."""
     assert view is not None
     starts = np.arange(PARTS) * view.depth.shape[1] // PARTS
     extra, light = (np.add.reduceat(part.sum(axis=0), starts) for part in (change.residual * view.weight, view.weight))

@@ -1,8 +1,8 @@
-"""Ghost: a broad hump of more or less light than any view should have that crosses the field from side to side.
+"""Ghost: a broad hump of too much or too little light that crosses the field from side to side.
 
-As for a floater the filters are blind to what turns with the stage (beamline.monitor.fan). But they look at the mean of
-all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are lost in the noise.
-In the mean of thousands of pixels they are a hundred times its noise.
+As for a floater the filters suppress everything that turns with the stage (beamline.monitor.fan). But they use the
+mean of all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are below the
+noise. In the mean of thousands of pixels they are a hundred times its noise.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from drivers.base.frame import Frame
 
 COLUMNS = 32  # broad columns of the field
 PARTS = 8  # of the rows
-MOST_PARTS = 25.0  # percentile of the parts that must have
-ALIKE = 0.25  # of the mean: a ghost is as high as the frame, a floater is in some parts only
+MOST_PARTS = 25.0  # percentile of the parts that must have the change
+ALIKE = 0.25  # share of the mean: a ghost is as high as the frame, a floater is only in some parts
 LAGS = (-4, -3, -2, -1, 0)  # times the stride
 SWEEP = 0.0105  # rad: 3 views of 0.2 degrees; while the sample turns by four of them its points move on straight lines
 MOST_STRIDE = 3
@@ -44,12 +44,12 @@ RULES = Rules(span=10, least=4, share=0.6, total=0.0, rows=0.0, cols=2.5, slack=
 
 @dataclass(frozen=True, eq=False)
 class GhostState:
-    """What it remembers.
+    """State of the check.
 
     Attributes:
         profiles: float32 [part of the rows, broad column] of the last views, oldest first.
         filters: for the angle's `step` in radians.
-        usual: what the filters usually give at each column, None before the first.
+        usual: usual output of the filters at each column, None before the first.
         peaks: the highest of each of the last views.
     """
 
@@ -108,7 +108,7 @@ class GhostCheck:
     def _judge(
         self, state: GhostState, now: int, outputs: CellValues, turn: float, context: ScanContext
     ) -> Look[GhostState]:
-        """The highest output, relative to what is usual there, and the peaks of the views before it."""
+        """The highest output, relative to the usual one there, and the peaks of earlier views."""
         assert state.filters is not None and context.grid is not None
         parts, outputs = outputs, outputs.mean(axis=1)
         spread = np.sqrt(np.mean(outputs**2, axis=0))
@@ -155,7 +155,7 @@ def _broad(cols: CellValues) -> CellValues:
 
 
 def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
-    """Noise of a profile, with what its sample does beyond moving on: from second differences over `stride` views."""
+    """Noise of a profile, including unsteady changes of the sample: from second differences over `stride` views."""
     seen = np.stack([profile.mean(axis=0) for profile in profiles])
     second = seen[2 * stride :] - 2 * seen[stride:-stride] + seen[: -2 * stride]
     return max(1.4826 * float(np.median(np.abs(second))) / math.sqrt(6.0), LEAST_NOISE)

@@ -1,4 +1,4 @@
-"""Lost: is there light at all? The only check whose alarms end a scan by default."""
+"""Lost: a beam without light. Only this check's alarms end a scan by default."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from drivers.base.frame import Frame, FrameKind
 
 @dataclass(frozen=True)
 class LostState:
-    """Nothing: the last good view is the monitor's."""
+    """Empty: the monitor keeps the last good view."""
 
 
 @dataclass(frozen=True)
 class LostCheck:
-    """Score: share of the light that is gone from nine tenths of the frame, against the last view with light.
+    """Score: lost share of the light on nine tenths of the frame, against the last view with light.
 
     The default: neither drift nor the decay of a ring's current between two top-ups takes half of the light. A sample
     that turns takes no light from all places at once.

@@ -1,4 +1,4 @@
-"""Mass: the total of a parallel projection is the same from every side, unless something came or went.
+"""Mass: the total of a parallel projection is equal from every side, unless matter entered or left.
 
 It is the moment of order 0 of the consistency conditions of Helgason (1965) and Ludwig (1966).
 """
@@ -33,7 +33,7 @@ class MassState:
 
 @dataclass(frozen=True)
 class MassCheck:
-    """Score: relative change of the mean line integral. None without light, or where the field cuts the sample."""
+    """Score: relative change of the mean line integral. None without light, or if the sample exceeds the field."""
 
     name: ClassVar[str] = "mass"
     bit: ClassVar[int] = 5

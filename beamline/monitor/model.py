@@ -1,8 +1,8 @@
-"""Model: does a view show what a reconstruction of the scan lets expect?
+"""Model: differences of a view from a reconstruction of the scan.
 
-The view's line integrals less those of a volume, in units of the view's noise. What they have in common (light) is
-taken off, and they are averaged over 3 x 3 cells. A volume never fits its views fully: at each place the difference is
-divided by what it usually is there.
+The view's line integrals less those of a volume, in units of the view's noise. Their common part (light) is
+removed, and they are averaged over 3 x 3 cells. A volume never fits its views fully: at each place the difference is
+divided by the usual one there.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ModelState:
 
 @dataclass(frozen=True)
 class ModelCheck:
-    """Score: largest difference from the volume, in standard deviations of what it usually is at its place.
+    """Score: largest difference from the volume, in standard deviations of the usual difference at its place.
 
     The default: a frame has up to 18,000 cells; noise takes one of them beyond 5 standard deviations in 100 views.
     Edges that the volume blurs move from cell to cell and have longer tails.

@@ -1,4 +1,4 @@
-"""Motion: does the sample do anything but turn steadily?"""
+"""Motion: jumps and slips of the sample, beyond steady rotation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beamline.monitor.scatter import FrameScatter
 from drivers.base.frame import Frame
 
 SIGMAS = 8.0
-CONFIRMED = 0.5  # of a figure; where less of it differs from row to row, that counts: a ghost is as high as the frame
+CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part counts: a ghost is as high as the frame
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class MotionState:
 
 @dataclass(frozen=True)
 class MotionCheck:
-    """Score: pixels by which the sample is elsewhere than its turning explains; steps of the stage where it is a slip.
+    """Score: displacement of the sample in pixels, beyond its rotation; steps of the stage if it is a slip.
 
-    Flagged is the view of the jump: the views from there on are as good as those before, but show another position.
+    Only the view of the jump is flagged: later views are as good as earlier ones, but show another position.
     The defaults: half a pixel is what reconstructions from views at two positions begin to show (a doubled edge is as
     wide as the resolution). A flat face that comes into the beam's direction looks like a slip of up to two steps.
     """

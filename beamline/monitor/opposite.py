@@ -1,4 +1,4 @@
-"""Opposite: does the view from the other side, or the same view taken again, show the same sample in the same place?
+"""Opposite: compares a view with the view from the other side, or with a repetition: a displaced or changed sample.
 
 Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
 degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a
@@ -21,13 +21,13 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.base.frame import Frame
 
-EVERY = math.radians(5)  # between the views that are kept
+EVERY = math.radians(5)  # radians between kept views
 MOST = 36  # of them: half a turn
-BESIDE = 1.25  # steps that a view may be beside the angle that is looked for
+BESIDE = 1.25  # steps by which a view may differ from the angle sought
 REACH = 2.0  # cells that the rim may move within these: the kept view goes on by its velocity
 LATER = 8  # views after the kept one at least
-CELLS = (0.05, 0.5, 0.25)  # of a cell, which the limits of a shift, of a remainder and of the axis are at least
-SIGMAS = 8.0  # of the noise, which a shift must have
+CELLS = (0.05, 0.5, 0.25)  # shares of a cell: least limits of a shift, of a remainder and of the axis
+SIGMAS = 8.0  # standard deviations of the noise that a shift must have
 FEWEST = 16  # columns that can be laid on others
 TURNS = 6  # rounds of the fit
 SEARCH = 0.4  # of the field: how far the axis may be from its middle, twice
@@ -46,7 +46,7 @@ class Kept:
     Attributes:
         view: itself.
         after: the next one, which gives the velocity.
-        turned, again: it was compared with the view from the other side, and with the one taken again.
+        turned, again: it was compared with the view from the other side, and with a repetition.
     """
 
     view: CellView
@@ -77,7 +77,7 @@ class OppositeState:
 
 @dataclass(frozen=True)
 class OppositeCheck:
-    """Score: pixels by which the sample moved, or by which all of it would have to move to change the view as much.
+    """Score: motion of the sample in pixels, or the motion of all of it that would change the view equally.
 
     The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution. Or a twentieth of a cell
     where that is more, since a shift is known no better. Flat faces and coarse steps leave a remainder of 0.3 cells.
@@ -108,7 +108,7 @@ class OppositeCheck:
             why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
             advice = f"Views from opposite sides are not compared: {why}."
             return Look(replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice))
-        kept = tuple(one for one in state.kept if one.view.index != frame.replaces)  # what it replaces had an alarm
+        kept = tuple(one for one in state.kept if one.view.index != frame.replaces)  # the replaced view had an alarm
         if kept and kept[-1].after is None:
             kept = (*kept[:-1], replace(kept[-1], after=view)) if context.follows else kept[:-1]
         elif len(kept) < MOST and all(abs(_folded(view.angle - one.view.angle)) >= EVERY for one in kept):
@@ -179,7 +179,7 @@ def _folded(angle: float) -> float:
 
 
 def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> Fit | None:
-    """Where the kept view, so many steps later, fits the view best; None where it has nothing that tells.
+    """The best fit of the kept view, so many steps later, to the view; None if the view has too little structure.
 
     Least squares over light, shift across and shift down, from the best whole number of cells on.
     """
@@ -209,7 +209,7 @@ def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored:
         w = weight[inside].ravel()
         left = (now - fitted)[inside].ravel()
         normal = (basis * w) @ basis.T
-        told = np.diag(normal)[1:] > NOISY * noise * len(w)  # a sample that is alike in all rows tells no shift down
+        told = np.diag(normal)[1:] > NOISY * noise * len(w)  # a sample with equal rows shows no shift down
         if not told[0]:
             return None
         if not told[1]:

@@ -1,4 +1,4 @@
-"""Pixels: which of the camera's see no light where their neighbours do, and which hold no number?"""
+"""Pixels: the camera's pixels without light beside lit ones, and pixels without a number."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from beamline.monitor.preview import light
 from beamline.monitor.view import BRIGHT, UNLIT
 from drivers.base.frame import Frame, FrameKind
 
-DEAD = 0.2  # of the light of the darkest of the preview blocks around it
-NAMED = 5  # pixels that are named
-HOLES = 1e-4  # of the pixels, that may hold no number: a column of 4096 is more
-HALF = 0.5  # of the pixels, without which a view is lost
+DEAD = 0.2  # share of the light of the darkest preview block around it
+NAMED = 5  # most pixels that are named
+HOLES = 1e-4  # share of the pixels that may hold no number; a column of 4096 is more
+HALF = 0.5  # share of the pixels: with more missing, a view is lost
 
 PixelPlaces = NDArray[np.int64]
 
@@ -103,7 +103,7 @@ def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlace
     above = light(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above
-    around = scipy.ndimage.minimum_filter(above, 3)  # at the edge of a shadow a dark pixel is none that is dead
+    around = scipy.ndimage.minimum_filter(above, 3)  # a dark pixel at the edge of a shadow is not dead
     limit = np.where(around > UNLIT * np.percentile(above[::2, ::2], BRIGHT), dark + DEAD * around, -np.inf)
     places = np.empty(frame.counts.size // 2, np.int64)
     return places[: _darker(frame.counts, limit.astype(np.float32), block, places)].copy()

@@ -23,13 +23,13 @@ from drivers.base.frame import FrameKind
 NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 LEAST_NOISE = 0.5  # counts: what rounding hides
 READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
-FEW = 20.0  # noises of the darks: flats with less light have no more noise by it, so that the variance tells nothing
-BRIGHT = 90.0  # percentile of a frame's blocks that stands for its light
-UNLIT = 0.05  # of the bright part's light: a place with less has none
-CHANGE_SIGMAS = 8.0  # beyond which a change between two flats is no noise
+FEW = 20.0  # noises of the darks: flats with less light have hardly more noise, so that their variance tells nothing
+BRIGHT = 90.0  # percentile of a frame's blocks that represents its light
+UNLIT = 0.05  # share of the bright part's light: a place with less counts as dark
+CHANGE_SIGMAS = 8.0  # standard deviations: a larger change between two flats is not noise
 LEAST_BLOCKS = 200  # differences of neighbouring blocks, from which a noise is known to 15 %
-ZINGER = 12.0  # times the median change: no noise
-WORST = 99.0  # percentile of the changes between two flats that counts: a zinger is no change
+ZINGER = 12.0  # times the median change: more is not noise
+WORST = 99.0  # percentile of the changes between two flats that counts, so that zingers do not
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ReferenceLimits:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFrame:
-    """What is kept of a dark or a flat.
+    """Statistics of a dark or a flat.
 
     Attributes:
         row: in the file.
@@ -91,7 +91,7 @@ class ReferenceFrame:
 
 
 class FaultKind(StrEnum):
-    """What can be wrong with darks and flats."""
+    """Kinds of faults of darks and flats."""
 
     SATURATED = auto()
     NO_BEAM = auto()  # flats at the darks' level
@@ -104,12 +104,12 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True)
 class ReferenceFault:
-    """What is wrong with a group.
+    """A fault of a group.
 
     Attributes:
         kind: which fault.
-        score, limit: the figure, and the limit that it breaks.
-        message: both in words, and what to do.
+        score, limit: the figure, and the violated limit.
+        message: both in words, with advice.
     """
 
     kind: FaultKind
@@ -120,7 +120,7 @@ class ReferenceFault:
 
 @dataclass(frozen=True)
 class JudgedGroup:
-    """References that were taken together.
+    """A group of references, taken together.
 
     Attributes:
         kind: DARK or FLAT.
@@ -149,7 +149,7 @@ def judge(groups: Sequence[Group], limits: ReferenceLimits | None = None, views:
 
     Args:
         groups: of one kind each, none empty, in the order of the file.
-        views: some projections, where there are any.
+        views: some projections, if there are any.
     """
     limits = limits or ReferenceLimits()
     base = min((group for group in groups if group[0].kind is FrameKind.DARK), key=_level, default=None)
@@ -192,7 +192,7 @@ def photons(flats: Group, darks: Group) -> float | None:
 
 
 def full_scale(largest: float) -> float:
-    """The count at which a detector saturates whose largest count is known: the end of its 8, 10, 12, 14 or 16 bits."""
+    """The saturation count of a detector by its largest count: the end of its 8, 10, 12, 14 or 16 bits."""
     return next((2.0**bits - 1 for bits in (8, 10, 12, 14, 16) if 2**bits > largest), np.inf)
 
 
@@ -229,7 +229,7 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
 
 
 def _outshone(flats: Group, darks: Group | None, views: Group, limits: ReferenceLimits) -> ReferenceFault | None:
-    """Views that are brighter than flats, where the exposures of both are known: a sample only takes light."""
+    """Faults of flats darker than views, if both exposures are known: a sample only takes light."""
     views = [view for view in views if view.saturated <= limits.saturated and np.isfinite(view.blocks).any()]
     if not views or not all(frame.exposure > 0 for frame in (*flats, *views)):
         return None
@@ -287,10 +287,10 @@ def _unlit(flats: Group, darks: Group | None, limits: ReferenceLimits) -> Refere
 
 def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> ReferenceFault | None:
     if not _has_light(flats, base, limits):
-        return None  # both have the same light: which of them is wrong cannot be told, and the flats' fault says it
+        return None  # both have the same light: the flats' fault reports it, because the wrong one is unknown
     level = _level(darks) / _level(flats) if _level(flats) > 0 else np.inf
     noise, of_flats = _noise(darks), _noise(flats)
-    known = of_flats > 0  # else the frames have no noise, which only simulated ones have not
+    known = of_flats > 0  # otherwise the frames have no noise, as only simulated ones
     variance = (noise / of_flats) ** 2 if known else level
     score = min(level, variance)
     limit = limits.light_in_darks if known else max(limits.light_in_darks, 0.5)

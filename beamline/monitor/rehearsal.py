@@ -17,7 +17,7 @@ _DARK, _FLAT, _SAMPLE = 100, 20_000, 8_000  # counts
 
 
 def rehearse(monitor: Monitor) -> None:
-    """Let the checks of a monitor look at a few small frames; it stays as it is.
+    """Let the checks of a monitor look at a few small frames; the monitor does not change.
 
     numba keeps what it compiles: once on a machine it takes up to a minute, then a fraction of a second. A check that
     fails here will say so in the scan.

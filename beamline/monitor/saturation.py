@@ -1,4 +1,4 @@
-"""Saturation: pixels at the end of their range, whose true count is unknown; but for zingers, which have a check."""
+"""Saturation: pixels at the end of their range, whose true count is unknown; zingers have a check of their own."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 
-FEW_PIXELS = 2  # a hot pixel or two that the darks did not show; that is no exposure too long
+FEW_PIXELS = 2  # fewer may be hot pixels that the darks did not show
 
 
 @dataclass(frozen=True)

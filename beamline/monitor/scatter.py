@@ -1,4 +1,4 @@
-"""Scatter: how much a figure usually varies, so that a limit is never below what is normal for this scan."""
+"""Scatter: the usual variation of a figure, so that a limit is never below it."""
 
 from __future__ import annotations
 

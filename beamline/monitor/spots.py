@@ -1,7 +1,7 @@
 """Spots: bright pixels of a single frame, where a stray X-ray or a muon hit the sensor (zingers).
 
-A spot is the largest pixel of a preview block that is brighter than the means of all blocks around it by far more than
-noise is, and than anything there was in the frame before: hot pixels and bright gaps in the sample stay.
+A spot is the largest pixel of a preview block if it is far brighter than the means of all blocks around it, beyond
+noise. It must also exceed that place in the previous frame, because hot pixels and bright gaps in the sample stay.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from beamline.core.jit import njit
 from beamline.monitor.digest import FrameDigest, block_side
 from drivers.base.frame import Frame, FrameKind
 
-NOISES = 4.0  # times what a block's largest pixel usually is above its mean: 8 to 10 standard deviations of a pixel
-RELATIVE = 0.25  # of the light around it, more than which a spot has: less leaves a faint streak
-SAMPLES = 4096  # blocks that tell what is usual
-MOST = 4096  # spots whose places are kept
+NOISES = 4.0  # times the usual excess of a block's largest pixel over its mean: 8 to 10 standard deviations of a pixel
+RELATIVE = 0.25  # share of the light around it: least excess of a spot; less leaves only a faint streak
+SAMPLES = 4096  # blocks that give the usual excess
+MOST = 4096  # most spots whose places are kept
 
 
 class Spots(NamedTuple):

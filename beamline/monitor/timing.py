@@ -1,4 +1,4 @@
-"""Timing: do the frames of a fly scan come as regularly as the triggers that were planned?"""
+"""Timing: early and late frames of a fly scan, against the planned triggers."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TimingCheck:
         return TimingState()
 
     def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
-        again = frame.replaces >= 0 or frame.trigger < state.trigger  # a view that gave no frame has its old trigger
+        again = frame.replaces >= 0 or frame.trigger < state.trigger  # a repeated view has its old trigger
         if frame.kind is not FrameKind.PROJECTION or context.period is None or again:
             return Look(state)
         after = TimingState(frame.trigger, frame.framestamp, frame.time)

@@ -17,10 +17,10 @@ from beamline.core.jit import njit
 
 COLS = 128  # cells at least, where the preview has as many blocks
 DARKEST = 1e-3  # transmission below which the logarithm would only show noise
-UNLIT = 0.05  # of the flats' bright part: a cell with less has no light worth a name
-HOT = 0.1  # of the flats' bright part: a cell whose dark is higher than the others by more says nothing either
+UNLIT = 0.05  # share of the flats' bright part: a cell with less counts as unlit
+HOT = 0.1  # share of the flats' bright part: a cell with a higher dark than others by more is not used, either
 EDGE = 2  # cells at either edge that say whether the sample ends within the field
-SEEN = 0.02  # transmission from which a place shows whether the beam is there
+SEEN = 0.02  # least transmission of a place that shows the beam
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
 
 CellValues = NDArray[np.float32]
@@ -37,7 +37,7 @@ class CellGrid:
         blocks: preview blocks a side of a cell.
         dark: counts [row, col] of the cells without light; 0 where no dark was seen.
         full: counts above it with the beam and no sample, at the flats' exposure.
-        lit: float32 [row, col], 1 where a cell has light enough to say something, else 0.
+        lit: float32 [row, col], 1 where a cell has enough light, else 0.
         flats: there were flats; otherwise `full` is 1 and line integrals are relative.
         row_dark, col_dark: dark counts of each preview row and column, means.
         left, right: first and last column of cells with most of them lit.
@@ -130,7 +130,7 @@ def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
     """Light in nine tenths of the places at most, over that of the last good view; before any, over the flats.
 
     A sample that turns makes some places darker and others brighter; only a beam that goes takes the light of all.
-    Places where the sample lets nothing through say nothing.
+    Opaque places do not count.
     """
     if last is None:
         if not grid.flats:

@@ -1,4 +1,4 @@
-"""Monitor: all checks together. A frame goes in, flags come out; what is known of the scan so far is a value."""
+"""Monitor: all checks together. A frame goes in, flags come out; the state of the scan so far is a value."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from beamline.monitor.view import CellView, grid_of, light_left, view_of
 from drivers.base.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
-FORGET = 0.99  # a view: what was at the edge a quarter of a turn ago may come back
-NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # steps as planned that a view is beyond the one before, as its neighbour
+FORGET = 0.99  # a view: matter at the edge a quarter of a turn ago may come back
+NEAREST, FARTHEST = 0.25, MOST_STEPS + 0.5  # planned steps from a view to its neighbour
 ONE_WAY = 0.75  # of the steps, which golden angles have not: 0.62
 EVERY, MOST = math.radians(5), 72  # between the views that are kept for others near them that come later; number
-DARK = 0.5  # light left of the view before: less is no view, see the check `lost`
+DARK = 0.5  # least light left of a view; with less it is skipped, see the check `lost`
 
 
 @dataclass(frozen=True, eq=False)
 class Monitor:
-    """What the monitor knows after the frames so far.
+    """The monitor's state after the frames so far.
 
     Attributes:
         context: the scan, and the mean references of the latest groups.
@@ -105,7 +105,7 @@ def _from(flag: Flag, row: int) -> Flag:
 
 
 def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
-    """The monitor with what all checks need of a projection."""
+    """The monitor with the quantities of a projection that all checks need."""
     context = monitor.context
     spots = spots_of(frame, digest, monitor.before, context.dark, context.saturation)
     context = replace(context, view=None, change=None, light_left=1.0, spots=spots, follows=True)
@@ -120,7 +120,7 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     recent, last = monitor.recent, monitor.recent[-1] if monitor.recent else None
     steps = math.nan if last is None else math.remainder(view.angle - last.angle, 2 * math.pi) / context.step
     follows = math.isnan(steps) or NEAREST < steps < FARTHEST
-    if not follows:  # what it is compared with must be its neighbour in angle
+    if not follows:  # the view for comparison must be its neighbour in angle
         recent, last = (), _nearest(view.angle, monitor.kept)
         context = replace(context, spots=spots._replace(n=0))
     left = light_left(view, last, grid)

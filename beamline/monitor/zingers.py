@@ -1,4 +1,4 @@
-"""Zingers: how many bright spots has a view that no other frame has?"""
+"""Zingers: bright spots of a view that no other frame has."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 
-VIEWS = 20  # after which their number is said
-FEW = 10  # a view, which are never many
+VIEWS = 20  # views after which their number is reported
+FEW = 10  # zingers a view that are never too many
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The page's server: files of the page, the feed of events, tiles, and verbs for who may act.
 
 A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
-host that is ours and carries the token for looking (a cookie). What acts is a POST of our own origin with the token for
-acting in a header. Nothing that comes from a client reaches the file system.
+host that is ours and carries the token for looking (a cookie). Actions are POST requests of our own origin with the
+token for acting in a header. No data of a client reach the file system.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from beamline.scan.control import Verb, tell
 
 COOKIE = "splatline_look"
 ACT_HEADER = "x-act-token"
-_PERIOD = 0.5  # s between two looks at the file for the feed
-_KEPT = 64  # tiles that the next client may want, too
+_PERIOD = 0.5  # s between two checks of the file for the feed
+_KEPT = 64  # tiles kept for the next client
 _HEADERS = {
     b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
     b"form-action 'none'; frame-ancestors 'none'",
@@ -79,7 +79,7 @@ class Guard:
             await send(message)
 
         request = Request(scope)
-        if request.headers.get("host") not in self._access.hosts:  # a name of somebody else's that leads here
+        if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
             await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
         elif _same(request.cookies.get(COOKIE, ""), self._access.look):
             await self._app(scope, receive, send_with_headers)
@@ -234,7 +234,7 @@ class _Server:
         return JSONResponse({"state": str(state)})
 
     async def _kept(self, key: object, read: Callable[[], Response]) -> Response:
-        """What another client asked for before, too: pixels of a frame never change."""
+        """The result of an earlier request: pixels of a frame never change."""
         if key not in self._tiles:
             answer = await run_in_threadpool(read)
             while len(self._tiles) >= _KEPT:

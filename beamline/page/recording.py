@@ -1,4 +1,4 @@
-"""Recording: what the page shows of a scan file, also of one that grows. All calls come from one thread (HDF5)."""
+"""Recording: the page's data from a scan file, also from a growing one. All calls come from one thread (HDF5)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drivers.base.frame import FrameKind
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """How far a scan file is.
+    """The progress of a scan file.
 
     Attributes:
         frames: that are whole in it.
@@ -70,7 +70,7 @@ class Recording:
         return ScanProgress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
 
     def facts(self) -> dict[str, Any]:
-        """What does not change: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
+        """Constant facts: sample, shape, pixel size in mm (null: unknown), axis, checks of the monitor."""
         pixel = hdf5.scalar(self._file, f"{layout.DETECTOR}/x_pixel_size", hdf5.LENGTH_UNITS)
         axis = hdf5.dataset(self._file, layout.AXIS_COL)
         return {
@@ -145,7 +145,7 @@ class Recording:
         kinds = np.array(self._column(layout.KIND, 0, self.progress().frames), int)
         views = np.flatnonzero(kinds == FrameKind.PROJECTION)
         views = views[views >= first]
-        packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost a whole frame
+        packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
         at = min(max(row // bin_of_source, 0), source.shape[1] - 1)
         hdf5.look_again(source)

@@ -1,4 +1,4 @@
-"""What is watched: a run folder, or a scan file alone; its events, and one thread that reads HDF5."""
+"""The watched run folder or scan file: its events, and one thread that reads HDF5."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Watched:
-    """Paths of what is watched.
+    """Paths of a watched run.
 
     Attributes:
         scan: the scan file.
@@ -46,7 +46,7 @@ class Watched:
 
 
 def watched(path: Path) -> Watched:
-    """By a run folder, or a scan file. DataError where there is neither."""
+    """The paths for a run folder, or a scan file. DataError if there is neither."""
     if path.is_dir():
         folder = parts_of(path)[-1]
         if not (folder / EVENTS).is_file():
@@ -58,8 +58,8 @@ def watched(path: Path) -> Watched:
 
 
 class EventLog:
-    """The events of a run as lines of JSON, numbered from 0 in the order of the file. Those of a line half written
-    come with the next look."""
+    """The events of a run as lines of JSON, numbered from 0 in the order of the file. An incomplete line comes with the
+    next call."""
 
     def __init__(self, folder: Path | None) -> None:
         self._path = None if folder is None else folder / EVENTS
@@ -67,7 +67,7 @@ class EventLog:
         self.lines: list[str] = []
 
     def refresh(self) -> None:
-        """Take up what was added."""
+        """Read new lines."""
         if self._path is None or not self._path.is_file():
             return
         with self._path.open("rb") as file:

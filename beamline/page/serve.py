@@ -21,7 +21,7 @@ from beamline.page.run_files import Reader
 
 @dataclass(frozen=True)
 class Addresses:
-    """What to open in a browser: to look, and to act as well (None: nobody may)."""
+    """Addresses for a browser: to look, and to act as well (None: not allowed)."""
 
     look: str
     act: str | None
@@ -54,7 +54,7 @@ def open_port(bind: str, port: int) -> socket.socket:
 
 
 class PageServer:
-    """A server that is ready to run; its addresses are known before."""
+    """A server that is ready to run, with known addresses."""
 
     def __init__(self, reader: Reader, listening: socket.socket, access: Access, log: Callable[[str], None]) -> None:
         self._listening = listening
@@ -81,7 +81,7 @@ def start(reader: Reader, listening: socket.socket, *, control: bool, log: Calla
     """A server with new tokens.
 
     Args:
-        control: verbs may be sent from the page, by who holds the address for acting.
+        control: allow verbs from the page, with the address for acting.
         log: takes a line for each verb.
     """
     access = Access(_names(listening), act=secrets.token_hex(16) if control else None)
@@ -89,7 +89,7 @@ def start(reader: Reader, listening: socket.socket, *, control: bool, log: Calla
 
 
 def _names(listening: socket.socket) -> list[str]:
-    """What a browser may call the server at this socket, with the port; the first is the one to print."""
+    """Names of the server at this socket for a browser, with the port; the first one is printed."""
     host, port = listening.getsockname()[:2]
     address = ipaddress.ip_address(host)
     if address.is_unspecified:

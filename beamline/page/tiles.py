@@ -1,4 +1,4 @@
-"""Tiles: parts of a picture, binned to what a screen shows and packed as 16-bit numbers."""
+"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TileRegion:
     last_col: int
 
     def inside(self, shape: tuple[int, int]) -> TileRegion:
-        """The part of it that a picture of this shape has; at least one pixel."""
+        """Its part inside a picture of this shape; at least one pixel."""
         rows, cols = shape
         first_row, first_col = min(max(self.first_row, 0), rows - 1), min(max(self.first_col, 0), cols - 1)
         last_row, last_col = min(max(self.last_row, first_row + 1), rows), min(max(self.last_col, first_col + 1), cols)

@@ -22,14 +22,14 @@ _HELD = 2**29
 
 @dataclass(frozen=True)
 class VolumeFile:
-    """A volume file as it was at a time: a snapshot is replaced by the next one."""
+    """A volume file at a certain time: the next snapshot replaces it."""
 
     path: Path
     changed_ns: int
 
 
 def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
-    """The first of these files that is there."""
+    """The first existing one of these files."""
     for path in candidates:
         with suppress(OSError):
             return VolumeFile(path, path.stat().st_mtime_ns)

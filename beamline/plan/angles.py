@@ -17,7 +17,7 @@ def _require(views: int, at_least: int = 1) -> None:
 
 
 def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:
-    """Equal steps of span / views from `start`; the end is excluded, for it is the start again (or its mirror).
+    """Equal steps of span / views from `start`; the end is excluded, because it is the start again (or its mirror).
 
     A negative span turns the other way.
     """

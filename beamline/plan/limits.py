@@ -13,7 +13,7 @@ from drivers.base.protocols import CameraTiming, StageLimits
 from drivers.stages.travel import least_interval
 
 ROOM = 1.1
-"""Free disk asked for, times pixels and previews: per-frame values and what else grows meanwhile."""
+"""Required free disk, as a multiple of pixels and previews: values of each frame and other files grow meanwhile."""
 MARGIN = 1.01
 """Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
 
@@ -138,7 +138,7 @@ def _speed(facts: PlanFacts) -> Iterator[str]:
 
 
 def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
-    """The trigger output must be able to tell the pulses apart, whatever the speed at which a train is passed."""
+    """The trigger output must separate the pulses at any speed up to the full one."""
     least, unit = least_interval(stage), stage.interval_unit
     if interval % unit:
         yield (
@@ -187,7 +187,7 @@ def _reference(name: str, field: FieldPlan, exposure: float, otherwise: str) -> 
 
 
 def _up(seconds: float) -> float:
-    """Rounded up to three digits: advice that works when it is followed."""
+    """Rounded up to three digits, so that the advice works."""
     unit = 10.0 ** (math.floor(math.log10(seconds)) - 2)
     return math.ceil(seconds / unit - 1e-9) * unit
 

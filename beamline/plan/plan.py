@@ -1,4 +1,4 @@
-"""ScanPlan: what a scan will do, as a value; its timeline says when, how fast, how blurred and how many bytes."""
+"""ScanPlan: the planned scan as a value; its timeline gives times, speeds, blur and bytes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class FieldPlan:
 
 @dataclass(frozen=True, eq=False)
 class ScanPlan:
-    """What the operator asked for.
+    """The requested scan.
 
     Attributes:
         angles: float64 [view] radians, in the order of acquisition.
@@ -47,7 +47,7 @@ class ScanPlan:
         settle: s to wait after each move of a step scan.
         darks, flats: reference frames.
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
-        retake_share: of the views, how many with an alarm of the monitor are taken again at most; 0: none.
+        retake_share: largest share of the views that are repeated after an alarm of the monitor; 0: none.
         stored: views that need not be taken: earlier files of the same scan have them.
         end_references: kinds of references that are still to be taken after the views, where all else is stored. None:
             all that are planned, before and after the views.
@@ -67,7 +67,7 @@ class ScanPlan:
 
     @property
     def retakes(self) -> int:
-        """Views that are taken again at most."""
+        """Largest number of repeated views."""
         return max(1, int(self.retake_share * self.angles.size)) if self.retake_share > 0 else 0
 
 
@@ -119,11 +119,11 @@ class Timeline:
         frame_bytes: of one frame's uint16 pixels.
         total_bytes: of the whole file, pixels and previews; without views that are taken again.
         step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
-        step: radians that these counts are.
+        step: the same in radians.
         blur_px: how far a point at the detector's edge moves during an exposure, in pixels.
         skew_px: how far it moves between the first and the last row's exposure (rolling shutter), in pixels.
         violations: every limit that is broken, each one sentence with values and what to do.
-        remarks: what the operator should know though it breaks nothing.
+        remarks: facts for the operator that break no limit.
         retake_seconds: for the most views that may be taken again.
     """
 

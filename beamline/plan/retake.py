@@ -1,4 +1,4 @@
-"""Retake: views that are taken again after the last one, standing, at the angles that they had."""
+"""Retake: views that are repeated after the last one, with a standing stage at their angles."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from drivers.base.frame import FrameKind
 
 @dataclass(frozen=True)
 class Retake:
-    """A view to take again: its frame in the file (-1: it gave none), and its trigger within the views."""
+    """A view to repeat: its frame in the file (-1: it gave none), and its trigger within the views."""
 
     row: int
     trigger: int
 
 
 def spread(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
-    """At most so many of the views, evenly spread over them: what is not taken again leaves small gaps, not one."""
+    """At most so many of the views, evenly spread, so that the others leave small gaps instead of a large one."""
     if len(views) <= most:
         return tuple(views)
     return tuple(views[i] for i in np.unique(np.linspace(0, len(views) - 1, most).round().astype(int)))
@@ -30,7 +30,7 @@ def spread(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
 def middle_of_exposure(views: Block) -> NDArray[np.float64]:
     """float64 [view] radians by which the stage has turned beyond the trigger in the middle of a view's exposure.
 
-    0 for a step scan. A standing stage must be there to show what the view of a fly scan shows.
+    0 for a step scan. A standing stage at this angle shows the same as the view of a fly scan.
     """
     turned = np.zeros(views.n)
     first = 0
@@ -42,7 +42,7 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
 
 
 def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:
-    """The block that takes these views again, in their order: each stands for the exposure of the view."""
+    """The block that repeats these views, in their order; the stage stands during each exposure."""
     angles = views.angles[triggers] + middle_of_exposure(views)[triggers]
     period = views.exposure if views.trains else views.period
     return Block(FrameKind.PROJECTION, Mode.STEP, views.first_trigger + views.n, angles, views.exposure, period)

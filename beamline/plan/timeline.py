@@ -146,7 +146,7 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[FlyPass]:
 
 
 def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float) -> float:
-    """How long a block takes, with its moves; the views' block begins with the stage at its zero."""
+    """Duration of a block with its moves; the views' block begins with the stage at its zero."""
     if not block.left:
         return 0.0
     tail = block.exposure + camera.readout
@@ -199,7 +199,7 @@ def _views(plan: ScanPlan, flight: Flight | None, row: int, scale: Scale, stage:
     angles = scale.angles(counts)
     if flight is None:
         return Block(FrameKind.PROJECTION, plan.mode, row, angles, plan.exposure, plan.period, stored=plan.stored)
-    # A pulse generator's speed is a whole number of counts a second, so the period becomes one that this gives.
+    # A pulse generator's speed is a whole number of counts a second, which fixes the possible periods.
     rate = max(1, round(flight.interval / plan.period))
     speed, period = rate * abs(scale.per_count), flight.interval / rate
     step, before = (n * abs(scale.per_count) for n in (flight.step, stage.run_up * flight.interval + flight.step))
@@ -215,14 +215,14 @@ def _half_width(camera: CameraTiming, axis_col: float | None) -> float:
 
 
 def _reach(views: Block) -> tuple[float, float]:
-    """The smallest and the largest angle that the stage would be sent to."""
+    """The smallest and the largest angle of the stage's moves."""
     ends = np.array([(flown.start, flown.end) for flown in passes(views)]) if views.trains else views.angles
     ends = ends if ends.size else views.angles  # all are stored
     return float(ends.min()), float(ends.max())
 
 
 def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: CameraTiming) -> float:
-    """For the most views that may be taken again, evenly spread, from where the views ended."""
+    """Time of the largest number of repeated views, evenly spread, from the end of the views."""
     if not plan.retakes:
         return 0.0
     triggers = [retake.trigger for retake in spread([Retake(i, i) for i in range(views.n)], plan.retakes)]
@@ -245,7 +245,7 @@ def describe(
     *,
     free_bytes: int | None = None,
 ) -> list[str]:
-    """The timeline for a human: what `check` and `scan --dry-run` print."""
+    """The timeline as text, for `check` and `scan --dry-run`."""
     lines = [
         f"{'rows':>13}  {'what':<10}  {'frames':>6}  {'how':<6}  {'exposure':>9}  {'period':>9}  {'time':>9}  angles"
     ]

@@ -21,7 +21,7 @@ class Scale:
 
     @classmethod
     def of(cls, to_counts: Callable[[float], int]) -> Scale:
-        """From the stage's own conversion, so that its direction and its zero stay its own business."""
+        """From the stage's own conversion, which has its direction and its zero."""
         zero = to_counts(0.0)
         per_count = 2 * math.pi / (to_counts(2 * math.pi) - zero)
         return cls(-zero * per_count, per_count)
@@ -38,8 +38,8 @@ class Flight:
         trains: one a pass, in the order of the views.
         interval: whole counts between neighbouring pulses of a pass (positive).
         step: whole counts between neighbouring angles of all passes together.
-        exact: what the step would be without rounding.
-        drift: radians by which the rounding moves the view that it moves most.
+        exact: the step without rounding.
+        drift: largest shift of a view by the rounding, radians.
     """
 
     trains: tuple[TriggerTrain, ...]
@@ -104,7 +104,7 @@ def _lattice(angles: NDArray[np.float64], count: float) -> tuple[NDArray[np.int6
 
 
 def _runs(counts: NDArray[np.int64]) -> list[TriggerTrain]:
-    """The longest runs of equal differences, one after another; a count left alone is a run of one."""
+    """The longest runs of equal differences, one after another; a single count is a run of one."""
     runs: list[TriggerTrain] = []
     at = 0
     while at < counts.size:

@@ -1,4 +1,4 @@
-"""AxisSearch: the rotation axis of a growing scan, as far as its views tell it."""
+"""AxisSearch: finds the rotation axis of a growing scan from its views so far."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from beamline.projections.selection import Selection, cone_of
 from beamline.storage.readers.base import ScanSource
 from recon.prep.align import AxisEstimate
 
-_FIRST_VIEWS = 12  # fewer do not tell an axis
+_FIRST_VIEWS = 12  # fewer views do not determine an axis
 
 
 class AxisSearch:
     """Looks for the axis each time the views have grown by half, and once more when all are there.
 
     Attributes:
-        col: the axis in pixels of the file; None as long as it is not known.
-        estimate: how it was found; None where it was given or stated.
-        settled: it is not looked for again.
+        col: the axis in pixels of the file; None while it is unknown.
+        estimate: how it was found; None if it was given or stated.
+        settled: the search is over.
     """
 
     def __init__(self, source: ScanSource, selection: Selection, warn: Warnings) -> None:
@@ -33,7 +33,7 @@ class AxisSearch:
         self._next = _FIRST_VIEWS
 
     def look(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Look for the axis in these views (frames of the file), if it is time. While views come only a clear optimum
+        """Look for the axis in these views (frames of the file), if it is time. While views come, only a clear optimum
         counts.
 
         Raises:
@@ -57,4 +57,4 @@ class AxisSearch:
 
 
 def _quiet(text: str) -> None:
-    """For an axis that will be looked for again."""
+    """Hides warnings on an axis that will be searched again."""

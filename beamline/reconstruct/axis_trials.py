@@ -45,7 +45,7 @@ class AxisRange:
 def try_axes(
     options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock, listen: Callable[[int, int], None]
 ) -> None:
-    """Reconstruct the middle row chosen by FBP with each axis and write the sheet; the event `done` says the scores.
+    """Reconstruct the middle of the chosen rows by FBP with each axis and write the sheet; `done` has the scores.
 
     The score is the share of a slice below 0 within the circle that all views see. A wrong axis takes away beside edges
     what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).

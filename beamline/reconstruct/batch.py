@@ -1,4 +1,4 @@
-"""Batches: many scans by one recipe, in a worker process that a failure ends, and a table of what became of them."""
+"""Batches: many scans by one recipe, in a worker process that ends after a failure, and a table of the results."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _WORKER_LOG = ".worker.txt"
 _WITH_VOLUME: Mapping[int | None, RowState] = {0: "done", QualityError.exit_code: "poor"}
 COMMAND = (sys.executable, "-m", "beamline.cli.recon_worker")
 """The worker, which reconstructs scan after scan: libraries are loaded and kernels compiled once."""
-_POLL = 0.2  # real s between two looks at the worker
+_POLL = 0.2  # real s between two checks of the worker
 _SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
-_OURS = ("done", "failed")  # events of a scan that become its row
+_OURS = ("done", "failed")  # events of a scan that make its row
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,11 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
 class Worker:
     """A process that reconstructs one scan after the other; a context manager, which ends it.
 
-    After a scan without a volume the next one gets a new process: a crash, a lack of memory or what a failure left
-    behind takes no other scan along.
+    After a scan without a volume the next one gets a new process, so that a crash, a lack of memory or leftovers of a
+    failure harm no other scan.
 
     Args:
-        log: file for what it writes to stderr while it works on a scan.
+        log: file for its stderr while it works on a scan.
         command: of the process.
         silence: real s without a line, after which a scan is taken to hang.
     """
@@ -190,7 +190,7 @@ def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) ->
 
 
 def names_of(scans: Sequence[Path]) -> list[str]:
-    """A name for each file: its stem, with as many of its folders before it as tell it from the others."""
+    """A name for each file: its stem, with as many of its folders as make it unique."""
     parts = [(*path.resolve().parent.parts[1:], path.stem) for path in scans]
     names = [own[-1] for own in parts]
     for depth in range(2, max(map(len, parts), default=0) + 1):
@@ -200,13 +200,13 @@ def names_of(scans: Sequence[Path]) -> list[str]:
 
 
 def _shared(names: Sequence[str]) -> list[bool]:
-    """Whether each name is also another's, on a disk that does not tell upper from lower case."""
+    """Whether each name is also another's, if upper and lower case are equal."""
     folded = [name.casefold() for name in names]
     return [folded.count(name) > 1 for name in folded]
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
-    """Make the folder, or see that it is one of this recipe."""
+    """Make the folder, or check that it belongs to this recipe."""
     kept = folder / RECIPE
     if folder.exists() and not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")

@@ -27,8 +27,8 @@ from recon.splatting.initialise import default_count
 from recon.trials import ROWS, part_of, predicts_best
 from recon.voxels.direct import has_direct_method
 
-_RESERVE = 0.02  # of the budget, for what no part has measured
-_LATE = 0.1  # of the time used, when it is over, is what a volume of all pixels may take
+_RESERVE = 0.02  # share of the budget for unmeasured work
+_LATE = 0.1  # share of the time used that a volume of all pixels may take, when the time is over
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 # Share of the time that a trial may take by prediction; in fact it may take a quarter more.
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
@@ -37,13 +37,13 @@ _LEVEL = 0.3  # dB: by the curves of four scans such methods are level
 
 @dataclass(frozen=True, eq=False)
 class Budgeted:
-    """A reconstruction that was given a time.
+    """A reconstruction within a time limit.
 
     Attributes:
-        result: what came out.
-        prepared: the views it is of, with binned pixels if the choice bins them.
+        result: of the reconstruction.
+        prepared: the reconstructed views, with binned pixels if the choice bins them.
         choice, speeds: what was chosen, and the measurements behind it.
-        because: why this method, in words; empty where there was no other.
+        because: why this method, in words; empty if there was no other.
         seconds: of everything, calibration included.
     """
 
@@ -82,7 +82,7 @@ class Budgeted:
 
 @dataclass(frozen=True, eq=False)
 class _Budget:
-    """A budget in use: what is left of it, and the choices that it allows; the methods by preference."""
+    """A budget in use: the time left, and the choices that it allows; the methods by preference."""
 
     seconds: float
     begin: float
@@ -96,9 +96,9 @@ class _Budget:
         return self.seconds - (self.now() - self.begin)
 
     def choices(self, share: float = 1.0, name: str | None = None) -> list[Choice]:
-        """The best choice of each method (or of one) within this share of what is left.
+        """The best choice of each method (or of one) within this share of the time left.
 
-        Where nothing is left, the cheapest without binned pixels, if it takes little of what was used already.
+        If no time is left: the cheapest without binned pixels, if its time is a small share of the time used.
         """
         if self.left < _RESERVE * self.seconds:
             full = plans(_LATE * (self.now() - self.begin), self.speeds, 1, self.methods)
@@ -109,7 +109,7 @@ class _Budget:
         return plans(left, self.speeds, self.largest_binning, self.methods if name is None else [name])
 
     def preferred(self, found: Sequence[Choice]) -> Choice:
-        """The first of the methods that is level with the one expected to gain most."""
+        """The first of the methods that is level with the most promising one."""
         level = [c for c in found if c.gain >= found[0].gain - _LEVEL]
         order = list(self.methods)
         return min(level, key=lambda c: order.index(c.method))

@@ -1,4 +1,4 @@
-"""Checkpoints of a fit: what it was made from, whether that is still the same, and keeping its state as it goes on."""
+"""Checkpoints of a fit: keeps its state with its origin, and checks the origin before a fit resumes."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from recon.base.geometry import Geometry
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 
-_SHOWN = 40  # characters of a value that is told
+_SHOWN = 40  # most characters of a value in a message
 
 
 def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str, Value]) -> dict[str, Value]:
-    """Everything that decides what a step or a slab is: data (by a checksum), geometry and settings.
+    """All that determines a step or a slab: data (by a checksum), geometry and settings.
 
     Args:
-        prepared: line integrals and geometry; those of views held out judge and decide nothing.
+        prepared: line integrals and geometry; views held out do not matter.
         settings: of the fit, or a method: a dataclass.
-        others: seed, start and the like, by name.
+        others: seed, start and similar values, by name.
     """
     data = np.ascontiguousarray(prepared.projections.data, np.float32)
     out: dict[str, Value] = {
@@ -44,7 +44,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
 
 
 def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[str]:
-    """What differs between two of `made_from`, in words."""
+    """The differences between two origins (`made_from`), in words."""
     out = []
     for name in dict.fromkeys([*now, *before]):
         one, other = now.get(name), before.get(name)
@@ -69,11 +69,11 @@ def _told(one: Value, other: Value) -> str:
 
 @dataclass(frozen=True)
 class CheckpointOptions:
-    """Where a fit's state is kept and where it comes from.
+    """Files of a fit's state.
 
     Attributes:
-        path: to write to; None keeps nothing.
-        resume: to begin from; None begins anew.
+        path: file to write; None: no checkpoint.
+        resume: file to resume from; None: begin anew.
     """
 
     path: Path | None = None
@@ -84,9 +84,9 @@ class CheckpointOptions:
         return self.path is not None or self.resume is not None
 
     def refuse_existing(self) -> None:
-        """Raises DataError before any work: a file in the way of the checkpoint, or none to begin from.
+        """Raises DataError before any work: the checkpoint exists, or there is none to resume from.
 
-        The checkpoint may take the place of the one it begins from.
+        The checkpoint may replace the one that the fit resumes from.
         """
         if self.resume is not None:
             _whole(self.resume)
@@ -94,12 +94,12 @@ class CheckpointOptions:
             refuse_existing(self.path)
 
     def begin(self, origin: Mapping[str, Value], steps: int, warn: Warn) -> Mapping[str, NDArray[Any]] | None:
-        """The state to go on from; None where a fit begins anew.
+        """The state to resume from; None if a fit begins anew.
 
         Args:
-            origin: what the fit is made from.
-            steps: planned; 0 where a time is.
-            warn: is told where the plan is another, so that the volume is not that of a fit without a break.
+            origin: of the fit, see `origin_of`.
+            steps: planned number; 0 if a time is planned.
+            warn: is told if the plan differs, so that the volume differs from that of an uninterrupted fit.
 
         Raises:
             ConfigError: the fit has more steps behind it than planned.
@@ -121,7 +121,7 @@ class CheckpointOptions:
         return kept.state
 
     def write(self, origin: Mapping[str, Value], steps: int, warn: Warn, state: Mapping[str, NDArray[Any]]) -> str:
-        """Keep the state; where the disk refuses, that is told and returned, and the fit goes on. "": it did not."""
+        """Keep the state. If the disk refuses, warn, return the reason, and let the fit go on; "" if it was kept."""
         if self.path is None:
             return ""
         try:
@@ -136,13 +136,13 @@ def _whole(path: Path) -> tuple[Checkpoint, FitState]:
     """The checkpoint, and the state in it.
 
     Raises:
-        DataError: there is none, or it holds no state to go on from.
+        DataError: there is no checkpoint, or it holds no state to resume from.
     """
     kept = read_checkpoint(path)
     try:
         reached = state_from(kept.state)
         for name, values in kept.state.items():
-            # The last loss may be none yet, and so may the best of views held out; a Gaussian's exponent is infinite.
+            # The last loss and the best of views held out may be NaN; a Gaussian's exponent is infinite.
             if name not in ("scalars", "watch", "kernel_exponent") and not np.isfinite(values).all():
                 raise ValueError(f"{name} of the checkpoint holds values that are not finite")
         if not (np.isfinite(reached.unit) and reached.unit > 0):
@@ -153,7 +153,7 @@ def _whole(path: Path) -> tuple[Checkpoint, FitState]:
 
 
 def refuse_other(path: Path, now: Mapping[str, Value], before: Mapping[str, Value], of: str) -> None:
-    """Raises DataError where a file was made from something else: which differences there are `of` what it holds."""
+    """Raises DataError if a file has another origin, with the differences; `of` names the content of the file."""
     others = differences(now, before)
     if others:
         listed = "; ".join(others[:6]) + (f"; and {len(others) - 6} more" if len(others) > 6 else "")

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _CONNECT_TIMEOUT = 30  # s for a scheduler to answer, and to get its first worker
 _PATIENCE = 60.0  # s that work goes without any worker
-_LOOK = 2.0  # s between two looks whether there is one
+_LOOK = 2.0  # s between two checks for a worker
 _TASK_SIZE_WARNING = "1 TB"  # of a task, from which distributed would warn: a slab goes as it is
 
 
@@ -43,7 +43,7 @@ class WorkersLostError(BeamlineError):
 
 @dataclass(frozen=True)
 class Cluster:
-    """Workers that reconstruct; one that is lost has its work done by another.
+    """Workers that reconstruct; another worker repeats the work of a lost one.
 
     Attributes:
         workers: how many.
@@ -69,7 +69,7 @@ class Cluster:
         """As `recon.reconstruct`, by a worker with as many threads as there are here; without progress and stop.
 
         Raises:
-            WorkersLostError: one after the other, with this work, or all of them, or the scheduler.
+            WorkersLostError: several workers were lost with this work, or all workers, or the scheduler.
         """
         import numba
         from distributed import KilledWorker
@@ -87,7 +87,7 @@ class Cluster:
         return found
 
     def _wait_for(self, future: Future) -> None:
-        """Return when it is done; raises WorkersLostError where no worker has been there for `patience`."""
+        """Return when it is done; raises WorkersLostError after `patience` without a worker."""
         look, alone, done = min(_LOOK, self.patience), 0.0, Event()
         # Not result(look): each TimeoutError of it is in a cycle with its frames, and these hold the partial volume.
         future.add_done_callback(lambda _: done.set())
@@ -121,7 +121,7 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
 
 
 def check_cluster(spec: str) -> None:
-    """Raises ValueError for what names no cluster, and where dask.distributed is not installed."""
+    """Raises ValueError for a wrong name of a cluster, or if dask.distributed is not installed."""
     if find_spec("distributed") is None:
         raise ValueError("it needs dask.distributed: pip install splatline[cluster]")
     if not re.fullmatch(r"local:[1-9]\d*|tcp://[^\s/]+:\d+|slurm(:.+)?", spec):
@@ -131,12 +131,12 @@ def check_cluster(spec: str) -> None:
 
 
 def local_workers(spec: str | None) -> int:
-    """Workers on this machine; 0: none, or those of a scheduler."""
+    """Number of workers on this machine; 0: none, or those of a scheduler."""
     return int(spec.removeprefix("local:")) if spec is not None and spec.startswith("local:") else 0
 
 
 def refuse_unusable(spec: str) -> None:
-    """Raises ConfigError where a cluster cannot be asked for work, before there is any; no jobs are submitted."""
+    """Raises ConfigError before any work if a cluster is unusable; no jobs are submitted."""
     if is_slurm(spec):
         require_accepted(spec)
     elif not local_workers(spec):

@@ -1,4 +1,4 @@
-"""Enough views: while a scan is followed, what the views to come would add, and whether the goal is met."""
+"""Enough views: predicts, while a scan is followed, the gain by further views, and whether the goal is met."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.voxels.enough_views import Gain, Goal, predicted_gains, well_spread
 
-GROWTH = 1.25  # of the views from look to look
+GROWTH = 1.25  # growth of the views between predictions
 _FIRST, _SAMPLES = 24, 2  # views of the first look; predictions a look
 
 
 class NotPlannedError(Exception):
-    """What the views to come are is not known; its text says why."""
+    """The further views are unknown; the message says why."""
 
 
 def planned_views(
     source: ScanSource, selection: Selection, axis_col: float | None, taken: Sequence[NDArray[np.int64]]
 ) -> Geometry:
-    """Geometry of the views so far and of those that the plan still holds.
+    """Geometry of the views so far and of the further views in the plan.
 
     Args:
         taken: frames of the views so far, in batches.
@@ -52,8 +52,8 @@ def planned_views(
 class EnoughViews:
     """Looks at the views each time they have grown by a quarter.
 
-    A prediction scatters by about half a decibel, so that one uses the samples of two looks. The earlier ones, which
-    are larger, err on the side of more views.
+    A prediction scatters by about half a decibel, so each one uses the samples of two. The earlier samples are larger,
+    which errs on the side of more views.
 
     Args:
         goal: when they are enough.
@@ -67,7 +67,7 @@ class EnoughViews:
         self.next_look = _FIRST
 
     def look(self, data: NDArray[np.float32], planned: Geometry) -> Gain | None:
-        """What the views to come would add to those so far; None where it is not known (yet).
+        """The gain by the further views; None if it is not (yet) known.
 
         Args:
             data: line integrals [view, row, col] so far.
@@ -85,5 +85,5 @@ class EnoughViews:
         return Gain.of(n, planned.n_views, before + self._samples) if before else None
 
     def met(self, gain: Gain) -> bool:
-        """The views so far are enough."""
+        """Whether the views so far are enough."""
         return self._goal.met(gain)

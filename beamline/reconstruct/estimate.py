@@ -1,4 +1,4 @@
-"""What a reconstruction will take, before it begins: memory, time, and bytes on disk."""
+"""Estimate of a reconstruction before it begins: memory, time, and bytes on disk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from recon.run_time import Extent, run_seconds
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a reconstruction will take.
+    """The resources of a reconstruction.
 
     Attributes:
         method: its name.
@@ -64,7 +64,7 @@ class Estimate:
 
 
 def estimate(options: ReconOptions, clock: Clock) -> Estimate:
-    """What a reconstruction of a finished scan of a parallel beam will take; of a partial volume, what is left of it.
+    """Estimate for a finished scan of a parallel beam; for a partial volume, of the missing slabs.
 
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a

@@ -63,7 +63,7 @@ def reconstruct_file(
     check_device(options.device)
     _refuse_foreign(options)
     if options.cluster is not None:
-        refuse_unusable(options.cluster)  # now, not when the scan has been corrected
+        refuse_unusable(options.cluster)  # now, before the correction of the scan
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:
@@ -87,7 +87,7 @@ def reconstruct_file(
         sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
     options.target.require_room(*(options.disk_needs(volume) if slabs else (volume * options.target.written, 0)))
-    if wanted is not None:  # before the work, not after it
+    if wanted is not None:  # before the work
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
     region = None if options.region is None else locate(options.region, selection, prepared.geometry)
@@ -134,7 +134,7 @@ def reconstruct_file(
 
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
-    """Send the event `recon_started`; before it, what was done to the views on request."""
+    """Report the requested corrections of the views, then send the event `recon_started`."""
     corrections_done({name: done.said for name, done in prepared.done.items()}, sink, clock)
     data = {
         "file": options.source.path,
@@ -149,7 +149,7 @@ def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, c
 
 
 def check_device(device: str) -> None:
-    """Raises ConfigError where a fit cannot compute there."""
+    """Raises ConfigError if a fit cannot compute on the device."""
     try:
         backend_for(device)
     except (ImportError, RuntimeError, ValueError) as error:
@@ -201,9 +201,9 @@ class _Job:
             raise DataError(f"{self.options.source.path} cannot be reconstructed{by}: {error}") from error
 
     def compile_kernels(self) -> None:
-        """Compile what will run here, once on a machine, and say so; workers of a cluster do it there.
+        """Compile the kernels of this process, once on a machine, and report it; cluster workers compile their own.
 
-        It must not count in the time of the run, nor in its estimate of the time left.
+        The time must count neither in the run nor in the estimated time left.
         """
         method, budget = self.options.method, self.options.budget
         methods = candidates_of(method) if budget is not None else (method,)
@@ -263,7 +263,7 @@ def _at_once(job: _Job) -> ReconOutcome:
     method = options.method_for(prepared.geometry)
     origin, resume, steps = {}, None, 0
     if checkpoints.wanted:
-        assert isinstance(method, CheckpointedMethod)  # others are refused before
+        assert isinstance(method, CheckpointedMethod)  # other methods were refused
         settings, others = method.made_by
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.warn)
@@ -314,7 +314,7 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
 
 
 def _chosen(result: Reconstruction) -> str:
-    """The method that another one chose, and why; empty where none did."""
+    """The chosen method and the reason, if a method chose; otherwise empty."""
     because = result.settings.get("chosen_because")
     return "" if because is None else f"{result.method}: {because}"
 

@@ -102,7 +102,7 @@ def follow(
 def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> None:
     """Compile what the fit needs, once on a machine, before the first view.
 
-    The state `ready` says that it is there, and where the volume can be watched.
+    The state `ready` then says where the volume can be watched.
     """
     compiled = compilation_events(sink, clock)
     sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
@@ -116,7 +116,7 @@ def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTimi
 
 
 def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> ScanSource:
-    """Wait for the file to be there and readable."""
+    """Wait until the file exists and is readable."""
     begin = clock.now()
     told = False
     while True:
@@ -139,7 +139,7 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: C
     """
     last_frame = last_snapshot = clock.now()
     while True:
-        ended = growing.source.finished  # asked before the frames, so that none can slip in between
+        ended = growing.source.finished  # asked before the frames, so that none is missed
         if growing.take_new_frames(ended):
             last_frame = clock.now()
         if ended:
@@ -149,7 +149,7 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: C
                 raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False
         if clock.now() - last_frame > rhythm.patience:
-            if held(growing.source.path):  # it waits: for the operator, the beam, or a long exposure
+            if held(growing.source.path):  # the writer waits: for the operator, the beam, or a long exposure
                 last_frame = clock.now()
                 continue
             raise DataError(

@@ -1,4 +1,4 @@
-"""A growing scan: what of its file has been taken, the axis as far as the views tell it, and the fit that they feed."""
+"""A growing scan: the frames taken so far, the axis by these views, and the fit that they feed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from recon.splatting.stream import StreamingFit
 
 _BATCH = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
-_AXIS_MOVES = 1.0  # px by which a better axis makes the fit begin anew
+_AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
 # Why all views are corrected again.
 _OUTDATED = "Flats or darks came after views, or air columns changed: all views are corrected again"
@@ -51,7 +51,7 @@ _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected 
 
 
 class ScanFollower:
-    """A scan's file and the volume that grows with it. Who follows it says when to look, to fit and to finish."""
+    """A scan's file and the volume that grows with it. The caller decides when to look, to fit and to finish."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self.source = source
@@ -63,7 +63,7 @@ class ScanFollower:
         self._references_follow = False  # darks or flats come after the views
         self._fit: StreamingFit | None = None
         self._frames = 0
-        self._taken = 0  # frames that were corrected, or that are no views
+        self._taken = 0  # frames that were corrected, or are not views
         self._file_part = 0  # part of the file whose views were corrected last
         self._history: list[Progress] = []
         self._begin = clock.now()
@@ -72,7 +72,7 @@ class ScanFollower:
 
     @property
     def axis_col(self) -> float | None:
-        """The rotation axis in pixels of the file; None as long as it is not known."""
+        """The rotation axis in pixels of the file; None while it is unknown."""
         return self._axis.col
 
     @property
@@ -86,11 +86,11 @@ class ScanFollower:
 
     @property
     def has_volume(self) -> bool:
-        """There is a model, of views enough for a volume after a stop."""
+        """Whether there is a model, with enough views for a volume after a stop."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
 
     def take_new_frames(self, ended: bool) -> bool:
-        """Look at the file; feed the fit with at most one batch of new views. True where the file has grown."""
+        """Look at the file; feed the fit with at most one batch of new views. True if the file has grown."""
         n = self.source.refresh()
         grown, self._frames = n > self._frames, n
         views = self._chosen(usable_views(self.source, self._options.selection.step(Flags).used).frames)
@@ -115,13 +115,13 @@ class ScanFollower:
         parts = np.searchsorted(self.source.part_starts, new, "right") - 1
         if new.size and parts[0] != self._file_part:
             self._begin_part(int(parts[0]))
-        batch = new[parts == parts[:1]][:_BATCH]  # of one part: those of the next are corrected by other references
+        batch = new[parts == parts[:1]][:_BATCH]  # views of one part: other parts are corrected by other references
         self._feed(batch, last=ended and batch.size == new.size)
         self._taken = int(batch[-1]) + 1 if batch.size < new.size else n
         return grown
 
     def _begin_part(self, part: int) -> None:
-        """Views of a later part of the file come: correct by its references, which the correction does not have yet.
+        """Begin a later part of the file: correct its views by its own references.
 
         The fit takes in the last view of the part before, which waited for the next, and learns all views again.
         """
@@ -153,7 +153,7 @@ class ScanFollower:
             self._fit.add_views(newest.data, self.source.angles[newest.view_ids])
 
     def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Those of the selection, by their place among all views that were taken, which later frames do not change."""
+        """The views of the selection, by their place among all views taken, which later frames do not change."""
         taken = np.flatnonzero(np.isin(self.source.image_key, (FrameKind.PROJECTION, FrameKind.INVALID)))
         wanted = parse_views(self._options.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[wanted])]
@@ -174,7 +174,7 @@ class ScanFollower:
         self._references_follow = True
 
     def _settle_axis(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
-        """Look for the axis. Where it moves by much, the fit begins anew with all views; by little, it goes on."""
+        """Look for the axis. After a large move the fit begins anew with all views; after a small one it goes on."""
         before = self.axis_col
         self._axis.look(correction, views, ended)
         if self._fit is None or before is None or self.axis_col is None or self.axis_col == before:
@@ -208,8 +208,8 @@ class ScanFollower:
     def _correct_again(self, usable: UsableViews, why: str) -> None:
         """Line integrals by all references and air columns, in place of those that the model has learnt from.
 
-        Does nothing where the views are of one part, and these are what they were. `why` is said, unless views are
-        unlearned.
+        Does nothing if the views are of one part, and references and air columns are unchanged. `why` is reported,
+        unless views are unlearned.
 
         Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
         again. Then the model goes on without them, at the first rates.
@@ -229,7 +229,7 @@ class ScanFollower:
         self._fit.replace_views(self._batches[0].data, self.source.angles[frames] if gone else None)
 
     def advance(self, seconds: float) -> bool:
-        """Fit for a while; False where there is nothing to fit yet."""
+        """Fit for a while; False if there is nothing to fit yet."""
         if self._fit is None:
             return False
         progress = self._fit.advance(seconds)
@@ -245,7 +245,7 @@ class ScanFollower:
         progress_events(self._sink, self._clock)(progress)
 
     def ask_whether_enough(self) -> None:
-        """Where there is a goal, say what the views to come would add, and once that the views so far are enough."""
+        """With a goal, report the gain by further views, and once that the views so far are enough."""
         if self._enough is None or sum(batch.view_ids.size for batch in self._batches) < self._enough.next_look:
             return
         try:
@@ -268,7 +268,7 @@ class ScanFollower:
         self._sink(Event("state", self._clock.now(), {"state": "gain", "message": message, **data}))
 
     def write_snapshot(self) -> None:
-        """The volume as it stands, and its picture, in place of the last ones."""
+        """Write the present volume and its picture, in place of the last ones."""
         assert self._fit is not None
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
@@ -284,7 +284,7 @@ class ScanFollower:
         """
         usable = checked_views(self.source, self._options.selection, self._warn)
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
-        if self._newest is not None:  # it was stopped: no other view comes
+        if self._newest is not None:  # the scan was stopped: no other view comes
             self._feed(np.empty(0, np.int64), last=True)
         if usable.jumps.size:
             self._warn(
@@ -352,7 +352,7 @@ class ScanFollower:
             if isinstance(step, ScanStep):
                 try:
                     done[step.name] = step.apply(found, self.source.angles[projections.view_ids])
-                except DataError as error:  # nobody throws the volume of a scan away for this
+                except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
                 if done[step.name].said:

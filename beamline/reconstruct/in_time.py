@@ -1,4 +1,4 @@
-"""In time: of the seconds that a whole call was given, what its fit gets, and what still fits in after it."""
+"""In time: divides the seconds of a whole call between the fit and the work after it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from recon.splatting.initialise import sweeps_of_start
 
 _REPORT = 5.0  # s, its pictures
 _BYTES = 1e8  # of a volume, written and read back in a second
-_BUSIEST = 4.0  # times as long as alone, at most, what others' work makes of that
+_BUSIEST = 4.0  # largest slow-down of this by other programs
 _FORWARD = 0.5  # of a sweep
 _LEAST = 0.1  # of a sweep: the time of a start from coarse views and one step
 
@@ -33,8 +33,8 @@ class Deadline:
     """When a call should end.
 
     Attributes:
-        end: by the clock; inf where nobody asked for it.
-        after: s that the report and writing take, about.
+        end: by the clock; inf without a deadline.
+        after: approximate s for the report and writing.
         now: the clock.
     """
 
@@ -43,7 +43,7 @@ class Deadline:
     now: Callable[[], float] = time.perf_counter
 
     def leaves(self, seconds: float) -> bool:
-        """Whether there is time for so much more before the report."""
+        """Whether there is time for so many s before the report."""
         return self.now() + seconds + self.after <= self.end
 
 
@@ -57,7 +57,7 @@ def fit_within(
 ) -> tuple[FitMethod, Deadline]:
     """The fit with the seconds that its call leaves it, before measuring, report and writing; and when the call ends.
 
-    Where they are too few, `warn` is told before the fit how long the call will take.
+    If they are too few, `warn` is told the expected duration before the fit.
 
     Args:
         method: `seconds` are those of the call.
@@ -88,7 +88,7 @@ def fit_within(
 
 @contextmanager
 def warnings_told(warn: Warn) -> Iterator[None]:
-    """Within the context what Python warns of is told as a sentence, without file and line."""
+    """Within the context Python's warnings are passed on as sentences, without file and line."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = lambda message, *_: warn(str(message))

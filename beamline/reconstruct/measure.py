@@ -1,4 +1,4 @@
-"""Measuring a volume: against a truth where there is one, and always against the data and its own background."""
+"""Measures a volume: against a truth if there is one, and always against the data and its own background."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def read_truth(spec: str) -> NDArray[np.float32]:
 
 
 def _volume_in(path: Path) -> str | None:
-    """Where an HDF5 file has its volume; None for other files. Raises DataError: none at a place that is known."""
+    """Where an HDF5 file has its volume; None for other files. Raises DataError: no volume at a known place."""
     if not h5py.is_hdf5(path):
         return None
     with hdf5.open_hdf5(path) as file:
@@ -82,7 +82,7 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a good volume (k-means), to judge others of the same sample by; None without two.
+    """Dense and empty regions of a good volume (k-means), by which others of the same sample are judged; or None.
 
     They are those of `metrics.sampled` of the volume.
     """
@@ -94,7 +94,7 @@ def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
 
 
 def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.float32], Geometry] | None) -> float:
-    """About which share of all rays the residual of `measure` looks at."""
+    """Approximate share of all rays in the residual of `measure`."""
     views = min(geometry.n_views, _RESIDUAL_VIEWS) + (0 if held_out is None else held_out[1].n_views)
     rows, cols = geometry.detector_shape
     in_bands = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
@@ -143,7 +143,7 @@ def _residual(
     weights: RayWeights | None,
     told: Callable[[int, int], None],
 ) -> float:
-    """Of these views, rays that were not measured left out: what the volume does not explain of them."""
+    """The residual of the volume in these views, without unmeasured rays."""
     left = total = 0.0
     some = geometry.select(views)
     matter = np.maximum(sum(data[view].sum(axis=1, dtype=np.float64) for view in views), 0)
@@ -165,7 +165,7 @@ def _residual(
 
 
 def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) -> list[slice]:
-    """Bands of rows that stand for all: all rows, unless the detector is large; one band where rows are no slices.
+    """Bands of rows that represent all: all rows, unless the detector is large; one band if rows are not slices.
 
     Args:
         matter: that the rows show [row]; bands lie at equal shares of it.

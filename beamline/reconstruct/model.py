@@ -39,7 +39,7 @@ class Model:
 
 
 def arrays_of_model(gaussians: Gaussians, geometry: Geometry) -> dict[str, Any]:
-    """What a file keeps of a model, by name: physical values, so that no other program needs our parameters."""
+    """The arrays of a model for a file, by name: physical values, so that no other program needs our parameters."""
     return {
         "kernel": gaussians.kernel.value,
         "density_unit": gaussians.density_unit,

@@ -1,4 +1,4 @@
-"""Options of a reconstruction: which scan and how it is read, which part of it, by which method, and where it goes."""
+"""Options of a reconstruction: scan, selection, method and output."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from recon.voxels.fbp import Filter
 
 @dataclass(frozen=True)
 class ReconOptions:
-    """What to reconstruct and how.
+    """The options of a reconstruction.
 
     Attributes:
         source: the scan.
@@ -39,12 +39,12 @@ class ReconOptions:
         device: to compute on.
         checkpoints: of the fit's state.
         filter: of the FBP that the volume is compared with.
-        seed: of everything random.
+        seed: of all random numbers.
         truth: FILE or FILE:first:end to compare with.
-        unfinished: take the frames that there are, where the scan still runs or died.
-        enough: of a followed scan: when its views are enough; None: nobody asks.
-        memory: bytes that the reconstruction may use; None: 70 % of what is free.
-        region: of the volume that is wanted; None: all of it.
+        unfinished: take the present frames of a scan that still runs or died.
+        enough: for a followed scan: when its views are enough; None: no such goal.
+        memory: bytes that the reconstruction may use; None: 70 % of the free memory.
+        region: requested part of the volume; None: all of it.
         cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
         partial: volume whose missing slabs are reconstructed; None begins anew.
         command: that repeats this, for the record.
@@ -73,11 +73,11 @@ class ReconOptions:
 
     @property
     def becomes_output(self) -> bool:
-        """Whether a volume that is made in slabs becomes the output where it lies."""
+        """Whether a volume made in slabs becomes the output without a copy."""
         return self.region is None and self.target.written and can_become(self.target.output)
 
     def disk_needs(self, volume: int) -> tuple[int, int]:
-        """Bytes on the disk for the result of a volume of so many, in slabs, and for what lies there meanwhile."""
+        """Bytes on the disk for the result, and for temporary files, of a volume of so many bytes in slabs."""
         compared = self.target.report is not None and not self.method.traits.direct
         slabs = self.partial is None  # else they are there
         if not self.target.written:
@@ -109,12 +109,12 @@ class ReconOptions:
 
     @property
     def stops_early(self) -> bool:
-        """The method ends where views held out say so."""
+        """Whether the method ends early by views held out."""
         return getattr(self.method, "early_stop", False)
 
     @property
     def streaming(self) -> StreamingMethod:
-        """The method of a scan that is followed.
+        """The method for a followed scan.
 
         Raises:
             ConfigError: it needs the whole scan.

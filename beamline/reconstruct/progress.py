@@ -1,5 +1,4 @@
-"""Progress of a fit or of iterations as events: how far, how fast, when it will be done; and what was done to the views
-before."""
+"""Progress of a fit or of iterations as events (steps, rate, time left), and the corrections before it."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
     Args:
         sink: is told.
         clock: that events are stamped by.
-        seconds: that the fit may take, where no number of steps is planned.
+        seconds: time of the fit, if no number of steps is planned.
     """
     first: Progress | None = None
     step = 0
@@ -51,7 +50,7 @@ def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
 
 
 def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> None:
-    """Say what each correction did to the views; "" is not said."""
+    """Report what each correction did to the views; "" is not reported."""
     for state, message in messages.items():
         if message:
             sink(Event("state", clock.now(), {"state": state, "message": message}))

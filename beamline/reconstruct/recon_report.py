@@ -43,10 +43,10 @@ class ScanFacts:
 
     Attributes:
         path, name: of the file.
-        sample: its name, where the file tells.
+        sample: its name, if known.
         table: facts for people, by name.
-        frames: frames there are of those triggered, e.g. "110/110".
-        remarks: what went wrong while it was taken, by what is in the file.
+        frames: frames in the file of those triggered, e.g. "110/110".
+        remarks: faults during the scan, by the file.
         flagged: the worst of the flagged frames.
         references: mean darks and flats [row, col], binned, by title.
         shape: (rows, cols) of the detector.
@@ -90,7 +90,7 @@ class ReconOutcome:
 
     @property
     def next_decibel(self) -> NextDecibel | None:
-        """What another dB would cost: of a fit by fits of other lengths, of iterations by their own record.
+        """The price of another dB: for a fit by fits of other lengths, for iterations by their own record.
 
         None for a direct method, while views still came, and for a resumed fit, whose whole time is not known. None
         also for other rates than those of the fits that were measured, as after following a scan.
@@ -125,7 +125,7 @@ class ReconOutcome:
 
 @dataclass(frozen=True)
 class ReportContext:
-    """What surrounds a reconstruction: the scan, the selection, the command, and what was warned of so far."""
+    """The context of a reconstruction: the scan, the selection, the command, and the warnings so far."""
 
     facts: ScanFacts
     selection: Selection
@@ -190,7 +190,7 @@ def compose(
     context: ReportContext,
     left: Unexplained | None = None,
 ) -> Report:
-    """The report on a reconstruction; `left` is the structure in its residual, where it is known."""
+    """The report on a reconstruction; `left` is the structure in its residual, if known."""
     name, geometry = label_of(made.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]

@@ -19,7 +19,7 @@ Span = tuple[int, int]
 
 @dataclass(frozen=True)
 class Region:
-    """Voxels first:end along z, y and x of the volume that the same options give of all of it."""
+    """Voxels first:end along z, y and x of the whole volume by the same options."""
 
     z: Span
     y: Span
@@ -87,7 +87,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
 
 
 def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOfRows:
-    """Where the region lies in the volume of `geometry`, which is of the selection that `selection_around` gave.
+    """Where the region lies in the volume of `geometry`, made from the selection of `selection_around`.
 
     Raises:
         ConfigError: it lies outside.
@@ -114,7 +114,7 @@ def _refuse_beyond(region: Region, width: int, whose: str) -> None:
 
 
 def _widest(source: ScanSource, selection: Selection) -> int:
-    """Voxels across that the volume has at most, before anything is read.
+    """Largest width of the volume in voxels, before anything is read.
 
     An axis that is still to be found may stand at an edge of the detector, and so may that of a sample that jumped.
     """

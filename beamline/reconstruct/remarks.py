@@ -1,5 +1,4 @@
-"""What speaks against a volume, in words: structure that it leaves in the views, mass that it lost, views that do not
-fit."""
+"""Warnings on a volume: structure that it leaves in the views, mass that it lost, views that do not fit."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ _NAMED = 5  # odd views, at most
 
 
 def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
-    """The warning that a volume has lost weak matter that FBP shows; empty where it has not."""
+    """The warning that a volume has lost weak matter that FBP shows; empty if it has not."""
     if beside_fbp.lost is None:
         return ""
     z, y, x = (f"{first}:{end}" for first, end in beside_fbp.lost)
@@ -29,7 +28,7 @@ def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:
 
 
 def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
-    """The warning that a volume leaves structure in the views; empty where it does not, or is no fit to the views."""
+    """The warning that a volume leaves structure in the views; empty if it does not, or is not fitted to the views."""
     if left.share <= unexplained.LIMIT or by_name(made.method).traits.direct:
         return ""
     return (
@@ -45,9 +44,9 @@ def odd_views_warning(
     selection: Selection,
     told: Callable[[int, int], None] = lambda done, of: None,
 ) -> str:
-    """The warning that parts of views are not in the volume; empty where there are none, and of direct methods.
+    """The warning that parts of views are not in the volume; empty without such parts, and for direct methods.
 
-    So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
+    It is also empty for a stopped volume, because the user waits, and the volume differs from its views in many places.
     `told` hears how many of how many views were compared.
     """
     if by_name(made.method).traits.direct or made.settings.get("ended_early"):

@@ -1,4 +1,4 @@
-"""Delivery: a volume becomes a file, figures of merit and a report; everything or nothing, and it says so."""
+"""Delivery: a volume becomes a file, figures of merit and a report; either all of them or none."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
-# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+# Approximate cost, in projections of all views: the search for odd views, and a direct method with its figures.
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
 
 
@@ -63,11 +63,11 @@ class OutputPaths:
 
     @property
     def live_picture(self) -> Path:
-        """The file of a volume that grows with its scan."""
+        """The picture of a volume that grows with its scan."""
         return self.output.with_name(f"{self.output.stem}.live.png")
 
     def refuse_partial(self) -> None:
-        """Raise DataError where slabs of an earlier call are in the way of those to be made."""
+        """Raise DataError if there are slabs of an earlier call."""
         if self.partial.exists():
             raise DataError(
                 f"{self.partial} exists: it keeps the slabs of a call that was stopped. Go on from it with --resume "
@@ -75,7 +75,7 @@ class OutputPaths:
             )
 
     def refuse_existing(self) -> None:
-        """Raise DataError before any work where a result is in the way, or its folder cannot be written to."""
+        """Raise DataError before any work if a result exists, or its folder cannot be written to."""
         if not self.replace:
             for path in (self.output, self.report):
                 if path is not None:
@@ -90,8 +90,8 @@ class OutputPaths:
             ) from error
 
     def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
-        """Raise DataError before the work where the disk has no room for a volume of so many bytes, and for what lies
-        there `meanwhile`."""
+        """Raise DataError before the work if the disk has no room for a volume of so many bytes and temporary files of
+        `meanwhile` bytes."""
         free = shutil.disk_usage(self.output.parent).free
         if n_bytes + meanwhile > free:
             work = f" and {size(meanwhile)} while it is made" if meanwhile else ""
@@ -131,7 +131,7 @@ def write_result(
         made.volume, prepared.projections.data, prepared.geometry, np.random.default_rng(context.seed),
         prepared.ray_factors(),
     )  # fmt: skip
-    mask = regions(truth or made.volume, context.seed)  # after what takes most memory
+    mask = regions(truth or made.volume, context.seed)  # after the work that takes most memory
     before = clock.now()
     metrics = {made.method: judged(made.volume, made.seconds)}
     all_rays = (clock.now() - before) / residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
@@ -237,7 +237,7 @@ def write_result(
 
 
 def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
-    """Everything that the volume depends on, by name."""
+    """All parameters of the volume, by name."""
     selection, geometry = context.selection, prepared.geometry
     rows = selection.rows
     return {
@@ -272,7 +272,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
 
 
 def _flat(prefix: str, values: Mapping[str, Any]) -> dict[str, Value]:
-    """Nested settings by joined names; what HDF5 has no type for becomes text."""
+    """Nested settings by joined names; values without an HDF5 type become text."""
     out: dict[str, Value] = {}
     for key, value in values.items():
         name = f"{prefix}_{key}" if prefix else key
@@ -296,7 +296,7 @@ def _axis_parameters(axis: AxisEstimate | None) -> dict[str, Value]:
 
 
 def axis_of(parameters: Mapping[str, Value]) -> AxisEstimate | None:
-    """How the axis was found, from the parameters of a reconstruction; None where it was given."""
+    """How the axis was found, from the parameters of a reconstruction; None if it was given."""
     if "axis_curve" not in parameters:
         return None
     return AxisEstimate(

@@ -33,7 +33,7 @@ from recon.voxels.methods.fista_tv import FistaTv
 _LOOKED_AT = 8  # views by which the rows with most matter are found
 _WEIGHED = 16  # rows whose weights are made at a time
 
-_LOOK = 0.5  # s between two looks at slabs under way
+_LOOK = 0.5  # s between two checks of slabs under way
 
 T = TypeVar("T")
 RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
@@ -58,9 +58,9 @@ def in_slabs(
     warn: Warn,
     workers: SlabWorkers | None = None,
 ) -> Reconstruction:
-    """A method's volume on disk, slab by slab; of a partial volume those that it lacks.
+    """A method's volume on disk, slab by slab; for a partial volume only the missing slabs.
 
-    The slab with most matter comes first; what it decides by its data the others follow, so that slabs fit together.
+    The slab with most matter comes first; the others follow its decisions, so that slabs fit together.
     From slab to slab the volume fades. Each slab depends on the data and the first slab alone: a volume that was
     stopped and resumed is equal to the bit.
 
@@ -68,7 +68,7 @@ def in_slabs(
         run: reconstructs a slab.
         control: of all slabs together.
         said: is told of each slab.
-        warn: is told of slices that are not by the method.
+        warn: is told of slices by another method.
         workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
 
     Raises:
@@ -83,7 +83,7 @@ def in_slabs(
     in_all = sum(slab.slices.stop - slab.slices.start for slab in slabs)
 
     def made(n: int, by: RunMethod, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
-        """The slab, and what is to be said of it; None of views that are zero."""
+        """The slab, and a sentence on it; None for views that are zero."""
         slab, follows = slabs[n], partial is not None
         one = replace(control, decide=decide, on_progress=_of_all(control, begin, done, slab, grid.shape[0]))
         rows, geometry, box = part_of(prepared.geometry, grid, slab.slices)
@@ -157,7 +157,7 @@ def _add(partial: PartialVolume, n: int, found: Reconstruction | None, remark: s
 
 @contextmanager
 def keeping(path: Path) -> Iterator[None]:
-    """The partial volume at `path` goes when the block has succeeded; else it stays.
+    """Remove the partial volume at `path` when the block has succeeded; otherwise keep it.
 
     Raises:
         ScanStopped: instead of KeyboardInterrupt, where there are slabs to go on from.
@@ -175,7 +175,7 @@ def keeping(path: Path) -> Iterator[None]:
 
 
 def _made_from(prepared: PreparedProjections, options: ReconOptions) -> dict[str, Value]:
-    """Everything that decides what the slabs are."""
+    """All that determines the slabs."""
     weights = hashlib.sha256()
     if not options.method.traits.direct:
         rows = prepared.geometry.detector_shape[0]
@@ -191,7 +191,7 @@ def _made_from(prepared: PreparedProjections, options: ReconOptions) -> dict[str
 
 
 def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, now: float) -> ReconRecord:
-    """What a partial volume says of itself, without voxels."""
+    """The record of a partial volume, without voxels."""
     path = Path(options.source.path)
     return ReconRecord(
         volume=Volume(np.broadcast_to(np.float32(0), grid.shape), grid),
@@ -205,7 +205,7 @@ def _record(prepared: PreparedProjections, options: ReconOptions, grid: Grid, no
 
 
 def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
-    """What the other slabs and the result need of the first slab."""
+    """The parts of the first slab's result that the other slabs and the whole result need."""
     return {
         "decided": decide.made,
         "method": first.method,
@@ -225,7 +225,7 @@ def _whole(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: f
 
 
 def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Slab]) -> list[int]:
-    """Numbers of the slabs, the one whose rows hold most matter before all others."""
+    """Numbers of the slabs, beginning with the slab whose rows hold most matter."""
     data = prepared.projections.data
     some, rows = data[:: max(1, len(data) // _LOOKED_AT)], [part_of(prepared.geometry, grid, s.own)[0] for s in slabs]
     matter = [sum(float(np.abs(view[part]).sum(dtype=np.float64)) for view in some) for part in rows]
@@ -234,7 +234,7 @@ def busiest_first(prepared: PreparedProjections, grid: Grid, slabs: Sequence[Sla
 
 
 def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: int) -> Callable[[Progress], None] | None:
-    """A listener to one slab that says how far all slices are, where `done` are there before it."""
+    """A listener to one slab that reports the progress of all slices; `done` slices come before it."""
     listen = control.on_progress
     if listen is None:
         return None
@@ -245,7 +245,7 @@ def _of_all(control: RunControl, begin: float, done: int, slab: Slab, slices: in
         nonlocal reached
         share = progress.step / progress.steps if progress.steps else 0.0
         at = done + round((slab.own.stop - slab.own.start) * share)
-        reached = max(reached, at)  # a fit's finish counts anew
+        reached = max(reached, at)  # a fit's finish counts from the beginning
         listen(replace(progress, step=reached, steps=slices, seconds=control.now() - begin, unit="slices"))
 
     return watch

@@ -39,11 +39,11 @@ from recon.voxels.unexplained import unexplained_memory
 SHARE = 0.7
 """Share of the free memory that a reconstruction takes by default."""
 
-_BATCH = 0.25  # of that, what views take while they are corrected
+_BATCH = 0.25  # share of it for views during correction
 _COPIES = 4  # float32 copies of a view while it is corrected
-_ROWS = 16  # slabs are multiples of so many, which FBP makes together
+_ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
 _REGIONS = 2**24  # voxels, at most, of the regions by which volumes are judged, see `metrics.sampled`
-_ASIDE = 64_000_000  # bytes of figures that nobody counts
+_ASIDE = 64_000_000  # bytes of figures that are not counted
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Needs:
 
     @property
     def at_once(self) -> int:
-        """With everything in memory."""
+        """Bytes with everything in memory."""
         return self.raw + self.line_integrals + self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
 
     @property
@@ -101,14 +101,14 @@ class Needs:
 
     @property
     def figures(self) -> int:
-        """The figures of merit of a volume on disk, beyond what is taken as part of the program; FBP needs less."""
+        """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
         odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
         found = min(self.volume // 4, _REGIONS) + max(odd, unexplained_memory(self.geometry))
         return found if found > _ASIDE else 0
 
     @property
     def least(self) -> int:
-        """The least memory that suffices."""
+        """The least sufficient memory."""
         return max(self.slab(_ROWS), self.view, self.figures)
 
     def height(self, memory: int) -> int:
@@ -132,7 +132,7 @@ def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
 
 
 def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
-    """What a reconstruction of the views chosen needs, before any frame is read.
+    """The needs of a reconstruction of the chosen views, before any frame is read.
 
     Raises:
         ConfigError: the selection does not fit the scan.
@@ -151,7 +151,7 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
 def spill_of(
     source: ScanSource, options: ReconOptions, told: Callable[[int, int], None], warn: Callable[[str], None]
 ) -> Spill | None:
-    """Where the views go if they do not fit into the memory; None where they do, and where slabs are not possible.
+    """Where the views go if they do not fit into the memory; None if they fit, or if slabs are impossible.
 
     Raises:
         DataError: the smallest slab does not fit, or the disk is too full.
@@ -162,7 +162,7 @@ def spill_of(
     try:
         needs = needs_of(source, options)
     except ConfigError:
-        return None  # what is wrong with the views themselves comes first: reading them says it
+        return None  # faults of the views come first; reading them reports these
     memory = memory_of(options)
     if needs.at_once <= memory and options.partial is None:
         return None
@@ -182,7 +182,7 @@ def spill_of(
 
 
 def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
-    """Whether rays have weights before the views are known, which may give them some: of views that are turned."""
+    """Whether it is known before reading that rays have weights, as of turned views."""
     turned = options.selection.step(TiltAndLens).of(source, options.selection) is not None
     return turned and not options.method.traits.direct
 
@@ -212,7 +212,7 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory
 
 
 def refuse_smallest(source: ScanSource, needs: Needs, memory: int, binning: int) -> None:
-    """Raises DataError where the smallest slab does not fit, with what would."""
+    """Raises DataError if the smallest slab does not fit, with a remedy."""
     if needs.least <= memory:
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
@@ -225,7 +225,7 @@ def refuse_smallest(source: ScanSource, needs: Needs, memory: int, binning: int)
 
 
 def refuse_slabs(path: Path, slabs: Sequence[Slab], needs: Needs, memory: int) -> None:
-    """Raises DataError where the slabs of a partial volume do not fit."""
+    """Raises DataError if the slabs of a partial volume do not fit."""
     if (wanted := needs.slab(slabs[0].own.stop)) > memory:
         raise DataError(
             f"The slabs of {path} take {size(wanted)} of memory, {size(memory)} may be used. Give --memory "
@@ -271,7 +271,7 @@ def prepare_within(
 
 
 def _refuse_wider(source: ScanSource, prepared: PreparedProjections, needs: Needs, memory: int) -> None:
-    """Raises DataError where a volume that was thought to fit does not: its axis, found since, is near an edge."""
+    """Raises DataError if a volume does not fit after all, because its axis was found near an edge."""
     if needs.geometry.is_cone or prepared.axis is None or needs.at_once <= memory:
         return
     raise DataError(

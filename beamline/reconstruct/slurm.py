@@ -28,7 +28,7 @@ def _text(value: Any) -> Any:
 
 
 class SlurmJobs(Section):
-    """Jobs of one worker each; what is not stated is the cluster's default."""
+    """Jobs of one worker each; missing keys have the cluster's defaults."""
 
     jobs: PositiveInt = 4
     cores: PositiveInt = 8
@@ -61,7 +61,7 @@ def is_slurm(spec: str) -> bool:
 
 
 def slurm_jobs(spec: str) -> SlurmJobs:
-    """What `slurm` or `slurm:CONFIG.yaml` asks for.
+    """The jobs of `slurm` or `slurm:CONFIG.yaml`.
 
     Raises:
         ConfigError: dask-jobqueue or sbatch is missing, or the file cannot be read, or is wrong, with the key.
@@ -103,9 +103,9 @@ def _cluster(jobs: SlurmJobs) -> Any:
 
 
 def _ask_slurm(cluster: Any) -> str:
-    """Why Slurm would refuse the cluster's jobs; empty where it would take them.
+    """Why Slurm would refuse the cluster's jobs; empty if it would take them.
 
-    What it refuses when the library submits it, nobody would hear of.
+    The library does not report a refused job.
     """
     asked = subprocess.run(["sbatch", "--test-only"], input=cluster.job_script(), capture_output=True, text=True)
     if not asked.returncode:
@@ -123,7 +123,7 @@ def require_accepted(spec: str) -> None:
     try:
         with _cluster(jobs) as cluster:
             refusal = _ask_slurm(cluster)
-    except (OSError, RuntimeError, ValueError) as error:  # distributed turns what it meets into a RuntimeError
+    except (OSError, RuntimeError, ValueError) as error:  # distributed turns errors into a RuntimeError
         raise ConfigError(
             f"--cluster {spec}: the cluster cannot be started ({' '.join(str(error).split())}). Mend the configuration "
             "of the jobs, or this machine's network. Nothing was read."

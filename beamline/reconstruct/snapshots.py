@@ -19,7 +19,7 @@ from recon.splatting.stream import StreamingFit
 
 
 class Snapshots:
-    """The files `<output>.snapshot.h5` and `<output>.live.png` of a scan that is followed."""
+    """The files `<output>.snapshot.h5` and `<output>.live.png` of a followed scan."""
 
     def __init__(self, options: ReconOptions, source: ScanSource, sink: Sink, clock: Clock, warn: Warnings) -> None:
         self._source, self._sink, self._clock, self._warn = source, sink, clock, warn
@@ -60,7 +60,7 @@ class Snapshots:
         self._sink(Event("snapshot", self._clock.now(), data))
 
     def remove(self) -> None:
-        """The volume is delivered: what stood in for it goes. The picture stays, as it was when the views came."""
+        """Remove the snapshot after the volume is delivered. The picture of the growing volume stays."""
         with suppress(PermissionError):  # Windows removes no file that a viewer holds open
             self.path.unlink(missing_ok=True)
 

@@ -43,7 +43,7 @@ class Report:
         command: that repeats the reconstruction.
         recipe: its options that hold for other scans; empty: none are shown.
         footnotes: definitions that the metrics need.
-        live_picture: name of the picture beside the page that showed the volume grow; empty: there is none.
+        live_picture: name of the picture of the growing volume, in the folder of the page; empty: no picture.
     """
 
     title: str

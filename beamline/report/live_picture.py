@@ -29,7 +29,7 @@ class LivePicture:
 
     Attributes:
         volume: so far, 1/unit.
-        view, render: the newest view [row, col] and that of the volume, line integrals.
+        view, render: the newest view [row, col] and the same view of the volume, line integrals.
         title: of the whole, one line.
         unit: of length, "mm" or "px".
     """
@@ -98,7 +98,7 @@ class _Panel:
         pixels: of the screen [row, col].
         colours, limits: colour map, and the values at its ends.
         label, note: the two lines.
-        bar: width of a pixel and its unit, for a bar of a round length; None: there is none.
+        bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
     """
 
     pixels: F32

@@ -16,7 +16,7 @@ _WORDS = {"held_out": "views held out", "residual": "views used"}
 
 
 def history_arrays(history: Sequence[Progress]) -> dict[str, NDArray[np.float64]]:
-    """The history of a fit as equally long arrays, by name; empty where there is none.
+    """The history of a fit as equally long arrays, by name; empty without a history.
 
     A quantity that was never measured (all NaN) is left out.
     """

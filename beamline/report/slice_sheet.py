@@ -23,7 +23,7 @@ class SliceSheet:
         self._drawn: set[tuple[str, str]] = set()
 
     def add(self, label: str, volume: F32, family: str = "", method: str = "") -> None:
-        """One more; of the rows of one family by one method the first alone."""
+        """Adds a slice of the volume; of each family and method, only the first volume counts."""
         if family and (family, method) in self._drawn:
             return
         if not self._shown:
@@ -32,7 +32,7 @@ class SliceSheet:
         self._shown[label] = volume[self._at].copy()
 
     def labels(self, method: str = "") -> list[str]:
-        """Those of a method (with none: of no row), after those that are of no row."""
+        """The labels of slices that belong to no row, then those of a method ("": none)."""
         return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
 
     def png(self, labels: Sequence[str]) -> bytes:

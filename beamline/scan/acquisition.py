@@ -22,14 +22,14 @@ from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraSettings, Devices
 
-DOUBTFUL = 0.2  # steps by which an angle may be wrong, from which that is told
+DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DARK: "dark"}
 
 
 @dataclass(frozen=True)
 class TakenBlock:
-    """A block with its frames and missing triggers; `again`: its views were taken before."""
+    """A block with its frames and missing triggers; `again`: it repeats views."""
 
     block: Block
     taken: Taken
@@ -44,7 +44,7 @@ class Acquisition:
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
         emit: takes (event, data) for block_started, block_done and warning.
-        supervision: what may pause the scan, or end it before its first projection, and is told its states.
+        supervision: may pause the scan, or end it before its first projection, and is told its states.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Acquisition:
         )
         self._done: list[TakenBlock] = []
         self.recovered = 0
-        """Views that gave no frame at first, and did when they were taken again."""
+        """Views that gave no frame at first, but when they were repeated."""
         self.unsafe = False
         """A device failed while the instrument was made safe: stage, camera or shutter may be as during the scan."""
 
@@ -76,7 +76,7 @@ class Acquisition:
 
     @property
     def missing(self) -> list[int]:
-        """Triggers, counted over the whole plan, that gave no frame so far (those never reached are not among them)."""
+        """Triggers, counted over the whole plan, that gave no frame so far; triggers not yet reached do not count."""
         return [done.block.first_trigger + i for done in self._done if not done.again for i in done.taken.missing]
 
     def frames(self) -> Generator[Frame, None, None]:
@@ -156,8 +156,8 @@ class Acquisition:
         )
 
     def _again(self, views: Block, taken: Taken) -> Iterator[Frame]:
-        """The views that supervision wants again; each says which frame it replaces, or has the trigger that gave
-        none, which is then missing no more. One that gives no frame is no failure beyond what it was before."""
+        """The views that supervision wants repeated. Each names the frame that it replaces, or has a missing trigger,
+        which is then not missing. A repeated view without a frame is not a further failure."""
         retakes = self._supervision.retakes(tuple(taken.missing))
         if not retakes:
             return
@@ -200,10 +200,9 @@ class Acquisition:
             )
 
     def _wait_while_paused(self) -> None:
-        """Wait with a closed shutter as long as a pause is asked for; a stop ends it.
+        """Wait with a closed shutter while a pause is requested; a stop ends it.
 
-        A shutter that is moved by hand is asked for after the state is told, and stays as it is in a pause that ends by
-        itself.
+        A manual shutter is asked for after the state is reported. In a pause that ends by itself it stays open.
         """
         pause, states, block = self._supervision.pause, self._supervision.states, self._done[-1].block
         reason = pause.reason
@@ -212,7 +211,7 @@ class Acquisition:
         shutter = self._devices.shutter
         if not shutter.by_hand:
             shutter.close()
-        self._supervision.wait_in_pause()  # what was typed before does not count
+        self._supervision.wait_in_pause()  # earlier input does not count
         states.enter(State.PAUSED, f"Paused{'' if shutter.by_hand else ' with a closed shutter'}: {reason}")
         while pause.reason and not self._stop.stopping:
             if shutter.by_hand and not pause.ends_by_itself:
@@ -229,7 +228,7 @@ class Acquisition:
         failed: list[Exception] = []
 
         def attempt(*ways: Callable[[], object]) -> bool:
-            """Try one way after the other until one works: a serial line that failed once often works again."""
+            """Try one action after the other until one works: a serial line that failed once often works again."""
             failures: list[Exception] = []
             for way in ways:
                 try:
@@ -281,7 +280,7 @@ class Acquisition:
             )
 
     def _warn_discrepancies(self) -> None:
-        """Say what is missing where the scan ends with another error, which would hide it."""
+        """Report missing frames if the scan ends with another error, which would hide them."""
         if text := self._discrepancies():
             self._emit("warning", {"message": text.strip()})
 
@@ -298,7 +297,7 @@ def _state_of(block: Block) -> State:
 
 
 def _in_words(error: Exception) -> str:
-    """The message of an error; for one that is not ours, with its type."""
+    """The message of an error; with its type if it is not ours."""
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"
 
 

@@ -45,7 +45,7 @@ class BeamLog:
         return tuple(self._readings)
 
     def next_reading_done(self) -> Callable[[], bool]:
-        """Says whether a reading that begins from now on is over, also a failed one, or none will come."""
+        """Returns a function: whether a reading begun after this call is over (or failed), or no reading will come."""
         due = self._begun + 1
         return lambda: self._ended >= due or not self._thread.is_alive()
 

@@ -1,8 +1,8 @@
-"""Braking: which triggers exposed the frames that came after a stage was told to stop within a train.
+"""Braking: assigns triggers to the frames that came after a stage was told to stop within a train.
 
 Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
-frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands tells when
-it began to brake, and where it was at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
+frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
+begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
 the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
 Frames that neither confirms belong to no trigger. All functions are pure.
 """
@@ -16,11 +16,11 @@ from itertools import pairwise
 
 from beamline.scan.ledger import DeliveredFrame, Ledger, enter, start_known
 
-EARLY, LATE = 0.02, 0.5  # s by which a stage may seem to brake before it was told to, and may brake after that
-MOST = 0.75  # of the triggers that must have a frame by their times; by chance 0.4 have
-FEW = 4  # triggers; of fewer the exposures show nothing
+EARLY, LATE = 0.02, 0.5  # s by which braking may seem to begin before the stop was sent, and may begin after it
+MOST = 0.75  # share of the triggers that must have a frame by their times; by chance 0.4 do
+FEW = 4  # triggers; fewer exposures show nothing
 SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
-BESIDE = 0.02  # intervals by which a stage that stands at a trigger may have passed it or not
+BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not have passed it
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class Braking:
 
 
 Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]
-"""Gives a frame the time at which its trigger would have come at constant speed; nan where that is not known."""
+"""Gives a frame the time at which its trigger would have come at constant speed; NaN if unknown."""
 
 
 def placing(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> Placing:
-    """What confirms the frames that a stage gave until it stood: its motion, their number, or nothing."""
+    """The confirmation of the frames until the stage stood: by its motion, by their number, or none."""
     steady, moved, counted = (booked(ledger, braking, frames, way) for way in (by_nothing, by_motion, by_number))
     fewest, most = (min(math.floor(braking.stood + by), ledger.train.n - 1) for by in (-BESIDE, BESIDE))
     due = fewest - steady.last
@@ -95,7 +95,7 @@ def _matched(ledger: Ledger) -> int:
 
 
 def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
-    """The intervals between exposures grow from the last steady one on."""
+    """Whether the intervals between exposures grow from the last steady one on."""
     steady = [DeliveredFrame(ledger.exposed, ledger.phase), *(frame for frame in frames if frame.time < braking.told)]
     came = [steady[-1], *(frame for frame in frames if frame.time >= braking.told)]
     intervals = [(b.time - a.time) / (b.framestamp - a.framestamp) for a, b in pairwise(came)]

@@ -1,8 +1,8 @@
 """Control: verbs to a running scan from another terminal.
 
 A verb is an empty file of that name in the folder `control` of the run, which only its owner can write to. The scan
-takes it away and does it. So it works on every system and file system, no port is open, and nothing is parsed. Where
-there are owners and modes, they are looked at on every use, and a folder put in its place is not looked into.
+removes the file and obeys. This works on every system and file system, without an open port or a parser. Owners and
+modes, if the system has them, are checked at every use, and a replaced folder is ignored.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from beamline.scan.run_folder import CONTROL, SCAN
 from beamline.scan.states import State
 from beamline.storage.writer_lock import held
 
-POSIX = os.name == "posix"  # a folder has an owner and a mode, and can be held open
-_POLL = 0.1  # real s between looks
-_ANSWER = 5.0  # real s within which a scan takes a verb away
+POSIX = os.name == "posix"  # the system has owners and modes, and can hold a folder open
+_POLL = 0.1  # real s between checks
+_ANSWER = 5.0  # real s within which a scan accepts a verb
 _EFFECT = 20.0  # real s within which most verbs have been done: a stage has braked, a frame is exposed
 
 
 class Verb(StrEnum):
-    """What a running scan can be told, most urgent first."""
+    """Commands to a running scan, most urgent first."""
 
     ABORT = "abort"
     STOP = "stop"
@@ -41,7 +41,7 @@ class Verb(StrEnum):
 
 
 class _Requests:
-    """The folder of requests, made here and held open: one that is put in its place is another.
+    """The folder of requests, made here and held open, so that a replacement is noticed.
 
     Raises:
         OSError: it cannot be made.
@@ -55,7 +55,7 @@ class _Requests:
             os.fchmod(self._held, 0o700)
 
     def fault(self) -> str:
-        """Why no request can be trusted, or none arrives; "" where all is well."""
+        """Why no request can be trusted, or none can arrive; "" if all is well."""
         if self._held < 0:
             return ""
         try:
@@ -66,7 +66,7 @@ class _Requests:
         return _not_private(ours) if same else "it is gone, or another was put in its place"
 
     def taken(self, verb: Verb) -> bool:
-        """Take a request away; False where there is none that its owner, or root, made."""
+        """Remove a request; False if there is none by its owner or root."""
         if self._held < 0:
             return _taken(self._folder / verb)
         try:
@@ -77,7 +77,7 @@ class _Requests:
         return stat.S_ISREG(made.st_mode) and made.st_uid in (os.geteuid(), 0)
 
     def close(self) -> None:
-        """Take what is left away, and the folder."""
+        """Remove the remaining requests, and the folder."""
         for verb in Verb:
             self.taken(verb)
         if self._held >= 0:
@@ -87,7 +87,7 @@ class _Requests:
 
 
 def _not_private(folder: os.stat_result) -> str:
-    """Why somebody else may have made requests there; "" where only we can."""
+    """Why somebody else may have made requests there; "" if only we can."""
     if not stat.S_ISDIR(folder.st_mode):
         return "it is no folder of its own"
     if os.geteuid() not in (folder.st_uid, 0):
@@ -101,7 +101,7 @@ def _not_private(folder: os.stat_result) -> str:
 def verbs_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, emit: Emit = lambda event, data: None
 ) -> Iterator[None]:
-    """While the context lasts, verbs for the run in this folder are taken and done; a warning where they cannot be.
+    """While the context lasts, verbs for the run in this folder are obeyed; a warning if this is impossible.
 
     Raises:
         DataError: the disk does not take the folder for them.
@@ -139,7 +139,7 @@ def verbs_taken(
 
 
 def _taken(request: Path) -> bool:
-    """Take a request away; False where there is none."""
+    """Remove a request; False if there is none."""
     try:
         request.unlink()
     except OSError:
@@ -154,7 +154,7 @@ def running(runs: Path) -> list[Path]:
 
 
 def tell(run: Path, verb: Verb) -> State:
-    """Tell a running scan, and wait until it has done it, or for 20 s; the state that it is in then.
+    """Send a verb to a running scan, and wait until it is done, or for 20 s; returns the scan's state.
 
     Raises:
         ConfigError: no scan runs there, or somebody else's, or none that answers within 5 s; the request is withdrawn.
@@ -191,14 +191,14 @@ def state_of(run: Path) -> State:
     state = State.IDLE
     with suppress(OSError), (run / EVENTS).open(encoding="utf-8") as lines:
         for line in lines:
-            with suppress(ValueError):  # a line that is just being written
+            with suppress(ValueError):  # an incomplete line
                 if line.startswith('{"event": "state"') and "source" not in (said := json.loads(line)):
                     state = State(said["state"])  # without those of the live reconstruction
     return state
 
 
 def _done(state: State, verb: Verb) -> bool:
-    """Whether a scan in this state has done what it was told."""
+    """Whether a scan in this state has obeyed the verb."""
     if state is State.FINISHING or state.ended:
         return True
     if verb in (Verb.PAUSE, Verb.RESUME):

@@ -23,12 +23,12 @@ from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame, CameraSettings, Devices, TriggerSource, TriggerTrain
 
-SLICE = 0.5  # s: the longest wait for a frame before the stop request is looked at again
-POLL = 0.02  # s between looks at a moving stage
+SLICE = 0.5  # s: the longest wait for a frame between two checks of the stop request
+POLL = 0.02  # s between status queries of a moving stage
 PATIENCE = 2.0  # s without a frame (beyond exposure and readout) after which a camera is silent; at least
 PATIENCE_PERIODS = 10  # so many trigger periods
-RAMP_TOLERANCE = 0.1  # of what the acceleration adds to the time of the first pulse
-SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera is taken for silent
+RAMP_TOLERANCE = 0.1  # share of the time that acceleration adds before the first pulse
+SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camera counts as silent
 NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
 
 
@@ -39,7 +39,7 @@ class Taken:
     Attributes:
         frames: delivered, with and without a trigger.
         rows: by trigger, counted within the block, the row and the time of its last frame.
-        missing: triggers, counted within the block, that gave no frame though one was waited for.
+        missing: triggers, counted within the block, whose expected frame did not come.
         lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
         extra: frames that no trigger exposed.
         unconfirmed: of the extra ones, those exposed while the stage braked.
@@ -58,7 +58,7 @@ class Taken:
     off: float = 0.0
 
     def miss(self, triggers: Iterable[int]) -> None:
-        """These gave no frame. One that gave a frame before, perhaps without beam, keeps that one."""
+        """Record triggers without a frame. A trigger with an earlier frame, perhaps without beam, keeps that frame."""
         self.missing += [trigger for trigger in triggers if trigger not in self.rows]
 
     def enter(self, account: Account, first: int) -> None:
@@ -92,7 +92,7 @@ class _Pass:
 
     @property
     def so_far(self) -> Ledger:
-        """The ledger as if no further frame came."""
+        """The settled ledger, as if no further frame came."""
         return booked(self.ledger, self._braking, self._exposed, by_nothing)
 
     @property
@@ -104,10 +104,10 @@ class _Pass:
         return math.inf if train.first is None else train.first + (train.n - 1) * train.period
 
     def enter(self, *frames: CameraFrame, last: bool = False) -> Iterator[tuple[CameraFrame, int, float]]:
-        """The frames that need not wait any more, each with its trigger within the block (or EXTRA) and its angle.
+        """The frames that need not wait longer, each with its trigger within the block (or EXTRA) and its angle.
 
         Args:
-            last: no further frame will come: none waits.
+            last: no further frame will come, so none waits.
         """
         self.waiting += frames
         if self.braking is not None and not last:
@@ -185,7 +185,7 @@ class Exposures:
             )
 
     def go(self, angle: float) -> bool:
-        """Move to `angle` at full speed and wait; False where a stop cut the move short."""
+        """Move to `angle` at full speed and wait; False if a stop cut the move short."""
         limits = self._stage.limits
         distance = angle - self._stage.position()
         self._stage.start_move(angle, limits.max_speed)
@@ -212,8 +212,8 @@ class Exposures:
             i += yield from self._pass(block, taken, left, i, (begin, flown.end))
 
     def _after_pause(self, i: int, block: Block, taken: Taken) -> int:
-        """Wait while the scan is paused. Returns the trigger to go on with: `i` or the next one that is not stored. Or
-        the first one since there may have been no beam. Its frame and those after it are taken again."""
+        """Wait while the scan is paused. Returns the next trigger: `i`, or the next one without a stored frame. After a
+        lost beam it is the first trigger that may lack beam; it and later ones are repeated."""
         i = next((k for k in range(i, block.n) if k not in block.stored), block.n)
         if i == block.n and taken.rows and block.kind is not FrameKind.DARK:
             self._supervision.wait_for_beam_reading()
@@ -247,7 +247,7 @@ class Exposures:
             except (BeamlineError, DeviceError):
                 yield from flight.enter(last=True)
                 raise
-            if not flight.paused:  # else the triggers of those that wait come again
+            if not flight.paused:  # otherwise the triggers of waiting frames come again
                 yield from flight.enter(last=True)
             cut_short = self._stop.stopping or flight.paused
         finally:
@@ -272,8 +272,8 @@ class Exposures:
         return Train(angles, block.period, first, tolerance=(after - before) / 2 + RAMP_TOLERANCE * ramp)
 
     def _until_standing(self, block: Block, flight: _Pass) -> Iterator[tuple[CameraFrame, int, float]]:
-        """Frames while the stage turns; after a stop, once it stands, those exposed until then. After a pause only
-        those exposed before the stage was told to stand: they look as if the scan had gone on.
+        """Frames while the stage turns; after a stop, all frames until the stage stands. After a pause only the frames
+        exposed before the stop was sent: they equal those of a scan without a pause.
 
         Waits for frames, not for the stage, so that a camera without frames is noticed at once.
         """
@@ -293,7 +293,7 @@ class Exposures:
                     yield from flight.enter(frame)
             elif stands:
                 break
-            elif self._clock.now() >= silent_at:  # before that a pause was asked for, or also taken back
+            elif self._clock.now() >= silent_at:  # the pause was requested earlier, and perhaps withdrawn
                 if not self._stage.moving():
                     break
                 if self._clock.now() >= flight.last_due + tail:
@@ -353,7 +353,7 @@ class Exposures:
                     f"{self._camera.name}: {silent} triggers in a row gave no frame within {patience:.3g} s each. "
                     "Check the camera. What was taken before is in the file."
                 )
-            self._arm_anew(block.n - i)  # a late frame must not be taken for the next one: this discards it
+            self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
         self._camera.disarm()
 
     def _arm_anew(self, n: int) -> None:
@@ -383,7 +383,7 @@ class Exposures:
                 self._emit("warning", {"message": str(error)})
 
     def _wait(self, seconds: float, until_stop: bool = True) -> bool:
-        """Wait for a move that should take `seconds`; False where a stop cut it short."""
+        """Wait for a move that should take `seconds`; False if a stop cut it short."""
         deadline = self._clock.now() + 2 * seconds + 5.0
         while self._stage.moving():
             self._check_abort()
@@ -393,14 +393,14 @@ class Exposures:
             if self._clock.now() > deadline:
                 break
             self._clock.sleep(POLL)
-        self._stage.wait(timeout=POLL)  # raises where the stage still moves or stopped short
+        self._stage.wait(timeout=POLL)  # raises if the stage still moves or stopped short
         return True
 
     def stand(self) -> None:
         """Slow down and wait until the stage stands.
 
         Raises:
-            InstrumentError: it does not.
+            InstrumentError: it does not stand.
         """
         limits = self._stage.limits
         deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
@@ -413,7 +413,7 @@ class Exposures:
 
     @property
     def _interrupted(self) -> bool:
-        """A stop or a pause is asked for."""
+        """Whether a stop or a pause is requested."""
         return self._stop.stopping or bool(self._supervision.pause.reason)
 
     def _check_abort(self) -> None:

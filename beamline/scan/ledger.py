@@ -4,9 +4,9 @@ A camera counts the frames it exposes. A gap in its framestamps is a frame that 
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
 While a stage turns at constant speed, trigger times are linear in the trigger's index. So the index of a frame is the
 nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too. Where the first trigger's time is not known well, the
-first frames are those that make a regular train. Of two frames that could belong to a trigger, the nearer one does.
-That takes a look at the frames that follow: see `enter`. Frames exposed while the stage brakes come with the times at
+Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the
+first frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does.
+This needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at
 which their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
@@ -24,8 +24,8 @@ from beamline.core.errors import DataError
 FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
 NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next, which may be nearer
 CONFIRMED = 0.2  # periods; the same for a frame of a stage that brakes
-KNOWN = 0.25  # periods by which the first trigger's time may be wrong, so that the first frame can be told by it
-TRAIN, LOOK = 3, 6  # frames that make a train, and how many are looked at for it at most
+KNOWN = 0.25  # periods: largest error of the first trigger's time that still identifies the first frame
+TRAIN, LOOK = 3, 6  # frames that make a train, and the most frames searched for one
 UNEVEN = 0.25  # periods; frames of a train are more regular than this
 PHASE_GAIN, PERIOD_GAIN = 0.3, 0.05
 PERIOD_RANGE = 0.2  # the true period may differ from the planned one by this fraction
@@ -48,7 +48,7 @@ class Train:
     Attributes:
         angles: float64 [trigger] radians.
         period: s between triggers.
-        first: time of trigger 0, s since the Unix epoch; None where it is not known.
+        first: time of trigger 0, s since the Unix epoch; None if unknown.
         tolerance: s by which `first` may be wrong.
     """
 
@@ -81,7 +81,7 @@ class Ledger:
     """Triggers and frames matched so far: begins as `Ledger(train)`, goes on by `assign`, ends by `settle`.
 
     Attributes:
-        train: what was expected.
+        train: the expected triggers.
         last: the trigger of the last matched frame, -1 before the first.
         exposed: framestamp of the last frame, matched or not, -1 before the first.
         unmatched: exposures since the last matched frame, delivered or not.
@@ -113,13 +113,13 @@ class Ledger:
 
     @property
     def complete(self) -> bool:
-        """The last trigger has its frame: no more frames are expected."""
+        """Whether the last trigger has its frame, so that no more frames are expected."""
         return self.last == self.train.n - 1
 
 
 @dataclass(frozen=True)
 class Account:
-    """A settled ledger: nothing is missing or extra where every trigger has its frame and every frame its trigger.
+    """A settled ledger. Without faults every trigger has its frame and every frame its trigger.
 
     Attributes:
         missing: triggers without a frame, ascending.
@@ -128,8 +128,8 @@ class Account:
         extra: framestamps of the frames that no trigger exposed.
         unconfirmed: how many of them were exposed while the stage braked.
         shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
-            missing at the other. Likewise a frame too many at the end could be one at the beginning. 0 where there is
-            none or the time of the first trigger was known.
+        missing at the other. Likewise an extra frame at the end could be one at the beginning. 0 without such
+        frames, or if the time of the first trigger is known.
         off: steps by which the angle of a frame may be wrong, because it came so much off its trigger.
     """
 
@@ -152,7 +152,7 @@ class DeliveredFrame:
 
 
 def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple[Ledger, LedgerEntry] | None:
-    """Enter the first of the frames that wait, by what those after it show; None: it must wait for further frames.
+    """Enter the first of the waiting frames, using those after it; None: it must wait for further frames.
 
     Args:
         frames: in the order in which they were exposed.
@@ -160,7 +160,7 @@ def enter(ledger: Ledger, frames: Sequence[DeliveredFrame], last: bool) -> tuple
     """
     first, *others = frames
     ahead = [frame for frame in others if not math.isnan(frame.time)]
-    last = last or len(ahead) < len(others)  # those that come where nobody knows show nothing
+    last = last or len(ahead) < len(others)  # frames without a known time show nothing
     after, entry = assign(ledger, first.framestamp, first.time, first.steady)
     if math.isnan(first.time):
         return after, entry
@@ -269,7 +269,7 @@ def _off(ledger: Ledger, trigger: int, time: float) -> float:
 
 
 def _regular(times: Sequence[float], period: float) -> tuple[int, ...]:
-    """Which of the first frames a train of triggers made: those that come most regularly, whole periods apart."""
+    """The first frames that belong to a train of triggers: those that come most regularly, whole periods apart."""
     best: list[tuple[float, tuple[int, ...]]] = []  # the best train that ends with each frame, and how good it is
     for i, time in enumerate(times):
         trains: list[tuple[float, tuple[int, ...]]] = [(0.0, (i,))]
@@ -282,7 +282,7 @@ def _regular(times: Sequence[float], period: float) -> tuple[int, ...]:
 
 
 def _window(train: Train) -> float:
-    """Periods by which the first frame may differ from where it is expected."""
+    """Largest difference of the first frame from its expected time, in periods."""
     return math.inf if train.first is None else max(0.5, train.tolerance / train.period)
 
 
@@ -292,7 +292,7 @@ def _first_place(train: Train, framestamp: int, time: float) -> tuple[float, int
     Args:
         framestamp: exposures before it, without those that no trigger made.
 
-    Where the expected time is not precise enough, framestamps decide. No trigger was ignored before the first frame,
+    If the expected time is not precise enough, framestamps decide. No trigger was ignored before the first frame,
     because an armed, idle camera takes every trigger.
     """
     if train.first is None:

@@ -27,21 +27,21 @@ LiveCommand = Callable[[Path, Path], Sequence[str]]
 """(scan file, output file) -> the command line."""
 
 _SILENCE = 300.0  # real s without output, after which the process is ended
-_GRACE = 120.0  # real s in which it may still write the volume that it has, unless the operator is in a hurry
-_CLOSE = 5.0  # the same where the scan itself has failed
-_POLL = 0.1  # real s between two looks whether it is ready
+_GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
+_CLOSE = 5.0  # the same if the scan itself has failed
+_POLL = 0.1  # real s between two checks of its readiness
 
 
 # Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
 _A_RAY, _A_VOXEL = 40, 50
 _WIDEST = 512  # columns: a wider volume does not grow as fast as views come, on any processor
 _FEWEST = 90  # views
-_SHARE = 0.5  # of the free memory
+_SHARE = 0.5  # share of the free memory
 
 
 @dataclass(frozen=True)
 class LivePlan:
-    """What of a scan the live volume is made of.
+    """The part of a scan for the live volume.
 
     Attributes:
         binning: binning of rows and columns.
@@ -88,7 +88,7 @@ def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
 
 
 def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
-    """What the live volume is made of, the memory that it takes, and why it is of no more."""
+    """A sentence on the live volume: its views and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
     views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} that are free"
@@ -133,10 +133,10 @@ def finished_command(config: Config) -> LiveCommand:
 
 @dataclass(frozen=True)
 class Commands:
-    """How a scan is reconstructed: while it runs, when it is complete, or (neither) not at all.
+    """The commands that reconstruct a scan: while it runs, or when it is complete; neither: no reconstruction.
 
     Attributes:
-        remark: for the operator; "" where there is nothing to say.
+        remark: for the operator; "" without one.
     """
 
     live: LiveCommand | None = None
@@ -145,7 +145,7 @@ class Commands:
 
 
 def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
-    """How the configuration wants its scan, or the run that goes on, to be reconstructed."""
+    """The commands by the configuration of a scan, or of a resumed run."""
     method = config.recon.method
     if not config.recon.live:
         return Commands()
@@ -182,7 +182,7 @@ class LiveReconstruction:
         enough: is told why the views so far are enough, in the thread that reads the output.
         what: its name in messages.
         silence: s without output after which `finish` stops it.
-        low_priority: it gives way to a scan that runs beside it.
+        low_priority: a scan beside it takes precedence.
     """
 
     def __init__(
@@ -211,9 +211,9 @@ class LiveReconstruction:
             emit("warning", {"message": message})
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
-        """Wait until it has compiled its kernels and can take views, has ended, `stop` says so, or so many real s.
+        """Wait until it has compiled its kernels or ended, `stop` returns True, or so many real s are over.
 
-        Where the time is over that is a warning: the scan need not wait for it.
+        A time-out is a warning: the scan need not wait for it.
         """
         deadline = time.monotonic() + seconds
         while self._process is not None and self._process.running and not stop():
@@ -231,8 +231,8 @@ class LiveReconstruction:
         """Wait until it ends; the data of its `done` event, or None where it failed.
 
         Args:
-            stop: polled a few times a second; True asks it to end with the volume that it has.
-            hurry: polled likewise; True kills it.
+            stop: polled a few times a second; True asks it to end with its present volume.
+            hurry: polled in the same way; True kills it.
         """
         process = self._process
         if process is None:
@@ -256,7 +256,7 @@ class LiveReconstruction:
             self._process.end(_CLOSE)
 
     def _say_if_early(self) -> None:
-        """Warn at once where it has ended while the scan runs: the operator watches a volume that grows no more."""
+        """Warn at once if it ends while the scan runs, because the operator watches a volume that does not grow."""
         if self._wanted and self._done is None:
             when = "in the middle of the scan" if self._ready.is_set() else "before it was ready"
             message = (

@@ -33,7 +33,7 @@ from recon.base.choices import AUTO
 from recon.methods import streams
 
 Remaining = Callable[[ScanPlan], ScanPlan]
-"""A plan without what earlier files of the same scan have."""
+"""A plan without the frames in earlier files of the same scan."""
 
 
 def all_of(plan: ScanPlan) -> ScanPlan:
@@ -52,7 +52,7 @@ class DryRun:
     free_bytes: int
 
     def lines(self) -> list[str]:
-        """For a human; the violations come last."""
+        """Lines of text; the violations come last."""
         return describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
 
     def data(self) -> Mapping[str, Any]:
@@ -80,11 +80,11 @@ class DryRun:
 
 
 def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = all_of) -> DryRun:
-    """Work out a configuration without asking a device.
+    """Work out a configuration without devices.
 
     Args:
         runs: where the file would be, for the free disk; the configured folder unless given.
-        remaining: what of the plan is still to be taken.
+        remaining: the part of the plan that is still to be taken.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
@@ -106,7 +106,7 @@ def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = a
 
 
 def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Timeline:
-    """The timeline with what the operator should know of the live volume."""
+    """The timeline with remarks on the live volume."""
     remarks = [*worked.remarks]
     method = config.recon.method
     if config.recon.live and method != AUTO and streams(method):
@@ -163,7 +163,7 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
 
     Args:
         runs: where the file will be, for the free disk.
-        remaining: what of the plan is still to be taken.
+        remaining: the part of the plan that is still to be taken.
 
     Raises:
         ConfigError: an impossible plan, every broken limit, or a simulated scene that cannot

@@ -34,11 +34,11 @@ from beamline.scan.supervision import BacklogGuard, SpaceGuard, Workload
 from drivers.base.frame import Frame, FrameKind
 
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
-WAITING_FRAMES = (4, 128)  # at least and at most
-CHECKED_FRAMES = 2  # that wait between the threads, at most
-LOOK = 1.0  # real s between two looks at the free space
+WAITING_FRAMES = (4, 128)  # least and most frames
+CHECKED_FRAMES = 2  # most frames that wait between the threads
+LOOK = 1.0  # real s between two checks of the free space
 BRAKING = 5.0  # s in which frames may still come after a scan is told to pause
-STALL = 60.0  # real s without a frame written, after which the disk is taken for dead
+STALL = 60.0  # real s without a written frame, after which the disk counts as dead
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
 
@@ -61,7 +61,7 @@ def _room(timeline: Timeline) -> int:
 
 
 def frames_in_memory(timeline: Timeline) -> int:
-    """Frames of a scan that are in memory at one time, at most: waiting, in work, and on their way from the camera."""
+    """Most frames of a scan in memory at one time: waiting, in work, and on their way from the camera."""
     return min(_room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
 
 
@@ -71,14 +71,14 @@ _Checked = tuple[Frame, FrameDigest, tuple[Flag, ...]]
 class Recorder:
     """Frames go in by `put`; each is digested once, looked at by the monitor, and appended with the monitor's flags.
 
-    What was appended is flushed when no frame waits; while some do, the writer decides how often.
+    Appended frames are flushed when no frame waits; otherwise the writer decides how often.
 
-    No frame is dropped: while the disk is behind, `put` waits. In a fly scan frames come whether there is room or not,
-    so the scan pauses before that. Any scan pauses before the disk is full.
+    No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
+    so it pauses before the queue is full. Any scan pauses before the disk is full.
 
     Args:
         react: told the flags of each frame.
-        pause: what pauses the scan.
+        pause: a request that pauses the scan.
 
     Attributes:
         n_frames: written so far.
@@ -137,7 +137,7 @@ class Recorder:
         self._raise_failure()
 
     def check(self) -> None:
-        """Look whether the disk answers, while no frames come.
+        """Check whether the disk answers, while no frames come.
 
         Raises:
             DataError: it has not taken a frame for STALL, or failed.
@@ -236,7 +236,7 @@ class Recorder:
         return f"The first {self._writer.safe} frames are safe in {self._writer.path}."
 
     def _check_frames(self) -> None:
-        """The first thread: digests and looks. What it cannot digest is a failure when its turn comes to be written."""
+        """The first thread: digests and checks. A frame that it cannot digest fails at its turn to be written."""
         while (item := self._next()) is not None:
             checked: _Checked | Exception | threading.Event
             if isinstance(item, threading.Event):
@@ -256,7 +256,7 @@ class Recorder:
         self._checked.put(None)
 
     def _write_frames(self) -> None:
-        """The second thread: writes, and tells."""
+        """The second thread: writes, and reports."""
         item, flushed = self._checked.get(), True
         while True:
             begun, cpu = time.monotonic(), time.thread_time()
@@ -289,7 +289,7 @@ class Recorder:
         return self._waiting.empty() and self._checked.empty()
 
     def _next(self) -> Frame | threading.Event | None:
-        """What comes next in the queue; looks at the disk about once a second meanwhile."""
+        """The next item of the queue; checks the disk about once a second meanwhile."""
         while True:
             self._look_at_backlog()
             if time.monotonic() - self._looked_at > LOOK:
@@ -302,21 +302,21 @@ class Recorder:
 
     def _look_at_backlog(self) -> None:
         if self._backlog is not None:
-            self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames come when `put` lets them
+            self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames wait in `put`
 
     def _write(self, frame: Frame, found: FrameDigest, flags: tuple[Flag, ...]) -> None:
         self._writer.append(frame, found, flags)
         self.references.add(frame, found)
         self.n_frames += 1
         if frame.kind is FrameKind.INVALID or (frame.replaces >= 0 and not self._retaking):
-            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and nobody announced it
+            self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
         self._report(frame, flags)
         data = self._progress.update(frame, self.n_frames)
         if data is not None:
             self._emit("frame", {**data, "mean": found.mean})
 
     def _look(self, frame: Frame, found: FrameDigest) -> tuple[Flag, ...]:
-        """The monitor's flags. An error there costs no frame: a check that raises is off, and a warning says so."""
+        """The monitor's flags. An error costs no frame: a check that raises is switched off, with a warning."""
         if self._monitor_off:
             return ()
         try:

@@ -16,7 +16,7 @@ VIEWS = 4  # enough for a median
 
 
 class ReferenceLog:
-    """What is needed of the darks and flats of a scan to judge them, group by group.
+    """Statistics of the darks and flats of a scan, to judge them group by group.
 
     Args:
         preview_bin: of the digests' previews.
@@ -29,7 +29,7 @@ class ReferenceLog:
         self._before = FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
-        """Take note of a frame, in the order of the file; of the first views, too, whose light the flats must have."""
+        """Record a frame, in the order of the file; also the first views, whose light the flats must have."""
         if frame.kind in REFERENCES:
             if frame.kind is not self._before:
                 self._groups.append([])
@@ -43,7 +43,7 @@ class ReferenceLog:
                 known[:] = [one for one in known if one.row != frame.replaces]
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
-        """What is wrong with the groups so far, by the name of the group; a sentence or more each.
+        """The faults of the groups so far, by the name of the group; a sentence or more each.
 
         Args:
             planned: blocks that are over by now; references without any frame are missing.
@@ -57,7 +57,7 @@ class ReferenceLog:
         return missing | {group.name: group.described() for group in judged if group.faults}
 
     def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
-        """A sentence or more where noise would rule the views: a pixel of the open beam has few photons. Else None.
+        """A warning if noise would dominate the views, because a pixel of the open beam has few photons; or None.
 
         Args:
             exposure: s, of the views.

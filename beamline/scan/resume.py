@@ -1,6 +1,6 @@
-"""Resume: a run that was killed, failed, stopped or aborted goes on; what it lacks comes into a file of its own.
+"""Resume: a run that was killed, failed, stopped or aborted goes on; missing frames go into a file of their own.
 
-The files that are there are only read (after `recover`, where their writer died): what is stored is never at risk. The
+Existing files are only read (after `recover`, if their writer died), so that stored frames are never at risk. The
 new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first
 file joins them all.
 """
@@ -45,17 +45,17 @@ _IDENTITY = (  # facts about a device that stay the same from scan to scan and d
 
 @dataclass(frozen=True)
 class ResumableRun:
-    """A run that goes on.
+    """A run that can go on.
 
     Attributes:
         run: its folder.
-        config: what it was started with.
+        config: its configuration.
         parts: its files so far, each with a frame at least.
         views: of the plan, in these files.
         planned: views of the whole plan.
-        end_references: kinds of references after the views that are missing, where no view is; None where views are.
+        end_references: missing kinds of references after the views, if no view is missing; None if views are.
         last_frame_time: time of the last frame, s since the Unix epoch.
-        left_out: a sentence on each part that counts for nothing.
+        left_out: a sentence on each part that is not used.
     """
 
     run: Path
@@ -77,7 +77,7 @@ class ResumableRun:
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
-        """What of the plan the run lacks."""
+        """The part of the plan that the run lacks."""
         return replace(plan, stored=self.views, end_references=self.end_references)
 
     def begin(self, ready: ReadyScan) -> Path:
@@ -91,7 +91,7 @@ class ResumableRun:
             _require_same_instrument(self.run, first, ready)
         for part in self.parts:
             recover(part)
-        if len(self.parts) > 1 and not is_joined(self.run / JOINED):  # for the case that the new part takes no frame
+        if len(self.parts) > 1 and not is_joined(self.run / JOINED):  # in case the new part takes no frame
             join(self.parts, self.run / JOINED)
         return create_part(self.run)
 
@@ -102,7 +102,7 @@ class ResumableRun:
 
 
 class NotJoined(ConfigError):  # noqa: N818 - an outcome, not a defect
-    """A run lacks no frame, but a file of it was not closed, or its parts are not joined: `recover_run` does both."""
+    """A run lacks no frame, but a file was not closed, or its parts are not joined: `recover_run` does both."""
 
 
 @contextmanager
@@ -221,10 +221,10 @@ def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple
     """Recover every part of a run, and join them where there are several: the joined file comes last.
 
     Args:
-        say: is told what room each needs, before anything is written to it.
+        say: is told the room that each needs, before anything is written to it.
 
     Returns:
-        what became of each file, and a sentence on each part that was left out.
+        the result for each file, and a sentence on each part that was left out.
 
     Raises:
         DataError: no run, or a part that cannot be recovered; those before it are recovered.

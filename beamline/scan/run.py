@@ -57,8 +57,8 @@ SAFE = "Stage stopped, shutter closed; the last frames are being written"
 """Message of the state `finishing`."""
 
 ASK_LIVE_AFTER = 4.0
-"""Real s from the request to stop a scan to the one to its live reconstruction for the volume that it has, so that this
-is there within 10: what the scan takes to end counts."""
+"""Real s from the request to stop a scan to the request for the live reconstruction's volume. The volume then comes
+within 10 s; the time that the scan takes to end counts."""
 
 READY_WITHIN = 300.0
 """Real s that a scan waits for its live reconstruction, which compiles once on a machine; see `_Run._compiled`."""
@@ -122,9 +122,9 @@ def run_scan(
         sinks: besides events.jsonl and user.log in the run's folder.
         stop: ends the scan from another thread or a signal handler.
         live: gives the command line of a live reconstruction; None: there is none.
-        afterwards: gives that of a reconstruction of the complete scan; a scan that ends early has none.
+        afterwards: gives the command line of a reconstruction of the complete scan; a scan that ends early has none.
         instrument: connected devices, left open at the end; None: those that `config` names, opened and closed here.
-        ask: puts a request to the operator, where the shutter or the sample is moved by hand.
+        ask: puts a request to the operator, if the shutter or the sample is moved by hand.
 
     Raises:
         ConfigError: the plan breaks a limit, or the instrument is not that of the run that goes on; nothing has moved
@@ -160,7 +160,7 @@ def run_scan(
             emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
             run = _Run(config, instrument, ready, folder, stop, emit, began, series)
             stack.enter_context(verbs_taken(folder, stop, run.pause, emit))
-            guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
+            guarded = stack.enter_context(ExitStack())  # held until the instrument is free for another scan
             if config.simulation is None:
                 guarded.enter_context(
                     watched(folder, emit, stop, run.pause if config.scan.without_watchdog == "pause" else None)
@@ -170,15 +170,15 @@ def run_scan(
 
 
 def _refuse_stop(stop: StopRequest) -> None:
-    """Raise ScanAborted where a stop was requested: before anything moves, a stop is an abort."""
+    """Raise ScanAborted if a stop was requested: before anything moves, a stop is an abort."""
     if stop.stopping:
         raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
 
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
-    """Whether the live reconstruction of a scan that has ended should end with the volume that it has. It should after
-    an abort, a stop that comes now, or ASK_LIVE_AFTER after that of the scan (not where its views were enough). Also
-    with a `useless` file, which is broken or has no projections."""
+    """Whether the live reconstruction of an ended scan should end with its present volume. It should after an abort, a
+    new stop, or ASK_LIVE_AFTER after the scan's stop (unless its views were enough). Also with a `useless` file, which
+    is broken or has no projections."""
     last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
 
     def ends() -> bool:
@@ -199,7 +199,7 @@ class _Run:
     series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
     told: set[str] = field(default_factory=set)
-    """Groups of references whose faults were told, and `_LITTLE_LIGHT` where that was."""
+    """Groups of references whose faults were reported, and `_LITTLE_LIGHT` once it was."""
 
     @cached_property
     def states(self) -> StateMachine:
@@ -335,7 +335,7 @@ class _Run:
                 recorder.put(frame)
 
     def _worse(self, error: BaseException | None, after: BaseException | None) -> BaseException | None:
-        """The error that the run ends with; a stop or lost frames yield to any other. The other becomes a warning."""
+        """The error that ends the run: any other one before a stop or lost frames, which become a warning."""
         if error is None or after is None or after is error:
             return error or after
         if isinstance(error, ScanStopped | LedgerError):
@@ -393,7 +393,7 @@ class _Run:
             time.sleep(PAUSE_POLL)
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
-        """Why no projection should be taken after these darks and flats; None where none, or the operator wants it."""
+        """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
         recorder.wait()
         self._tell_little_light(recorder)
         if self.config.simulation is not None:
@@ -410,7 +410,7 @@ class _Run:
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views with an alarm or without a frame, evenly spread where there are more than the plan allows."""
+        """Views with an alarm or without a frame; if there are more than the plan allows, an even spread of them."""
         most = self.ready.plan.retakes
         if not most:
             return ()
@@ -431,7 +431,7 @@ class _Run:
         return chosen
 
     def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:
-        """What is wrong with the darks and flats so far, by group; of a new one it is a warning."""
+        """The faults of the darks and flats so far, by group; a fault of a new group is a warning."""
         faults = recorder.references.faults(reference_limits(self.config.references), planned)
         for group in faults.keys() - self.told:
             self.told.add(group)
@@ -439,7 +439,7 @@ class _Run:
         return faults
 
     def _tell_little_light(self, recorder: Recorder) -> None:
-        """Once a scan, as soon as there are flats: before the views, where the plan has flats before them."""
+        """Warn once a scan, as soon as there are flats: before the views, if the plan has flats before them."""
         said = recorder.references.too_little_light(reference_limits(self.config.references), self.ready.plan.exposure)
         if said is not None and _LITTLE_LIGHT not in self.told:
             self.told.add(_LITTLE_LIGHT)
@@ -476,7 +476,7 @@ def _wait_in_pause(recorder: Recorder) -> bool:
 
 
 def _failure_of(action: Callable[[], None]) -> BaseException | None:
-    """The exception that the action raised, None where it raised none; it is raised after everything is closed."""
+    """The exception that the action raised, or None; it is raised after everything is closed."""
     try:
         action()
     except BaseException as error:

@@ -1,4 +1,4 @@
-"""Runs of a folder: what each is of and what became of it, by its log of events, or its file where that ends early."""
+"""Runs of a folder: sample and outcome of each, by its log of events, or by its file if the log ends early."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from beamline.scan.run_folder import CONTROL, SCAN, STAMP
 from beamline.scan.states import State
 
 DIED = "died"
-"""State of a run whose process has ended without a word."""
+"""State of a run whose process has ended without a final event."""
 
-_HEAD, _TAIL = 2**16, 2**17  # bytes of a log that are read: the sample stands at its head, what came of it at its end
-_ENDING = 600.0  # real s since the last line of a log, within which a scan that is complete may still be ending
+_HEAD, _TAIL = 2**16, 2**17  # bytes of a log that are read: the sample is at its head, the outcome at its end
+_ENDING = 600.0  # real s since the last line of a log, within which a complete scan may still be ending
 _OF_STATUS = {"complete": State.DONE, "stopped": State.STOPPED, "failed": State.FAILED}
 
 FlagCounts = Mapping[str, Mapping[str, int]]
@@ -39,7 +39,7 @@ class Run:
         frames: in its files; None: not known.
         planned: frames that the first part was to have; None: not known.
         flags: frames that the monitor flagged: their number by check, then by level.
-        state: that of its newest part, see docs/states.md; `died` where its process ended without a word.
+        state: of its newest part, see docs/states.md; `died` if its process ended without a final event.
         bytes: of all files in the folder.
         parts: 1, and one for each time that it was resumed.
     """
@@ -62,7 +62,7 @@ def runs_in(folder: Path) -> list[Path]:
 
 
 def newest(folder: Path) -> Path:
-    """The running scan of a folder, else its newest run. ConfigError where there is none."""
+    """The running scan of a folder, or else its newest run. ConfigError if there is none."""
     found = running(folder)[-1:] or runs_in(folder)
     if not found:
         raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")
@@ -70,7 +70,7 @@ def newest(folder: Path) -> Path:
 
 
 def describe(run: Path) -> Run:
-    """What the log of a run says, or its files where that ended early. No pixel is read."""
+    """The facts of a run by its log, or by its files if the log ended early. No pixel is read."""
     parts = parts_of(run)
     heads = [_head(part) for part in parts]
     frames: int | None = 0
@@ -99,12 +99,12 @@ def describe(run: Path) -> Run:
 def _is_run(run: Path) -> bool:
     try:
         return (run / EVENTS).is_file()
-    except OSError:  # not ours to look into
+    except OSError:  # a file of another user
         return False
 
 
 def _began(run: Path) -> float:
-    """By the folder's name, which a simulated clock does not change; of one with another name, by its log."""
+    """When the run began: by the folder's name, which a simulated clock does not change, or else by its log."""
     with suppress(ValueError):
         return timegm(time.strptime(run.name.partition("_")[0], STAMP))
     return float(_head(run).get("time") or 0.0)
@@ -164,7 +164,7 @@ def _of_file(scan: Path) -> tuple[int | None, FlagCounts]:
 
 
 def _head(part: Path) -> Mapping[str, Any]:
-    """The event that a run begins with; nothing where there is none."""
+    """The first event of a run; empty without one."""
     with suppress(OSError), (part / EVENTS).open("rb") as file:
         for line in file.readlines(_HEAD):
             if (event := _event(line, ("run_started",))) is not None:
@@ -173,13 +173,13 @@ def _head(part: Path) -> Mapping[str, Any]:
 
 
 def _said(part: Path) -> Mapping[str, Mapping[str, Any]]:
-    """The last event of each kind that tells what became of a part, from the end of its log."""
+    """The last event of each kind that tells the outcome of a part, from the end of its log."""
     said: dict[str, Mapping[str, Any]] = {}
     with suppress(OSError), (part / EVENTS).open("rb") as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - _TAIL))
         for line in reversed(file.read(_TAIL).splitlines()):
             kinds = tuple(kind for kind in ("done", "failed", "scan_done", "state", "frame") if kind not in said)
-            if (event := _event(line, kinds)) is not None and "source" not in event:  # that is the live volume's
+            if (event := _event(line, kinds)) is not None and "source" not in event:  # an event of the live volume
                 said[event["event"]] = event
             if said.keys() & {"done", "scan_done"} and "state" in said:
                 break
@@ -187,10 +187,10 @@ def _said(part: Path) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _event(line: bytes, kinds: Iterable[str]) -> dict[str, Any] | None:
-    """The event in a line, where it is of one of these kinds; their order within a line is that of `Event.to_json`."""
+    """The event in a line, if it is of one of these kinds; keys have the order of `Event.to_json`."""
     if not any(line.startswith(f'{{"event": "{kind}"'.encode()) for kind in kinds):
         return None
-    with suppress(ValueError):  # a line that is just being written, or was cut
+    with suppress(ValueError):  # an incomplete line
         event = json.loads(line)
         return event if isinstance(event, dict) else None
     return None

@@ -1,4 +1,4 @@
-"""States of a scan, and which may follow which; docs/states.md draws them and says what each verb does in them."""
+"""States of a scan and their allowed order; docs/states.md draws them and explains the verbs in each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from beamline.core.events import Emit
 
 
 class State(StrEnum):
-    """What a scan is doing."""
+    """The activity of a scan."""
 
     IDLE = "idle"
     PREPARING = "preparing"
@@ -27,7 +27,7 @@ class State(StrEnum):
 
     @property
     def ended(self) -> bool:
-        """Nothing follows."""
+        """Whether no state may follow."""
         return not NEXT[self]
 
 
@@ -57,7 +57,7 @@ class StateMachine:
         self._emit, self.state = emit, state
 
     def enter(self, state: State, message: str = "") -> None:
-        """Go to a state, with a message for people; to stay in one without a message says nothing.
+        """Go to a state, with a message; staying in a state without a message emits nothing.
 
         Raises:
             ValueError: the state must not follow the present one; nothing has changed.

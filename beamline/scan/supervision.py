@@ -1,4 +1,4 @@
-"""Supervision: what may hold a scan or end it beside its operator, and what alarms of the monitor do to it."""
+"""Supervision: causes that pause or end a scan beside its operator, and the effects of the monitor's alarms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beamline.scan.states import State, StateMachine
 from drivers.base.protocols import BeamReading
 
 CLOSING = 20_000_000  # bytes that a file may take to be closed, with its /exchange view
-PAUSE_POLL = 0.05  # real s between looks at a paused scan
+PAUSE_POLL = 0.05  # real s between checks of a paused scan
 
 
 def _wait_in_pause() -> bool:
@@ -27,18 +27,18 @@ def _wait_in_pause() -> bool:
 
 @dataclass(frozen=True)
 class Supervision:
-    """What acquisition asks and tells while it goes on.
+    """Callbacks of the acquisition.
 
     Attributes:
-        refusal: asked once, before the first projection, when all frames before it were taken over: why no projection
-            should be taken; None: they may be.
-        pause: looked at before each frame of a stage that stands, and all the time while it turns.
-        wait_in_pause: called again and again while the scan is paused. It waits a moment, and says whether the operator
-            at the terminal let the scan go on since.
-        states: told what the scan is doing.
+        refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no
+        projection should be taken; None: projections may be taken.
+        pause: checked before each frame of a standing stage, and all the time while it turns.
+        wait_in_pause: called repeatedly while the scan is paused. It waits a moment, and returns whether the operator
+        at the terminal has let the scan go on.
+        states: told the states of the scan.
         wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there
             was beam.
-        retakes: asked once, after the last projection: which to take again; is given the triggers without a frame.
+        retakes: called once, after the last projection, with the triggers without a frame; returns the views to repeat.
     """
 
     refusal: Callable[[], str | None] = lambda: None
@@ -55,7 +55,7 @@ class BeamLimits:
 
     Attributes:
         pause_below: a reading below it pauses the scan.
-        resume_above: readings of at least so much are beam again.
+        resume_above: readings of at least so much mean that the beam is back.
         settle: s for which they must be so, before the scan goes on.
     """
 
@@ -65,18 +65,18 @@ class BeamLimits:
 
 
 class BeamGuard:
-    """Pauses a scan while readings of the beam monitor say that there is too little beam."""
+    """Pauses a scan while the beam monitor reads too little beam."""
 
     def __init__(self, limits: BeamLimits, pause: PauseRequest) -> None:
         self._limits, self._pause = limits, pause
         self._good = -math.inf
         """Time of the last reading with beam."""
         self._back: float | None = None
-        """While paused: since when there is beam again."""
+        """While paused: the time since which the beam is back."""
         self._paused = False
 
     def __call__(self, reading: BeamReading) -> None:
-        """Take note of the next reading, and act."""
+        """Record the next reading, and act."""
         limits = self._limits
         if not self._paused:
             if reading.value >= limits.pause_below:
@@ -108,7 +108,7 @@ class SpaceGuard:
         self._reserve, self._pause = reserve, pause
 
     def __call__(self, free: int, left: int) -> None:
-        """Take note of the bytes that are free, and of those that are still to be written."""
+        """Record the free bytes and the bytes that are still to be written."""
         again = min(2 * self._reserve, left) + CLOSING
         if left and free < min(self._reserve, left) + CLOSING:
             self._pause.hold(
@@ -124,8 +124,8 @@ class SpaceGuard:
 class Workload:
     """Seconds that a recorder's threads have spent, by the clock and of the processor.
 
-    Checking a frame waits for the processor alone. What writing took beyond the same multiple of its own processor
-    time, it waited for the disk.
+    Checking a frame waits only for the processor. Its ratio of clock time to processor time, applied to writing, gives
+    the writing time without the disk; the rest is waiting for the disk.
     """
 
     checking: float = 0.0
@@ -135,31 +135,31 @@ class Workload:
 
     @property
     def disk(self) -> float:
-        """Seconds for which a write waited for the disk."""
+        """Seconds that writes waited for the disk."""
         contended = self.checking / self.checking_cpu if self.checking_cpu > 0 else 1.0
         return max(0.0, self.writing - max(1.0, contended) * self.writing_cpu)
 
     @property
     def behind(self) -> tuple[str, str]:
-        """What the frames wait for, and what would help: the disk where the writes waited longer than checks took."""
+        """The cause of the wait, and a remedy: the disk if the writes waited longer than the checks took."""
         if self.disk > self.checking:
             return "the disk is behind", "a longer period_s or a faster disk"
         return "the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it"
 
 
 class BacklogGuard:
-    """Pauses a fly scan before frames come that find no room, until few wait to be written.
+    """Pauses a fly scan before the queue is full, until few frames wait to be written.
 
     Args:
         room: frames that may wait.
-        work: what the frames before took.
+        work: the time that earlier frames took.
     """
 
     def __init__(self, room: int, pause: PauseRequest, work: Workload) -> None:
         self._room, self._pause, self._work = room, pause, work
 
     def __call__(self, waiting: int) -> None:
-        """Take note of the frames that wait."""
+        """Record the number of waiting frames."""
         if 4 * waiting >= 3 * self._room:
             what, advice = self._work.behind
             self._pause.hold(
@@ -173,7 +173,7 @@ class BacklogGuard:
 
 @dataclass(frozen=True)
 class AlarmPolicy:
-    """What alarms of the monitor do to a scan.
+    """Effects of the monitor's alarms on a scan.
 
     Attributes:
         act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
@@ -192,7 +192,7 @@ class AlarmReaction:
         self._in_a_row: Counter[str] = Counter()
 
     def __call__(self, flags: tuple[Flag, ...]) -> None:
-        """Take note of the flags of the next frame, and act."""
+        """Record the flags of the next frame, and act."""
         alarms = [flag for flag in flags if flag.level is Level.ALARM]
         self._in_a_row = Counter({flag.check: self._in_a_row[flag.check] + 1 for flag in alarms})
         for flag in alarms:

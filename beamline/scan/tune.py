@@ -1,6 +1,6 @@
-"""Tune: a few darks, flats and views at some exposures, and what they say about counts, noise and the exposure to take.
+"""Tune: takes a few darks, flats and views at some exposures, and derives counts, noise and the best exposure.
 
-Noise is told from structure by pairs of frames. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
+Pairs of frames separate noise from structure. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
 ch. 5): variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
 sigma^2 = var(view) / light(view)^2 + var(flat) / (n light(flat)^2), n flats being averaged.
 """
@@ -31,18 +31,18 @@ from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 
 F64 = NDArray[np.float64]
 
-SHORTER = (1.0, 1 / 8, 1 / 64)  # of the configured exposure: one of them does not saturate, unless it is off by 60
-TARGET = 0.8  # of the range for the brightest pixels: room for top-up and drift; more light would gain 1/10 of noise
+SHORTER = (1.0, 1 / 8, 1 / 64)  # of the configured exposure: one does not saturate, unless it is off by 60
+TARGET = 0.8  # share of the range for the brightest pixels: room for top-up and drift; more light gains 1/10 of noise
 BRIGHTEST = 99.9  # percentile of the flat that must not saturate
 DARKEST = 1.0  # percentile of the transmission that is the darkest part
-UNLIT = 0.05  # of the brightest light: pixels with less are beside the beam
+UNLIT = 0.05  # share of the brightest light: pixels with less are beside the beam
 BLOCK = 4  # pixels a side, whose mean has little noise
-ZINGER = 12.0  # times the median change of a pixel from frame to frame, 8 standard deviations: no noise
+ZINGER = 12.0  # times the median change of a pixel from frame to frame, 8 standard deviations: more is not noise
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What the frames say; counts per pixel and frame, exposures in s.
+    """Results of the frames; counts per pixel and frame, exposures in s.
 
     Attributes:
         configured: exposure of the configuration.
@@ -79,11 +79,11 @@ class Tuning:
 
     @property
     def photons(self) -> float:
-        """In a pixel of the flat, at its exposure."""
+        """Photons in a pixel of the flat, at its exposure."""
         return (self.flat - self.dark) / self.gain
 
     def lines(self) -> list[str]:
-        """For a human; the exposure to take comes last."""
+        """Lines of text; the advised exposure comes last."""
         low, middle = self.transmission
         at_low, at_middle = self.noise
         words = [
@@ -145,7 +145,7 @@ def tune(
 def evaluate(
     frames: Sequence[Frame], plan: ScanPlan, saturation: float, longest: float, limits: ReferenceLimits
 ) -> Tuning:
-    """What the frames say: two darks, and two flats and a view at each exposure.
+    """Evaluate the frames: two darks, and two flats and a view at each exposure.
 
     Args:
         longest: exposure in s that may be advised.
@@ -222,7 +222,7 @@ def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLim
 
 
 def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
-    """Mean over pixels, from the difference of two frames; a change of the light as a whole is none, nor a zinger."""
+    """Mean variance over pixels, from the difference of two frames, without zingers and changes of the whole light."""
     one, other = (frame.counts[where].astype(np.float64) for frame in pair[:2])
     change = one - other
     change -= np.median(change)

@@ -3,8 +3,8 @@
 `python -m beamline.scan.watchdog RUN PID` reads its stdin, which the scan holds open as long as it lives, and to which
 it writes a byte each second: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. A
 frozen scan holds the stage's port, so it is killed first. What the scan held is free then: the port, which the watchdog
-opens, and the camera, which stops without its program. A scan that ends by itself kills the watchdog first. Requests to
-end, which a shutdown sends to every process, the watchdog passes over as long as its scan lives.
+opens, and the camera, which stops without its program. A scan that ends by itself kills the watchdog first. As long as
+its scan lives, the watchdog ignores the requests to end that a shutdown sends to every process.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ BETWEEN = 0.5  # s between attempts
 READY_WITHIN = 60.0  # real s
 BEAT = 1.0  # real s between signs of life
 FROZEN = 60.0  # s without one, after which a scan counts as dead
-AGAIN = 3  # watchdogs that are started in the place of others
-ACTED = 70  # exit code of one that has made the instrument safe
+AGAIN = 3  # most watchdogs that are started as replacements
+ACTED = 70  # exit code of a watchdog that has made the instrument safe
 COMMAND = (sys.executable, "-m", "beamline.scan.watchdog")
 INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=beamline", "--why=A scan runs", "cat")
 
@@ -50,13 +50,13 @@ def watched(
     stop: StopRequest | None = None,
     pause: PauseRequest | None = None,
 ) -> Iterator[None]:
-    """A watchdog for the run in this folder as long as the context lasts; a warning where there is none.
+    """A watchdog for the run in this folder as long as the context lasts; a warning if there is none.
 
-    One that ends meanwhile is told and replaced.
+    A watchdog that ends meanwhile is reported and replaced.
 
     Args:
-        stop: is aborted where a watchdog took the scan for dead and acted.
-        pause: is asked for where the last watchdog has ended; None: the scan goes on without one.
+        stop: is aborted if a watchdog took the scan for dead and acted.
+        pause: requested after the last watchdog has ended; None: the scan goes on without one.
     """
     with Path(os.devnull).open("w") as nowhere, inhibited():
         keeper = _Keeper(folder, emit, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
@@ -67,7 +67,7 @@ def watched(
 
 @contextmanager
 def inhibited() -> Iterator[None]:
-    """The system is asked not to shut down or sleep, where there is systemd; nobody waits for its answer."""
+    """Ask systemd, if present, not to shut down or sleep, without waiting for its answer."""
     with ExitStack() as ending:
         if (program := shutil.which(INHIBIT[0])) is not None:
             with suppress(OSError):
@@ -159,12 +159,12 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
 
 
 def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], done: str) -> bool:
-    """Try until it works or PATIENCE is over; whether it worked."""
+    """Try until it works or PATIENCE is over; returns whether it worked."""
     deadline = clock.now() + PATIENCE
     while True:
         try:
             step()
-        except Exception as error:  # whatever it is, the next step must be tried
+        except Exception as error:  # after any error the next step must be tried
             if clock.now() > deadline:
                 say(f"{error} LOOK AT THE INSTRUMENT before anybody goes near the beam.")
                 return False
@@ -189,7 +189,7 @@ class _Life:
 
 
 def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
-    """Wait until the scan is dead; whether it is frozen.
+    """Wait until the scan is dead; returns whether it is frozen.
 
     A step in which this process did nothing either (the computer slept, or was busy with its memory) counts once.
 
@@ -209,7 +209,7 @@ def until_dead(signs: Callable[[], int | None], clock: Clock) -> bool:
 
 
 def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
-    """Wait until the scan is dead, then act, and write down what was done; the exit code.
+    """Wait until the scan is dead, then act, and log the actions; returns the exit code.
 
     Args:
         scan: its process.
@@ -234,7 +234,7 @@ def main(folder: Path, scan: int, source: RawIOBase | BytesIO) -> int:
             f"The process of the scan did nothing for {FROZEN:.0f} s and counts as dead. It is killed to free its port."
         )
         try:
-            psutil.Process(scan).kill()  # it is still that process: the pipe is open
+            psutil.Process(scan).kill()  # the number still belongs to that process: the pipe is open
         except psutil.Error as error:
             say(f"It could not be killed: {error}.")
     else:

@@ -33,7 +33,7 @@ class SegmentOptions:
     """What to segment and how; the steps are those of recon.post.
 
     Attributes:
-        volume, dataset: the file, and the array in it; None: the one of a reconstruction, or the only one.
+        volume, dataset: the file, and the array in it; None: the volume of a reconstruction, or the only array.
         output: HDF5 file of the labels; the table and the picture lie beside it.
         voxel_mm: edge of a voxel where the file does not say it; None: as the file says, or 1 px.
         margin: of the square inside the sample's circle; None: the whole volume.

@@ -1,6 +1,6 @@
-"""archive: a compressed copy of a scan file, equal in everything to the raw one; whole and compared, or not at all.
+"""archive: a compressed copy of a scan file with the same content; complete and compared, or not at all.
 
-The frames lie one a chunk, each compressed by itself; all else is copied as it is. Frames that the raw file draws from
+Each frame is a chunk, compressed by itself; everything else is copied unchanged. Frames that the raw file draws from
 others (a joined scan) become frames of the archive.
 """
 
@@ -34,7 +34,7 @@ _BLOCK = 2**24  # bytes that are compared at once
 
 
 Progress = Callable[[int, int], None]
-"""Is told how many of how many MB are done."""
+"""Gets how many of how many MB are done."""
 CountImage = Callable[[NDArray[Any]], None]
 
 
@@ -57,9 +57,9 @@ class Archived:
 
     Attributes:
         frames: in the file.
-        sources: the raw file, then those that it draws frames from; raw_bytes: of all of them.
+        sources: the raw file, then the files that it draws frames from; raw_bytes: of all of them.
         damaged: rows whose pixels differ from the checksum that was written with them, in the raw file already.
-        altered: rows of the frame log that differ from their checksum; likewise.
+        altered: rows of the frame log that differ from their checksum in the raw file already.
     """
 
     path: Path
@@ -117,7 +117,7 @@ def archive(
 
 
 def _frames_of_archivable(scan: Path) -> tuple[int, tuple[int, ...], str]:
-    """How many frames the scan has, and which are altered, in words, too; DataError where it is not one to archive."""
+    """The number of frames, and the altered ones, in words, too; DataError if the scan cannot be archived."""
     if scan.exists() and not (scan.is_file() and hdf5.is_hdf5(scan)):
         raise DataError(f"{scan} is no HDF5 scan. `beamline ingest` makes one of it. Nothing was written.")
     head = superblock(scan) if scan.is_file() else None
@@ -158,7 +158,7 @@ def _drop_from_cache(path: Path) -> None:
 def _differences(
     raw: h5py.File, file: h5py.File, checksums: Mapping[str, list[int]], count_image: CountImage
 ) -> Iterator[str]:
-    """What the two files do not have in common: images by their checksums, other datasets by their values."""
+    """The differences of the two files: images by their checksums, other datasets by their values."""
     for path, expected in checksums.items():
         for row, (image, checksum) in enumerate(zip(_images(file[path]), expected, strict=True)):
             count_image(image)
@@ -219,7 +219,7 @@ class _CompressedCopy:
         self.damaged = set[int]()
 
     def group(self, source: h5py.Group, target: h5py.Group) -> None:
-        """All that is in a group; what has several names in the raw file has them in the copy."""
+        """Copy a group; an object with several names in the raw file keeps them in the copy."""
         self._paths[_place(source)] = target.name
         hdf5.copy_attributes(source, target)
         for name in source:
@@ -259,8 +259,8 @@ class _CompressedCopy:
 def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
     """Every dataset of images, once.
 
-    DataError where something would not be in a copy: values in another file, other than frames, and references between
-    objects, which are places in this one.
+    DataError for content that a copy would lack: values in another file, other than frames, and references between
+    objects, which are places in this file.
     """
     names: list[str] = []
     raw.visit_links(names.append)  # an error within a visit would end h5py
@@ -286,7 +286,7 @@ def _image_datasets(raw: h5py.File) -> list[h5py.Dataset]:
 
 
 def _is_image_dataset(item: h5py.HLObject) -> bool:
-    """It holds images, and not those of another dataset of its file."""
+    """Whether it holds images of its own, not those of another dataset of its file."""
     if not isinstance(item, h5py.Dataset) or item.shape is None or item.ndim != 3 or item.dtype.kind not in "iuf":
         return False
     if item.is_virtual:

@@ -1,4 +1,4 @@
-"""Codecs: the lossless compressors of archived scans, by name; apart from HDF5, so that a command's help loads none."""
+"""Codecs: the lossless compressors of archived scans, by name; without HDF5, so that a command's help loads quickly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""describe: what a scan or a volume is, in plain values; `beamline info` prints them."""
+"""describe: the facts of a scan or a volume as plain values; `beamline info` prints them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from drivers.base.frame import FrameKind
 
 
 def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
-    """Describe a scan or a volume. DataError where it cannot be opened."""
+    """Describe a scan or a volume. DataError if it cannot be opened."""
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
     if (kind := volume_format(path)) is not None:
         with kind.open(path) as record:

@@ -1,4 +1,4 @@
-"""Files under HDF5, for its driver `fileobj`: DiskFile, to write; GrowingFile, to read beside who writes it."""
+"""Files under HDF5, for its driver `fileobj`: DiskFile, to write; GrowingFile, to read beside its writer."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _ENDLESS = 2**60  # bytes, more than any file grows to
 
 
 class UnderHdf5:
-    """What HDF5 asks of a file that it reads: where it is in it, how long it is, and its bytes.
+    """The interface of a file for HDF5 to read: position, length, bytes.
 
-    HDF5 shares nothing between two of these, whatever file they are of.
+    HDF5 shares nothing between two of these, even for the same file.
     """
 
     def __init__(self, path: Path, mode: str, length: int = 0) -> None:
@@ -77,7 +77,7 @@ class UnderHdf5:
 
 
 class GrowingFile(UnderHdf5):
-    """A file of ours that a program writes, as if it were closed: what HDF5 refreshes, it finds as it is by then."""
+    """A file that a program of ours is writing, as if it were closed: a refresh by HDF5 finds its present state."""
 
     def __init__(self, path: Path, head: Superblock) -> None:
         super().__init__(path, "r", _ENDLESS)
@@ -92,9 +92,9 @@ class GrowingFile(UnderHdf5):
 class DiskFile(UnderHdf5):
     """A file that h5py writes to.
 
-    HDF5 holds chunks and metadata back and writes them when an object goes, where h5py cannot raise; and it may crash
-    once a write has failed. So no method that HDF5 calls fails: the first error waits for `require_taken`, and nothing
-    more is written. Until HDF5 has closed the file, it reads later writes from memory.
+    HDF5 holds chunks and metadata back and writes them when an object closes, where h5py cannot raise. It may crash
+    after a failed write. So no method called by HDF5 fails: the first error waits for `require_taken`, and nothing
+    further is written. Until HDF5 has closed the file, it reads later writes from memory.
     """
 
     def __init__(self, path: Path, mode: Literal["x", "r+"]) -> None:
@@ -139,11 +139,11 @@ class DiskFile(UnderHdf5):
         return size
 
     def keep(self, error: BaseException) -> None:
-        """Have it raised by `require_taken`, unless there was one before it."""
+        """Keep an error for `require_taken`, unless there is an earlier one."""
         self._error = self._error or error
 
     def require_taken(self) -> None:
-        """Raise what went wrong so far: OSError where the disk refused."""
+        """Raise the first error so far: OSError if the disk refused."""
         error = self._error
         if isinstance(error, OSError):  # HDF5's own have no number
             raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(self.path)) from error

@@ -42,7 +42,7 @@ class FlagBit:
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """What a row of a scan file says of the flags of its frame.
+    """The flags of a frame in its row of a scan file.
 
     Attributes:
         bits: as `beamline.monitor.checks.bitmask` makes them.
@@ -104,7 +104,7 @@ class FrameFlags:
 
     @classmethod
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """[row] what the checks found in each frame of a file; a flag that holds for rows before its own marks them."""
+        """[row] the findings of the checks in each frame of a file; a flag that holds for earlier rows marks them."""
         flags = cls.of_marks([mark_of(each) for each in found])
         for flag in chain.from_iterable(found):
             rows = flag.frames
@@ -112,7 +112,7 @@ class FrameFlags:
         return flags
 
     def mark(self, frame: int) -> Mark:
-        """The row of a frame as today's checks would write it; a check that is no more is left out."""
+        """The row of a frame as today's checks would write it, without checks that do not exist now."""
         mark = Mark(0, UNMARKED.scores.copy(), UNMARKED.regions.copy())
         bits, row = 0, int(self.bits[frame])
         for i, entry in enumerate(self.legend):
@@ -124,7 +124,7 @@ class FrameFlags:
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
-        """The same by today's checks; a check that is no more is left out."""
+        """The same by today's checks, without checks that do not exist now."""
         return FrameFlags.of_marks([self.mark(frame) for frame in range(self.bits.size)])
 
     @property

@@ -47,17 +47,17 @@ _FRAMES, _PIXELS = 10**7, 2**31  # far beyond any scan and detector
 
 
 class NotReadyError(DataError):
-    """The file is just being created: nothing is wrong with it, try again."""
+    """The file is just being created. This is not a fault: try again."""
 
 
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
     HDF5 shares a file within a program. A reader beside the writer would see half of the file, and write to it at the
-    end. Two followers of one file would both read wrong values. So such a file is opened apart from HDF5's own.
+    end. Two followers of one file would both read wrong values. So such a file gets a handle of its own.
 
-    Raises DataError where it is no readable HDF5 file, or draws on what is no file (see storage.structure),
-    NotReadyError where it may become one (`follow`).
+    Raises DataError if it is not a readable HDF5 file, or draws on a path that is not a file (see storage.structure).
+    NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
         raise (NotReadyError if follow else DataError)(f"{path} is not there.")
@@ -124,9 +124,9 @@ def _apart(path: Path, follow: bool) -> h5py.File:
 
 
 def look_again(item: h5py.Dataset) -> None:
-    """Have a dataset read as it is by now, where its file grows.
+    """Refresh a dataset of a growing file.
 
-    HDF5 2.0 reads wrong values where a dataset is refreshed that is open twice, as one of a file that has ended may be.
+    HDF5 2.0 reads wrong values after a refresh of a dataset that is open twice, as one of an ended file may be.
     """
     plist = item.file.id.get_access_plist()
     if item.file.id.get_intent() != h5py.h5f.ACC_RDONLY or plist.get_driver() == h5py.h5fd.fileobj_driver:
@@ -155,7 +155,7 @@ ALTERED = (OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeE
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """What h5py raises in the block is a DataError: the file is damaged, or altered by something else."""
+    """Turn h5py's errors in the block into a DataError: the file is damaged, or altered by another program."""
     try:
         yield
     except ALTERED as error:
@@ -168,17 +168,17 @@ def readable(path: Path) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """Why the disk or the system did not do it, in its own words; HDF5 wraps them in addresses and offsets."""
+    """The reason of the disk or the system, in its own words, without HDF5's addresses and offsets."""
     said = re.search(r"error message = '([^']*)'", str(error))
     return said[1] if said else (isinstance(error, OSError) and error.strerror) or str(error)
 
 
 def never_close(file: h5py.File) -> None:
-    """Keep a file open until the process ends, so that HDF5 changes nothing more on the disk.
+    """Keep a file open until the process ends, so that HDF5 does not change it further.
 
-    For a file that the disk did not take: to close it would write that once more, with a traceback for each object. It
-    may leave the file marked so that nobody can open it. HDF5 closes it all the same when the process ends, and crashes
-    where the disk still fails: its handle leads to memory then.
+    For a file that the disk did not take. Closing it would repeat the writes, with a traceback for each object, and may
+    leave the file marked so that nobody can open it. HDF5 still closes it at the end of the process, and crashes if the
+    disk fails: its handle then leads to memory.
     """
     for item in h5py.h5f.get_obj_ids(file.id, h5py.h5f.OBJ_ALL):
         item.locked = True  # each is a reference of its own to the object, which is now never given back
@@ -201,7 +201,7 @@ class NewFile(h5py.File):  # type: ignore[misc]  # h5py has no types
     def __init__(self, disk: DiskFile, mode: str, libver: str | tuple[str, str] | None = None) -> None:
         super().__init__(disk, mode, libver=libver)
         self.require_taken = disk.require_taken
-        """Raises OSError where the disk did not take something: ask it now and then while much is written."""
+        """Raises OSError if the disk did not take something; call it now and then during long writes."""
 
 
 @contextmanager
@@ -209,7 +209,7 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Iterator
     """A new file. At the end of the block it is on the disk, and was read back and compared with what was written.
 
     Raises:
-        OSError: the disk did not take it, or holds something else, whenever that was; the file is closed and stays.
+        OSError: the disk refused the bytes or holds others; the file is closed and stays.
     """
     with _written(path, "x", libver) as file:
         yield file
@@ -231,7 +231,7 @@ def _written(path: Path, mode: Literal["x", "r+"], libver: str | tuple[str, str]
             disk.finish()
         except Exception as error:
             disk.require_taken()  # the cause, where the disk is
-            if isinstance(error, OSError | RuntimeError):  # what h5py makes of HDF5's errors
+            if isinstance(error, OSError | RuntimeError):  # h5py's classes for HDF5's errors
                 number = error.errno if isinstance(error, OSError) and error.errno else errno.EIO
                 raise OSError(number, reason(error), str(path)) from error
             raise
@@ -263,12 +263,12 @@ def text(value: Any) -> str:
 
 
 def attribute(item: h5py.HLObject, name: str) -> str:
-    """An attribute as text; "" where there is none."""
+    """An attribute as text; "" if it is missing."""
     return text(item.attrs[name]) if name in item.attrs else ""
 
 
 def resolve(group: h5py.Group, path: str) -> Any | None:
-    """What a path leads to; None where it leads nowhere, by a link to a file that is not there, or in a circle."""
+    """The object at a path; None without one, as after a link to a missing file, or in a circle of links."""
     try:
         return group[path]
     except (KeyError, OSError, RuntimeError):
@@ -276,7 +276,7 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
 
 
 def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
-    """The dataset at a path; None where there is none, or one that can hold nothing (a null dataspace).
+    """The dataset at a path; None if it is missing or can hold nothing (a null dataspace).
 
     Raises:
         DataError: a list longer than any scan.
@@ -290,7 +290,7 @@ def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """A number in our unit; None where it is absent, not finite, or in a unit (or none) that we do not know."""
+    """A number in our unit; None if it is absent, not finite, or in an unknown or missing unit."""
     item = dataset(group, path)
     factor = None if item is None else units.get(attribute(item, "units").lower())
     if item is None or factor is None or item.size == 0 or item.dtype.kind not in "uif":
@@ -300,7 +300,7 @@ def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | 
 
 
 def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians by the `units` attribute, or by `default` where there is none; a column of them is a list."""
+    """Angles in radians by the `units` attribute, or by `default` if it is missing; a column becomes a list."""
     unit = attribute(item, "units") or default
     factor = ANGLE_UNITS.get(unit.lower())
     if factor is None:
@@ -328,8 +328,8 @@ def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
 def missing_links(item: h5py.Dataset, within: int = 4) -> list[str]:
     """Files, and datasets of its own file, that a virtual dataset draws on and that cannot be read, or differ in shape.
 
-    HDF5 gives fill values without a word for what is in another file, and crashes or reads for ever for what is in its
-    own. Sources that are virtual, too, are followed `within` so many files.
+    For such sources HDF5 silently gives fill values (in another file), or crashes or reads for ever (in its own file).
+    Virtual sources are followed through `within` files at most.
     """
     if not item.is_virtual:
         return []
@@ -400,6 +400,6 @@ _SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "t
 
 
 def require_real(dtype: np.dtype[Any], what: str) -> None:
-    """DataError where pixels, keys or angles are text, complex, or anything else that is no real number."""
+    """DataError if pixels, keys or angles are not real numbers, such as text or complex numbers."""
     if dtype.kind not in "uif":
         raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")

@@ -2,7 +2,7 @@
 
 Integer frames become an NXtomo. Float frames (the lab's float32 stacks) cannot: NXtomo's data are integers, and a
 rounding would lose what was measured. They keep their type, at the same paths, under the definition
-`splatline_float_projections`, so that nobody takes them for counts; open_scan reads both.
+`splatline_float_projections`, so that they do not count as counts; open_scan reads both.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def _copy(
 
 
 def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
-    """Pixels and what is known of each frame; a scan of ours (also one whose writer died) keeps its log."""
+    """Pixels and metadata of each frame; a scan of ours (even if its writer died) keeps its log."""
     flags = source.flags
     if source.dtype == np.uint16:
         for i, frame in enumerate(source.frames()):

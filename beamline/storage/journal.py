@@ -1,8 +1,8 @@
-"""A journal: changes to a file in its place happen whole, whatever is killed or fails meanwhile.
+"""Journal: changes an existing file completely or not at all, whatever is killed or fails meanwhile.
 
-They are written beside the file first, then to it. Where a journal lies beside a file, its changes were begun: `finish`
-ends them, and readers see the file as it shall be. First comes what makes the file longer, then what changes in it. So
-a disk without room is found out while the file is as it was; overwriting bytes takes no room.
+Changes are written beside the file first, then to it. A journal beside a file means that its changes have begun:
+`finish` completes them, and readers see the finished file. Bytes beyond the present end are written first, then the
+others. So a full disk is found while the file is unchanged; overwriting bytes takes no room.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class FileChange:
     new: bytes
 
     def fits(self, now: bytes) -> bool:
-        """The file has the old bytes, the new ones, or was stopped between."""
+        """Whether the file has the old bytes, the new ones, or a mixture after an interruption."""
         return len(now) == len(self.old) and all(byte in pair for byte, *pair in zip(now, self.old, self.new))  # noqa: B905
 
 
@@ -47,7 +47,7 @@ class FileChanges:
 
     @property
     def room(self) -> int:
-        """Bytes that its disk must have free: for the journal, and for what makes the file longer."""
+        """Required free bytes on its disk: for the journal, and for the growth of the file."""
         longer = max(0, self.length - self.path.stat().st_size)
         return sum(-(-n // _BLOCK) * _BLOCK for n in (len(_journal(self)), longer))
 
@@ -85,7 +85,7 @@ def journal_of(path: Path) -> Path:
 
 
 def pending(path: Path) -> FileChanges | None:
-    """The changes of a file that were begun and not ended; None: there are none.
+    """The unfinished changes of a file; None: there are none.
 
     Raises:
         DataError: their journal is damaged, or of another file.
@@ -151,7 +151,7 @@ def _apply(changes: FileChanges, journal: Path) -> None:
 
 
 def _now(changes: FileChanges) -> list[tuple[FileChange, bytes]]:
-    """What the file has in place of the old bytes."""
+    """The present bytes of the file at the place of the old ones."""
     with changes.path.open("rb", buffering=0) as file:
         return [(change, _get(file, change.at, len(change.old))) for change in changes.ranges]
 

@@ -1,4 +1,4 @@
-"""Overlay: a file as HDF5 is to see it, with what HDF5 writes kept in memory and the disk untouched."""
+"""Overlay: a file for HDF5 whose writes stay in memory; the disk does not change."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piec
 
 
 class Overlay(UnderHdf5):
-    """Bytes of a file under those that were written since, for h5py.File(overlay).
+    """Bytes of a file, covered by later writes in memory, for h5py.File(overlay).
 
     Args:
-        changes: what the file shall have.
-        length: bytes of the file, where this is more than there are: the rest is zero.
+        changes: bytes that replace the file's.
+        length: of the file in bytes; bytes beyond its end are zero.
     """
 
     def __init__(self, path: Path, changes: Sequence[FileChange] = (), length: int = 0) -> None:
@@ -58,7 +58,7 @@ class Overlay(UnderHdf5):
         return self._size
 
     def changes(self) -> FileChanges:
-        """What was written and differs from what the disk has; never less than there is."""
+        """Written bytes that differ from the disk's; the file never becomes shorter."""
         ranges = []
         for page in sorted(self._pages):
             begin, old, new = page * _PAGE, self._on_disk(page), self._pages[page]

@@ -2,8 +2,8 @@
 
 The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
 holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
-records name, number of frames and digest of each part, so that a reader finds out whether these still are all of its
-parts.
+records name, number of frames and digest of each part, so that a reader can check that it has all parts,
+unchanged.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_in(file: h5py.File) -> frozenset[int]:
-    """The views of the plan that a file holds, counted from 0: not those whose frame became invalid, or whose record
-    is not what was written.
+    """The views of the plan that a file holds, counted from 0. Not those whose frame became invalid, or whose record
+    differs from its checksum.
 
     Raises:
         ValueError: a row is said to replace one after it.
@@ -56,13 +56,13 @@ def views_in(file: h5py.File) -> frozenset[int]:
 
 
 def views_planned(file: h5py.File) -> int | None:
-    """How many views the scan has when it is whole; None where the file does not hold its plan."""
+    """Number of planned views of the scan; None if the file does not hold its plan."""
     angles = json.loads(file["/entry/record/plan"].asstr()[()]).get("angles_deg")
     return None if angles is None else len(angles)
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references that the plan has after the views and that files of a scan lack in part.
+    """Kinds of references planned after the views that the files of a scan lack, wholly or in part.
 
     Args:
         files: all of the scan, in the order that they were taken in.
@@ -72,7 +72,7 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
 
 
 def _planned_after_views(file: h5py.File) -> dict[FrameKind, int]:
-    """How many references the plan has after the views, in the order that they are taken in."""
+    """Numbers of references planned after the views, in the order of acquisition."""
     plan = json.loads(file["/entry/record/plan"].asstr()[()])
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
     return {kind: int(field["count"]) for kind, field in fields.items() if field.get("at") in ("end", "both")}
@@ -94,13 +94,13 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
 
 
 def join(parts: Sequence[Path], joined: Path) -> int:
-    """Make, or make again, the file that has the frames of all parts, in this order. Returns how many these are.
+    """Make, or make again, the file with the frames of all parts, in this order. Returns their number.
 
     Args:
         parts: closed files of one scan, each with a frame at least. They are only read.
 
     Raises:
-        DataError: one cannot be read or was not closed, or the disk does not take the file: what was there stays.
+        DataError: a part cannot be read or was not closed, or the disk does not take the file; the old file then stays.
     """
     for part in parts:  # HDF5 draws nothing from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
@@ -124,9 +124,9 @@ def other_parts(part: Path) -> list[Path]:
 
 
 def may_hold_frames(part: Path) -> bool:
-    """Whether the file of a part has a frame, or cannot be read and its events (which may lack the last ones) name one.
+    """Whether a part may have frames: its file has one, or is unreadable and its events (perhaps not all) name one.
 
-    A part that ended before its first frame is none.
+    A part that ended before its first frame does not count.
     """
     if not part.is_file():
         return False
@@ -156,9 +156,9 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
 
 
 def require_joined(file: h5py.File) -> None:
-    """DataError where a joined file draws frames from parts that are not those it was made of, or lacks one of them.
+    """DataError if a joined file draws frames from changed parts, or lacks a part.
 
-    Nothing is asked of a file that holds its frames itself, such as an archived one.
+    A file with frames of its own, such as an archived one, always passes.
     """
     if layout.PART_STARTS not in file or not file[layout.DATA].is_virtual:
         return
@@ -171,7 +171,7 @@ def require_joined(file: h5py.File) -> None:
 
 
 def is_joined(joined: Path) -> bool:
-    """Whether this file is there and has the frames of all parts of its scan."""
+    """Whether this file exists and has the frames of all parts of its scan."""
     try:
         with hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
             require_joined(file)
@@ -197,7 +197,7 @@ def _disagreement(joined: h5py.File, folder: Path) -> str:
 
 
 def _digest(part: h5py.File) -> str:
-    """SHA-256 of what the file says of its frames: kind, angle, time, ..., and the checksum of their pixels."""
+    """SHA-256 of the records of the frames: kind, angle, time, ..., and the checksum of their pixels."""
     n, found = int(part[layout.COMMITTED][()]), hashlib.sha256()
     for path in layout.COLUMNS:
         found.update(part[path][:n].tobytes())
@@ -246,7 +246,7 @@ def _name_parts(files: Sequence[h5py.File], names: Sequence[str], rows: Sequence
 
 
 def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]]) -> None:
-    """Copy a group, with these values for the datasets named; without what is virtual, made anew, or a link."""
+    """Copy a group, with these values for the named datasets; without virtual datasets, new ones, and links."""
     hdf5.copy_attributes(source, target)
     for name, item in source.items():
         path = f"{source.name.rstrip('/')}/{name}"
@@ -261,7 +261,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
 
 
 def _links(file: h5py.File) -> list[tuple[str, str]]:
-    """Paths of links, and what they lead to."""
+    """Paths of links, and their targets."""
     data = file["/entry/data"]
     return [(f"/entry/data/{name}", target) for name, item in data.items() if (target := _target(item))]
 

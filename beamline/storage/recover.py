@@ -37,17 +37,17 @@ COMPARED = 2**31  # bytes of the last frames: more than a machine that loses pow
 
 @dataclass(frozen=True)
 class Recovered:
-    """What became of a file.
+    """The result for a file.
 
     Attributes:
-        changed: it was not in order before.
+        changed: whether the file was changed.
         frames: committed, and kept.
         dropped: frames at the end that were not committed when the writer died, and are cut off.
         missing: views that were planned and not taken; None where the file does not hold its plan.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames, of the last 2 GB, that differ from their checksum; they are kept.
         altered: frames whose row in the log differs from its checksum; likewise kept.
-        remark: what could not be done though the frames are in order; "" where all was done.
+        remark: a step that failed although the frames are in order; "" if none failed.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class Recovered:
     remark: str = ""
 
     def said(self) -> str:
-        """A line for people."""
+        """The result as one line of text."""
         wrong = f"; what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"
@@ -202,7 +202,7 @@ def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
 
 
 def _read(file: h5py.File) -> None:
-    """All that is in the file but its pixels: what HDF5 raises then is raised now."""
+    """Read all of the file except its pixels, so that HDF5's errors come now."""
     names: list[str] = []
     file.visit(names.append)
     for item in (file[name] for name in names):

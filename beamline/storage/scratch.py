@@ -1,4 +1,4 @@
-"""Scratch arrays: in a file without a name, so that nothing of them stays, whatever ends the process."""
+"""Scratch arrays: in a file without a name, which vanishes however the process ends."""
 
 from __future__ import annotations
 

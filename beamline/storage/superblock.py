@@ -1,4 +1,4 @@
-"""The first 48 bytes of an HDF5 file: whether it is being written, what it lacks, and how it would be if closed.
+"""The first 48 bytes of an HDF5 file: whether it is being written, missing bytes, and the same bytes if closed.
 
 Superblocks of versions 2 and 3 at the beginning of the file (HDF5 file format specification 3.0, II.A). Fields:
 signature 8, version 1, sizes 2, flags 1, base address 8, extension 8, end of file 8, root group 8, checksum 4 bytes,
@@ -19,7 +19,7 @@ _WORD = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Superblock:
-    """What the head of a file says.
+    """The fields of a file's head.
 
     Attributes:
         head: its bytes.
@@ -31,22 +31,22 @@ class Superblock:
 
     @property
     def open_for_writing(self) -> bool:
-        """A program is writing the file, or died while it did."""
+        """Whether a program is writing the file, or died while writing."""
         return self.head[_FLAGS] != 0
 
     @property
     def grows(self) -> bool:
-        """It is being written so that others may read it meanwhile (SWMR)."""
+        """Whether it is being written in a way that others may read it meanwhile (SWMR)."""
         return bool(self.head[_FLAGS] & _GROWS)
 
     @property
     def missing(self) -> int:
-        """Bytes that the file has less than its head says."""
+        """Bytes missing at the end of the file, by its head."""
         return max(0, self.end - self.size)
 
     @property
     def intact(self) -> bool:
-        """Its checksum is right."""
+        """Whether its checksum is right."""
         return self.head[_CHECKSUM] == _checksum(self.head[: _CHECKSUM.start])
 
     @property

@@ -56,7 +56,7 @@ def read_volume(
         return _from_numpy(path, dataset)
     except DataError:
         raise
-    except Exception as error:  # the readers of other people's files raise what they stumble over where one is damaged
+    except Exception as error:  # readers of foreign files raise various errors if a file is damaged
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error}).") from error
 
 
@@ -77,7 +77,7 @@ def _from_tiff(path: Path) -> NDArray[np.generic]:
 
 
 def _check_size(path: Path, n: int) -> None:
-    """Raises DataError where n bytes are more than there are: a damaged file claims anything."""
+    """Raises DataError if n bytes exceed the free memory: a damaged file may claim any size."""
     free = free_memory()
     if n > free:
         raise DataError(

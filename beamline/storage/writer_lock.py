@@ -1,4 +1,4 @@
-"""The lock that a program holds on the file that it writes: however long it is silent, nobody takes it for dead.
+"""The lock of a program on the file that it writes, so that a long silence does not count as its death.
 
 The system gives the lock back when the program ends, however it ends. HDF5 has none while a file can be followed.
 """

@@ -99,7 +99,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     """Run all rows and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every row. After Ctrl-C the table is `stopped`. A folder without results is removed. The
-    views lie in a file of the folder while the study runs; the memory holds those of one row.
+    views lie in a file of the folder while the study runs; the memory holds the views of one row.
 
     Raises:
         ConfigError, DataError: nothing was written, or the table of the rows that were done.
@@ -202,7 +202,7 @@ class _Rig:
     def reconstructed(
         self, row: StudyRow, method: str, settings: Mapping[str, Plain] | None = None
     ) -> tuple[F32 | None, Outcome]:
-        """The volume of a row, by `settings` instead of those of the method; None where the method failed."""
+        """The volume of a row, by `settings` instead of the method's own; None if the method failed."""
         assert row.groups is not None
         # Opened here and closed with the return: Windows removes no file that is open.
         data, angles = averaged(np.load(self.work / "views.npy", mmap_mode="r"), self.geometry.angles, row.groups)

@@ -19,7 +19,7 @@ EQUAL_COUNTS = 120, 60
 DISJOINT_DEG = 1.0, 2.0, 3.0
 OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
 OVERLAPPING = 180
-"""Windows that overlap, whatever their width."""
+"""Number of overlapping windows of each width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def averaged(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """The views of a row: line integrals [view, row, col] and their mean angles [view].
 
-    A longer exposure adds light, so the mean is that of the transmissions, -log(mean(exp(-p))), not of the logarithms.
+    A longer exposure adds light, so the transmissions are averaged, -log(mean(exp(-p))), not the logarithms.
 
     Args:
         projections, angles: of the scan.

@@ -32,7 +32,7 @@ def compile_kernels(trials: Sequence[Trial], work: Path) -> None:
 
 
 def _kernels(trial: Trial) -> tuple[str, ...]:
-    """What decides which kernels a trial compiles: its method, and those of its settings that are words."""
+    """A trial's method and its settings that are words: they decide which kernels it compiles."""
     return trial.method, *(value for value in trial.settings.values() if isinstance(value, str))
 
 

@@ -148,7 +148,7 @@ def to_csv(table: TrialTable) -> str:
 
 
 def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
-    """Write the pictures, as far as there are data for them, and the page; `slices` of each baseline, and the truth."""
+    """Write the page, and the pictures that have data; `slices` are of each baseline and of the truth."""
     pictures = []
     for cost in (TIME, MEMORY):
         if table.front(cost):

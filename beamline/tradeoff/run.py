@@ -33,7 +33,7 @@ from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting.initialise import default_count
 
-_HELD_OUT_ONE_IN = 8  # one of so many views is held out if there is no truth
+_HELD_OUT_ONE_IN = 8  # without a truth, one view in this many is held out
 _HELD_OUT_VIEWS = 16  # at most
 
 
@@ -148,7 +148,7 @@ def _each(
     clock: Clock,
     now: Callable[[], float],
 ) -> Iterator[TrialTable]:
-    """The table after each trial, and after one that Ctrl-C interrupted; `slices` take those of the baselines."""
+    """The table after each trial, and after one that Ctrl-C interrupted; `slices` gets the slices of the baselines."""
     begin = now()
     timed: list[Timed] = []
     for index, outcome in enumerate(table.outcomes):

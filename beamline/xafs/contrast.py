@@ -49,7 +49,7 @@ class XafsCurve:
 
     Attributes:
         energies: keV, rising, [n].
-        absorption: [n], of the region less that of its surroundings, in `unit`.
+        absorption: [n], of the region minus that of its surroundings, in `unit`.
         contrast: the same as a line integral, [n]; None where only the absorption is known.
         noise: rms noise of the difference of a pixel inside and one around, as a line integral, [n]; None likewise, and
             where the regions are too small.
@@ -68,8 +68,8 @@ class XafsCurve:
     def contrast_to_noise(self) -> Reals | None:
         """|contrast| over noise, [n]; None where either is unknown or the noise is 0.
 
-        The noise of a few hundred pixels is known to 5 % only, as much as it differs between energies: it is smoothed
-        over neighbouring ones.
+        Noise of a few hundred pixels is known to 5 %, and differs as much between energies: it is smoothed
+        over neighbouring energies.
         """
         if self.contrast is None or self.noise is None or not (self.noise > 0).all():
             return None

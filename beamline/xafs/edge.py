@@ -27,9 +27,9 @@ class AbsorptionEdge:
 
     Attributes:
         found: there is an edge within the range.
-        reason: why there is none, as a sentence.
+        reason: why no edge was found, as a sentence.
         energy: keV of the steepest rise; None where no edge is found.
-        white_line: keV of the top above it; None where there is none, or it is not within the range.
+        white_line: keV of the maximum above the edge; None without a maximum within the range.
         misfit: rms difference from the best smooth curve, in units of the absorption.
         noise: rms noise of the curve, likewise.
     """

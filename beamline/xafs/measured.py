@@ -123,7 +123,7 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve
 
 
 def _bounds(mask: NDArray[np.bool_]) -> FramePart:
-    """The rows and columns of the mask and its neighbouring pixels: no more of a frame is read."""
+    """The rows and columns of the mask and its neighbouring pixels: only these are read from a frame."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     return slice(max(int(rows[0]) - 1, 0), int(rows[-1]) + 2), slice(max(int(cols[0]) - 1, 0), int(cols[-1]) + 2)
 

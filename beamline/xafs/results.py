@@ -142,7 +142,7 @@ def table_beside(target: Path) -> Path:
 
 
 def refuse_existing_results(target: Path) -> None:
-    """Raises DataError where picture or table exists, or there is no folder for them."""
+    """Raises DataError if the picture or the table exists already, or if their folder does not exist."""
     for path in (target, table_beside(target)):
         refuse_existing(path)
 

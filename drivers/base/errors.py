@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class DeviceError(Exception):
-    """A device did not do what it was asked.
+    """A device did not obey a request.
 
     The message is one readable paragraph; its parts are attributes.
 

@@ -29,10 +29,10 @@ class Frame:
         index: row in the file, counted over all frames of the scan from 0.
         trigger: index of the trigger pulse that exposed it, counted within its block of frames from 0.
         framestamp: the camera's own counter, -1 without one.
-        angle: radians, the stage position at the trigger; NaN where the position does not matter (a dark).
+        angle: radians, the stage position at the trigger; NaN if the position does not matter (a dark).
         time: s since the Unix epoch, at the trigger.
         exposure: s.
-        replaces: row of the view that this one was taken again for; -1: none.
+        replaces: row of the view that this one repeats; -1: none.
     """
 
     counts: NDArray[np.uint16]

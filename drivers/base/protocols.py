@@ -1,4 +1,4 @@
-"""Device Protocols: what acquisition asks of stage, camera, shutter, sample mover and beam monitor, in rad and s."""
+"""Device Protocols: the interfaces of stage, camera, shutter, sample mover and beam monitor, in rad and s."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class StageLimits:
-    """What a stage can do.
+    """The limits of a stage.
 
     Attributes:
         counts_per_turn: encoder counts (or motor pulses) for 2π; triggers fall on whole counts.
@@ -22,7 +22,7 @@ class StageLimits:
         trigger_output: it can emit position-synchronised trigger pulses.
         run_up: intervals of a train before its first pulse within which the stage cannot be armed.
         pulse_spacing: s that the pulses of a train must be apart at `max_speed`.
-        interval_unit: counts; intervals of trains must be multiples of it (2 where each fire toggles the output).
+        interval_unit: counts; intervals of trains must be multiples of it (2 if each fire toggles the output).
     """
 
     counts_per_turn: int
@@ -55,14 +55,14 @@ class TriggerTrain:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """What the controller says of itself now.
+    """The present state of the controller.
 
     Attributes:
-        counts: where it stands or passes, in whole encoder counts (motor pulses).
+        counts: its present place, in whole encoder counts (motor pulses).
         moving: it has not come to rest.
-        homed: its counts are those of the reference; None where this controller cannot tell.
-        fault: why the last move ended early, or a fault that stands, in words; "" where there is none.
-        held: count at which a servo holds it after a move that arrived, which may be beside `counts`. None elsewhere.
+        homed: its counts refer to the reference; None if this controller cannot tell.
+        fault: why the last move ended early, or a standing fault, in words; "" without one.
+        held: count at which a servo holds it after a completed move; it may differ from `counts`. None otherwise.
     """
 
     counts: int
@@ -91,7 +91,7 @@ class Motion(Protocol):
         ...
 
     def status(self) -> StageStatus:
-        """What the controller says now; DeviceError where it says nothing that can be understood."""
+        """The present state; DeviceError if the reply cannot be understood."""
         ...
 
     def start_move(self, angle: float, speed: float) -> None:
@@ -122,7 +122,7 @@ class Motion(Protocol):
 
 
 class TriggerOutput(Protocol):
-    """Position-synchronised pulses from whatever turns the sample."""
+    """Position-synchronised pulses of the device that turns the sample."""
 
     def arm(self, train: TriggerTrain) -> None:
         """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
@@ -131,7 +131,7 @@ class TriggerOutput(Protocol):
     def disarm(self) -> None: ...
 
     def remaining_pulses(self) -> int | None:
-        """Pulses of the armed train still to come, 0 where none is armed; None where the controller does not tell."""
+        """Pulses of the armed train still to come, 0 if none is armed; None if the controller does not tell."""
         ...
 
 
@@ -156,7 +156,7 @@ class RotationStage(Motion, TriggerOutput, Protocol):
         """Another output of the stage's controller, such as one that opens a shutter.
 
         Raises:
-            DeviceRefused: the controller has none that can be set, or it is the one of the trigger pulses.
+            DeviceRefused: the controller has no output to set, or this output gives the trigger pulses.
         """
         ...
 
@@ -175,7 +175,7 @@ class TriggerSource(StrEnum):
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """What is asked of a camera, and (as the return value of configure) what it accepted.
+    """Requested settings of a camera; as the return value of `configure`, the accepted ones.
 
     Attributes:
         exposure: s.
@@ -194,11 +194,11 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """What the camera says about its present settings; read, never computed by the caller.
+    """The camera's timing with its present settings; read from it, never computed by the caller.
 
     Attributes:
-        shape: (rows, cols) of the frames that will come.
-        min_period: s between triggers below which pulses are ignored.
+        shape: (rows, cols) of the next frames.
+        min_period: least s between triggers; earlier pulses are ignored.
         readout: s for a full frame.
         row_period: s by which each row starts later than the one above (rolling shutter); 0 for a global one.
         bits: of a count; saturation is 2**bits - 1.
@@ -213,7 +213,7 @@ class CameraTiming:
 
 @dataclass(frozen=True, eq=False)
 class CameraFrame:
-    """What a camera gives: pixels, its own frame counter (from 0 at arm), and the time of the trigger in s."""
+    """A frame from a camera: pixels, its own frame counter (from 0 at arm), and the time of the trigger in s."""
 
     counts: NDArray[np.uint16]
     framestamp: int
@@ -226,7 +226,7 @@ class Camera(Protocol):
     name: str
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
-        """Apply and read back. Raises DeviceRefused where the camera cannot."""
+        """Apply and read back. Raises DeviceRefused if the camera cannot."""
         ...
 
     @property
@@ -254,7 +254,7 @@ class Camera(Protocol):
 
 
 class Shutter(Protocol):
-    """Beam shutter. Darks need it closed. `by_hand`: somebody is asked to move it."""
+    """Beam shutter. Darks need it closed. `by_hand`: the operator is asked to move it."""
 
     name: str
     by_hand: bool
@@ -278,7 +278,7 @@ class SampleMover(Protocol):
 
 @dataclass(frozen=True)
 class BeamReading:
-    """What a beam monitor says: a value in `unit` (A of an ion chamber, mA of the ring), at a time in s since 1970."""
+    """A beam monitor's reading: a value in `unit` (A of an ion chamber, mA of the ring), at a time in s since 1970."""
 
     value: float
     unit: str
@@ -286,12 +286,12 @@ class BeamReading:
 
 
 class BeamMonitor(Protocol):
-    """Something that tells how much beam there is."""
+    """A device that reads the beam intensity."""
 
     name: str
 
     def reading(self) -> BeamReading:
-        """The present value, always finite. Raises DeviceTimeout, or DeviceError for an answer that is no number."""
+        """The present value, always finite. Raises DeviceTimeout, or DeviceError if the answer is not a number."""
         ...
 
     def close(self) -> None: ...
@@ -299,7 +299,7 @@ class BeamMonitor(Protocol):
 
 @dataclass(frozen=True)
 class Devices:
-    """The instrument as acquisition sees it; made by the composition root."""
+    """The devices of the instrument; made by the composition root."""
 
     stage: RotationStage
     camera: Camera

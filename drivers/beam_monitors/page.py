@@ -64,7 +64,7 @@ class PageSource:
             return data.decode("ascii", errors="replace")
 
     def close(self) -> None:
-        """Nothing stays open between readings."""
+        """Does nothing: no connection stays open between readings."""
 
     def _error(self, kind: type[DeviceError], problem: str) -> DeviceError:
         return kind(

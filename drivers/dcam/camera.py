@@ -21,8 +21,8 @@ from drivers.dcam.settings import apply_settings, apply_trigger_source, read_set
 from drivers.dcam.structures import BufFrame
 from drivers.frame_memory import FrameMemory
 
-_WAIT_SLICE = 0.1  # s; short, since an event between looking and waiting is missed
-_LEAST_SLOTS = 16  # if memory allows: the camera may take more frames than asked for while the host is busy
+_WAIT_SLICE = 0.1  # s; short, since an event between a check and the wait is missed
+_LEAST_SLOTS = 16  # if memory allows: the camera may take additional frames while the host is busy
 _TEST_SETTINGS = CameraSettings(0.01, TriggerSource.INTERNAL)
 
 
@@ -191,7 +191,7 @@ class DcamCamera:
         """Free all resources, also after a failure; may be called again.
 
         Raises:
-            DcamError: the first failure. A camera that is no longer connected is not one.
+            DcamError: the first failure. An unplugged camera is not a failure.
         """
         if self._closed:
             return
@@ -248,7 +248,7 @@ class DcamCamera:
         return int(first.framestamp)
 
     def _await_event(self, seconds: float) -> None:
-        """Wait until something may have changed in the ring; `_look` then reads what it is."""
+        """Wait until the ring may have changed; `_look` then reads the change."""
         try:
             self._dcam.wait_start(self._session.wait, self._session.events, max(1, round(seconds * 1000)))
         except DcamError as error:

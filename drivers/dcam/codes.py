@@ -10,8 +10,9 @@ from types import MappingProxyType
 
 
 class Error(IntEnum):
-    """DCAMERR: a call failed if the int32 it returns is negative; these are the same 32 bits, unsigned. Those of the
-    recorder and of image files are left out: the driver calls neither."""
+    """DCAMERR: a call failed if it returns a negative int32; these are the same 32 bits, unsigned. Codes of the
+    recorder and of image files are left out: the driver calls neither.
+    """
 
     BUSY = 0x80000101
     ABORT = 0x80000102

@@ -19,7 +19,7 @@ _REFUSALS = frozenset(
         *(Error.NOTWRITABLE, Error.ACCESSDENY, Error.NOTSTABLE, Error.BUSY),
     )
 )
-"""Errors for a value that a camera refuses, always or for now; the vendor's manuals disagree on which one comes."""
+"""Errors for a value that a camera refuses, always or for now; the vendor's manuals disagree on their use."""
 _STATE = "No frame was taken with it; earlier frames are good"
 
 
@@ -76,7 +76,7 @@ class Properties:
             raise self._refused(f"it set {prop.name} = {accepted:g} instead of {value:g}", prop, value, f"{accepted:g}")
 
     def set_if_available(self, prop: Property, value: float) -> None:
-        """`set_exactly`, if the camera has the property; one without it behaves as if it had this value."""
+        """`set_exactly`, if the camera has the property; a camera without it behaves as if it had this value."""
         if self.find(prop) is not None:
             self.set_exactly(prop, value)
 

@@ -36,7 +36,7 @@ class Ring:
     def __init__(self, dcam: Dcam, camera: int, device: str, slots: int, memory: FrameMemory) -> None:
         self._dcam, self._camera, self._device, self._slots = dcam, camera, device, slots
         self._next = 0  # number of the next frame to take, counted from 0 in the order of arrival
-        self._count = 0  # frames that had arrived at the last look
+        self._count = 0  # frames that had arrived at the last call
         self._overrun_reported = False  # and no frame was taken since
         self.overwritten = 0
         self._memory = memory
@@ -71,7 +71,7 @@ class Ring:
         """Number of frames that have arrived since the start.
 
         Raises:
-            DeviceError: the count went back; waiting for it to grow again would be in vain.
+            DeviceError: the count went back, so the capture cannot go on.
         """
         before, self._count = self._count, self._dcam.cap_transferinfo(self._camera)
         if self._count < before:

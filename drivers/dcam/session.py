@@ -28,7 +28,7 @@ class Session:
     def __init__(self, library: Path | None, index: int, device: str) -> None:
         self.dcam = Dcam(library, device)
         self._device = device
-        self._steps: list[Callable[[], None]] = []  # that close what was opened, run last first
+        self._steps: list[Callable[[], None]] = []  # close what was opened, in reverse order
         try:
             found = self._start()
             if index >= found:
@@ -50,10 +50,10 @@ class Session:
             raise
 
     def close(self) -> None:
-        """Close all that was opened, also if a step fails; may be called again.
+        """Close everything, also if a step fails; may be called again.
 
         Raises:
-            DcamError: the first failure. A camera that is no longer connected is not a failure.
+            DcamError: the first failure. An unplugged camera is not a failure.
         """
         steps, self._steps = self._steps[::-1], []
         run_all(*steps)
@@ -87,10 +87,10 @@ class Session:
 
 
 def run_all(*steps: Callable[[], None]) -> None:
-    """Run every step, also after one that failed.
+    """Run every step, also after a failed one.
 
     Raises:
-        DcamError: the first failure. A camera that is no longer connected is not one: nothing is left to undo.
+        DcamError: the first failure. An unplugged camera is not a failure: there is nothing to undo.
     """
     first: DcamError | None = None
     for step in steps:

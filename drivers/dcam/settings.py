@@ -50,7 +50,7 @@ _READOUTS = MappingProxyType(
     {
         "standard": (codes.SENSORMODE_AREA, codes.READOUTSPEED_STANDARD),
         "ultra_quiet": (codes.SENSORMODE_AREA, codes.READOUTSPEED_ULTRA_QUIET),
-        PHOTON_NUMBER: (codes.SENSORMODE_PHOTONNUMBERRESOLVING, None),  # has one speed only
+        PHOTON_NUMBER: (codes.SENSORMODE_PHOTONNUMBERRESOLVING, None),  # has only one speed
     }
 )
 """Sensor mode and readout speed. With photon_number the camera converts a pixel's charge to photoelectrons itself."""
@@ -63,7 +63,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
     Only the exposure may be rounded.
 
     Raises:
-        DeviceRefused: at the first property that the camera refuses; those before it are set.
+        DeviceRefused: at the first property that the camera refuses; earlier ones are set.
     """
     if settings.readout not in _READOUTS:
         problem = f"there is no readout {settings.readout!r}"
@@ -74,7 +74,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
             advice="Choose one of them in the configuration",
             state="Its settings were not changed",
         )
-    # Sensor mode and speed first: they change the ranges of what follows.
+    # Sensor mode and speed first: they change the ranges of the others.
     mode, speed = _READOUTS[settings.readout]
     properties.set_exactly(Property.SENSORMODE, mode)
     if speed is not None:

@@ -37,7 +37,7 @@ class Probe:
 
 
 def _no_checksum(line: str) -> str:
-    """The check of a device whose lines carry no checksum: nothing is wrong."""
+    """The check for a device without checksums: always "", no fault."""
     return ""
 
 
@@ -51,7 +51,7 @@ class SerialLine:
         timeout: s for a whole reply, more than 0.
         unsolicited: regular expression of lines that the device may send without a request; they are skipped and
             recorded.
-        check: returns what is wrong with a received line, "" if nothing is; for checksums.
+        check: returns the fault of a received line, "" if it is good; for checksums.
         transcript: log file to which every byte sent and received is appended with its time; None: no file.
 
     Raises:
@@ -108,7 +108,7 @@ class SerialLine:
         self._reader = LineReader(self._port, clock, self._transcript, framing, unsolicited, check)
 
     def send(self, command: str) -> None:
-        """Send a command without a reply, at once: also while another thread waits for a reply, or out of step.
+        """Send a command without a reply, at once, even while another thread waits, or the line is out of step.
 
         Raises:
             DeviceError: the port failed. DeviceTimeout: the device accepts no bytes.
@@ -140,7 +140,7 @@ class SerialLine:
         """Close the port once a request of another thread has ended; calling again does nothing."""
         with self._asking, self._writing:
             self._closed = True
-            with contextlib.suppress(OSError):  # a failed port has nothing left to close
+            with contextlib.suppress(OSError):  # a failed port needs no closing
                 self._port.close()
             self._transcript.close()
 
@@ -255,7 +255,7 @@ class SerialLine:
             ) from problem
 
     def _refuse_if_closed(self, request: str) -> None:
-        """Raise DeviceError if the line is closed: what a closed port raises differs between operating systems."""
+        """Raise DeviceError if the line is closed: operating systems raise different errors for a closed port."""
         if self._closed:
             raise DeviceError(
                 self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"

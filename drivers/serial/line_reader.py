@@ -12,7 +12,7 @@ from drivers.serial.transcript import Transcript
 
 LONGEST_LINE = 1024
 LONGEST_REPLY = 1 << 16
-"""Characters of a reply of several lines, at most."""
+"""Most characters of a reply of several lines."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class LineReader:
     Args:
         port: a pyserial port whose read ends after a short silence.
         unsolicited: regular expression of lines that the device may send without a request.
-        check: returns what is wrong with a received line, "" if nothing is.
+        check: returns the fault of a received line, "" if it is good.
 
     Raises (in all methods):
         OSError: the port failed.

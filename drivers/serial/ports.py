@@ -13,7 +13,7 @@ from serial.tools import list_ports
 
 @dataclass(frozen=True)
 class SerialPort:
-    """A serial port by its device name, with the ids and texts of its USB adapter: None and empty where it has none."""
+    """A serial port by its device name, with the ids and texts of its USB adapter; None and "" without one."""
 
     device: str
     vendor: int | None
@@ -53,5 +53,5 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
         # command and its read-back.
         with contextlib.suppress(OSError), socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as copy:
             copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            port.reset_input_buffer()  # other kinds of port do this when they open
+            port.reset_input_buffer()  # other kinds of port do this at opening
     return port

@@ -19,7 +19,7 @@ RECENT_CHARACTERS = 40
 class Transcript:
     """Record of one serial line. Safe from several threads.
 
-    A log file that fails later is closed and not written any more: a full disk must not end a scan. Each line of the
+    A log file that fails later is closed: a full disk must not end a scan. Each line of the
     file holds the time in s since the epoch, a mark and the bytes as a Python literal. Marks: ">" sent, "<" received,
     "!" done by the driver.
 
@@ -38,7 +38,7 @@ class Transcript:
         self._file: FileIO | None = None if path is None else path.open("ab", buffering=0)
 
     def add_line(self, mark: str, text: str) -> None:
-        """Add a line to those that error messages quote."""
+        """Add a line to the lines that error messages quote."""
         with self._lock:
             self._last.append((self._clock.now(), mark, text))
 

@@ -1,4 +1,4 @@
-"""Settings of a stage: the values that every driver takes, and how each of them is written in a configuration.
+"""Settings of a stage: the values that every driver takes, and how a configuration writes each of them.
 
 A driver's settings are a frozen dataclass in radians and seconds. `key` says with each field how a configuration file
 writes it: its unit, which ends the key's name, its legal values and its meaning.
@@ -29,9 +29,9 @@ class Key:
     """How a configuration writes a field.
 
     Attributes:
-        unit: what ends the key's name; "" for none.
-        default: in that unit; MISSING where the key has to be there.
-        doc: what it means, where its name does not say.
+        unit: ending of the key's name; "" without one.
+        default: in that unit; MISSING if the key is required.
+        doc: its meaning, if the name does not tell.
         bounds: legal values, by pydantic's names: gt, ge, le, pattern.
     """
 
@@ -51,7 +51,7 @@ def key(default: Any = MISSING, doc: str = "", *, unit: str = "", **bounds: Any)
 
 
 def with_keys(name: str, driver: Any) -> Any:
-    """The driver of another package, where a configuration can write every field of its settings.
+    """The driver of another package, if a configuration can write every field of its settings.
 
     Raises:
         ValueError: it cannot.
@@ -64,7 +64,7 @@ def with_keys(name: str, driver: Any) -> Any:
 
 @dataclass(frozen=True)
 class StageFigures:
-    """What a stage is limited to: counts for 2π, rad/s, rad/s², soft limits in rad.
+    """The limits of a stage: counts for 2π, rad/s, rad/s², soft limits in rad.
 
     Raises:
         ValueError: figures that no stage can have.
@@ -96,7 +96,7 @@ class StageFigures:
     def limits(
         self, acceleration: float, pulse_spacing: float, *, run_up: int = 0, interval_unit: int = 1
     ) -> StageLimits:
-        """The limits of a stage with these figures that emits trigger pulses; the rest as in `StageLimits`.
+        """The limits of a stage with these figures and a trigger output; arguments as in `StageLimits`.
 
         Raises:
             ValueError: no pulses can be so far apart.
@@ -146,7 +146,7 @@ class Wiring:
 
 
 class StageSettings(Protocol):
-    """What a driver is opened with."""
+    """The settings of a driver."""
 
     @property
     def figures(self) -> StageFigures: ...
@@ -160,7 +160,7 @@ class StageSettings(Protocol):
         ...
 
     def limits(self) -> StageLimits:
-        """What the driver will say of the stage, as far as that is known before it is connected."""
+        """The stage's limits, as far as they are known before it is connected."""
         ...
 
 
@@ -168,13 +168,13 @@ class StageDriver(Protocol):
     """A driver's class; each stage's folder has one, and `drivers.stages.registry` lists them.
 
     Attributes:
-        Settings: the class of what it is opened with.
+        Settings: the class of its settings.
     """
 
     Settings: type[StageSettings]
 
     def __call__(self, url: str, settings: Any, clock: Clock) -> RotationStage:
-        """The driver, connected at what pyserial opens. Nothing moves.
+        """The driver, connected at a pyserial URL. Nothing moves.
 
         Raises:
             DeviceRefused: the settings do not fit the controller, or it is moving.
@@ -183,7 +183,7 @@ class StageDriver(Protocol):
         ...
 
     def halt(self, url: str, settings: Any, clock: Clock) -> None:
-        """Stop whatever the stage does, also a move that a program began which has died; it may still slow down then.
+        """Stop the stage, also in a move of a program that has died; it may still slow down at return.
 
         Raises:
             DeviceError, DeviceTimeout: no contact.

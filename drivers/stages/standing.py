@@ -1,4 +1,4 @@
-"""Standing: looking at a moving stage until it stands, and how long a stop may take."""
+"""Standing: waits until a moving stage stands, and knows how long a stop may take."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from drivers.base.clock import Clock
 from drivers.base.protocols import StageLimits
 
 POLL = 0.02
-"""s between looks at a moving stage."""
+"""s between two status queries of a moving stage."""
 STOP_MARGIN = 2.0
 """s beyond the longest deceleration after which a stop has failed."""
 Status = TypeVar("Status")
 
 
 def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[Status], bool], timeout: float) -> Status:
-    """What the last look shows: that the stage stands, or, where `timeout` s are over, that it still moves.
+    """The last status: the stage stands, or it still moves after `timeout` s.
 
     Args:
         look: asks the controller, at least once.

@@ -24,16 +24,16 @@ class Stops:
         self._hard = False
 
     def came(self, *, hard: bool) -> None:
-        """To be called before the stop is sent: then it is either counted in time, or sent after the move's command."""
+        """Call this before the stop is sent. The stop is then counted in time, or sent after the move's command."""
         self._hard = hard
         self.count += 1
 
     @contextmanager
     def none_while(self, purpose: str, since: int | None = None) -> Iterator[None]:
-        """Around the commands that begin a move.
+        """Context around the commands that begin a move.
 
         Args:
-            purpose: what is started, for the error.
+            purpose: the move, for the error message.
             since: the number of stops before the first of several commands.
 
         Raises:

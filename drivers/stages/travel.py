@@ -1,4 +1,4 @@
-"""Travel of a stage: radians and whole counts, soft limits, and the refusal of what no stage can have or reach."""
+"""Travel of a stage: radians and whole counts, soft limits, and the refusal of impossible moves and trains."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.base.protocols import StageLimits, TriggerTrain
 
 ROUNDING = 1e-6
-"""counts by which a spacing may be missed: floats give no better where speeds are written in degrees."""
+"""counts: tolerance of a spacing, because speeds in degrees are rounded floats."""
 
 
 def counts_in(seconds: float, limits: StageLimits) -> int:
@@ -19,7 +19,7 @@ def counts_in(seconds: float, limits: StageLimits) -> int:
 
 
 def least_interval(limits: StageLimits) -> int:
-    """Counts between pulses below which they would run together when a train is passed at the stage's full speed."""
+    """Least counts between pulses: closer ones would merge at the stage's full speed."""
     units = -(-counts_in(limits.pulse_spacing, limits) // limits.interval_unit)
     return max(units, 1) * limits.interval_unit
 
@@ -72,7 +72,7 @@ class Travel:
         Raises:
             DeviceRefused: it is beyond the soft limits.
         """
-        near = self.limits.low - 1 <= angle <= self.limits.high + 1  # also refuses what is no number or too large
+        near = self.limits.low - 1 <= angle <= self.limits.high + 1  # also refuses NaN and values that are too large
         if not near or not self.low <= self.to_counts(angle) <= self.high:
             raise DeviceRefused(
                 self.name,
@@ -83,8 +83,10 @@ class Travel:
         return self.to_counts(angle)
 
     def refuse_train(self, train: TriggerTrain) -> None:
-        """Refuses a train without pulses or intervals. Also one whose pulses would run together at full speed or are no
-        multiple of `interval_unit` apart, and one beyond the soft limits. How far apart a single pulse is says nothing.
+        """Refuses a train without pulses or intervals, or beyond the soft limits.
+
+        Also if its pulses would merge at full speed, or are not multiples of `interval_unit` apart. The interval of a
+        single pulse does not count.
         """
         interval, least = abs(train.interval), least_interval(self.limits)
         close = train.n > 1 and interval < least
@@ -94,7 +96,7 @@ class Travel:
             raise self.cannot_emit(train, advice="A lower max_speed lets pulses be closer" if close else "")
 
     def cannot_emit(self, train: TriggerTrain, why: str = "", advice: str = "") -> DeviceRefused:
-        """The refusal of a train, with what every train must be."""
+        """The refusal of a train, with the conditions for trains."""
         unit, least = self.limits.interval_unit, least_interval(self.limits)
         multiple = f" apart by a multiple of {unit} counts (a toggled output: an even number)," if unit > 1 else ""
         return DeviceRefused(
@@ -107,8 +109,10 @@ class Travel:
         )
 
     def refuse_late_arming(self, train: TriggerTrain, counts: int, opening: Fraction | int | None = None) -> None:
-        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`. Also refuses it
-        where the stage has passed the count before, from which on pulses are let through."""
+        """Refuses a train whose first pulse does not lie ahead of a stage that stands at `counts`.
+
+        Also if the stage is past the count before the first pulse at which the output opens.
+        """
         if train.interval * (train.start - counts) <= 0:
             raise DeviceRefused(
                 self.name,
@@ -126,7 +130,7 @@ class Travel:
             )
 
     def refuse_narrower(self, low: int, high: int, advice: str) -> None:
-        """Refuses a controller whose own limits (counts) leave less room."""
+        """Refuses a controller whose own limits (counts) are narrower."""
         if self.low < low or self.high > high:
             raise DeviceRefused(
                 self.name,
@@ -137,7 +141,7 @@ class Travel:
             )
 
     def still_moving(self, timeout: float, counts: int, aim: str, request: str, reply: str = "") -> DeviceTimeout:
-        """The error of a wait (s) that is over before the stage stands at its aim."""
+        """The error of a wait (s) that ends before the stage has arrived."""
         return DeviceTimeout(
             self.name,
             f"still moving after {timeout:g} s",
@@ -149,7 +153,7 @@ class Travel:
         )
 
     def not_stopped(self, timeout: float, counts: int, request: str, reply: str = "") -> DeviceTimeout:
-        """The error of a stop after which the stage does not stand within `timeout` s."""
+        """The error of a stop if the stage does not stand within `timeout` s."""
         return DeviceTimeout(
             self.name,
             f"still moving {timeout:.1f} s after the stop command",

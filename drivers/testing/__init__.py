@@ -1,4 +1,4 @@
-"""Conformance suites: what every driver of a camera or a stage does, as pytest classes that a driver's tests subclass.
+"""Conformance suites: the laws for every driver of a camera or a stage, as pytest classes that its tests subclass.
 
 They need pytest, and import neither simulators nor beamline.
 """

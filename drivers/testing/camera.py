@@ -1,4 +1,4 @@
-"""What every camera does, real or simulated: the suite that each camera's tests subclass.
+"""Laws for every camera, real or simulated: the suite that each camera's tests subclass.
 
 A subclass gives `bench`, a fixture that makes a CameraBench anew for each test. Frames are small and exposures short.
 """
@@ -19,13 +19,13 @@ from drivers.base.protocols import Camera, CameraFrame, CameraSettings, TriggerS
 
 @dataclass(frozen=True)
 class CameraBench:
-    """A camera and what goes with it.
+    """A camera and the tools to test it.
 
     Attributes:
         pulse: put rising edges on the camera's trigger input, at these times on the clock.
-        settings: that it takes: externally triggered, a small region, 10 ms or so.
-        refused: changes of them that it refuses, and a pattern for its words.
-        binnings: beside 1 that it has.
+        settings: accepted settings: externally triggered, a small region, about 10 ms.
+        refused: changes of them that it refuses, and a pattern of the message.
+        binnings: its binnings beside 1.
     """
 
     camera: Camera
@@ -90,7 +90,7 @@ class CameraConformance:
         assert [frame.framestamp for frame in frames] == list(range(6))
         assert [frame.time for frame in frames] == pytest.approx(times, abs=2e-4)
         assert {(frame.counts.shape, frame.counts.dtype) for frame in frames} == {(bench.shape, np.dtype(np.uint16))}
-        # A frame cannot be there before it is exposed and read out.
+        # A frame cannot arrive before it is exposed and read out.
         assert bench.clock.now() >= times[-1] + bench.settings.exposure + bench.camera.timing.readout - 1e-6
 
     def test_pulses_that_come_too_early_are_ignored(self, bench: CameraBench) -> None:

@@ -1,4 +1,4 @@
-"""How steep volumes are at the edges of the smoothest of them: one that is smoother is flatter there."""
+"""Edge steepness: compares volumes by their slopes at edges; a smoother volume has flatter edges."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from scipy.ndimage import gaussian_filter
 
 F32 = NDArray[np.float32]
 
-_SLICES = 8  # that are looked at
-_SMOOTH = 1.0  # voxels, in plane: of the volume that shows where the edges are
-_STEEP, _NEAR = 0.99, 0.8  # edges change by at least 0.8 of what 99 % of the voxels do not exceed
+_SLICES = 8  # voxels that are looked at
+_SMOOTH = 1.0  # voxels, in plane: smoothing of the volume that shows the edges
+_STEEP, _NEAR = 0.99, 0.8  # edges have slopes of at least 0.8 of the 99th percentile
 
 
 def edge_steepness(volumes: Sequence[F32]) -> list[float]:
-    """Mean slope of each volume [z, y, x] across the edges of the smoothest one, over that of the steepest volume.
+    """Mean slope of each volume [z, y, x] across the edges of the smoothest one, relative to the steepest volume.
 
-    Edges are the voxels where the smoothest volume (least mean slope), smoothed further by one voxel, changes nearly as
-    much as in its steepest hundredth. Slopes are taken along its gradient. So the noise of the others does not choose
-    where they are looked at. Noise adds to a slope by as much as it is correlated with the noise of the smoothest
-    volume. This tells where no edge is above the noise. NaN for each volume where one has values that are not finite.
+    The smoothest volume (least mean slope), smoothed by one voxel more, defines the edges: voxels that change nearly as
+    much as its steepest hundredth. All slopes are taken along its gradient, so the noise of the other volumes does not
+    choose the edges. Their noise adds to a slope only as far as it is correlated with that of the smoothest volume. If
+    any volume has values that are not finite, all results are NaN.
 
     Raises:
         ValueError: no volumes, volumes of different shapes, or of fewer than two voxels along y or x.

@@ -52,8 +52,8 @@ class ShellCorrelation:
     def crossing(self, threshold: F64) -> float:
         """Full period, in mm, at which the correlation first falls below `threshold` [shell].
 
-        Between two shells the crossing is interpolated. The Nyquist period where the correlation never falls below:
-        then the voxels are the limit, not the data. Infinite if already the first shell lies below.
+        Between two shells the crossing is interpolated. If the correlation never falls below, it is the Nyquist period:
+        the voxels are the limit, not the data. Infinite if already the first shell lies below.
         """
         above = np.nan_to_num(self.correlation, nan=-1.0) - threshold
         below = np.flatnonzero(above < 0)
@@ -139,7 +139,7 @@ def fourier_shell_correlation(
     shells = max(1, int(np.floor(nyquist / width + 1e-9)))
     kz, ky = (np.fft.fftfreq(n, edge) for n, edge in zip(shape[:2], edges[:2], strict=True))
     kx = np.fft.rfftfreq(shape[2], edges[2])
-    twice = np.full(kx.size, 2.0)  # half of a real volume's transform is stored: the other half are its conjugates
+    twice = np.full(kx.size, 2.0)  # only half of a real volume's transform is stored; the other half is its conjugate
     twice[0] = 1
     if shape[2] % 2 == 0:
         twice[-1] = 1

@@ -1,4 +1,4 @@
-"""lost_mass: weak matter that FBP shows above its own air, and a volume without negative densities does not have."""
+"""lost_mass: weak matter that FBP shows above its own air, and that a volume without negative densities lacks."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from recon.base.noise import air_level
 
 F32 = NDArray[np.float32]
 
-_BLOCKS = 96  # of a volume along its longest side, at most
+_BLOCKS = 96  # blocks of a volume along its longest side, at most
 _SMOOTH, _SIGMAS = 1.5, 5.0  # blocks; of air
-_MARGIN, _RIM = 4, 0.92  # blocks around matter; of the radius that all views see
+_MARGIN, _RIM = 4, 0.92  # blocks around matter; share of the radius that all views see
 _LEAST_AIR = 100  # blocks
-_LEFT = 0.5  # of what FBP shows: a voxel with less has lost it
+_LEFT = 0.5  # share of FBP's density: a voxel with less has lost it
 _CORE = 3, 5, 5  # blocks along z, y and x of the boxes that a region is made of
 _LEAST = 64  # blocks of a region
 
@@ -29,8 +29,8 @@ class Comparison:
     Attributes:
         air: level of the volume where FBP shows no matter, over `noise`.
         noise: standard deviation of FBP there, in blocks of voxels.
-        lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region has.
-        kept: mass in that region, over FBP's; each above its own air.
+        lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region lost any.
+        kept: mass in that region over the mass in FBP, each above its own air.
     """
 
     air: float
@@ -50,7 +50,7 @@ def compare(volume: F32, reference: F32) -> Comparison | None:
         reference: [z, y, x], FBP or FDK.
 
     Returns:
-        None where the reference shows no air.
+        None if the reference shows no air.
     """
     factor = max(1, math.ceil(max(volume.shape) / _BLOCKS))
     factor = min(factor, *volume.shape)
@@ -83,7 +83,7 @@ def compare(volume: F32, reference: F32) -> Comparison | None:
 
 
 def _blocks(volume: F32, factor: int) -> F32:
-    """Means of blocks of so many voxels a side; those that fill no block at the ends are dropped."""
+    """Means of blocks of so many voxels a side; voxels at the ends that do not fill a block are dropped."""
     nz, ny, nx = (n // factor for n in volume.shape)
     blocks = np.empty((nz, ny, nx), np.float32)
     for z in range(nz):

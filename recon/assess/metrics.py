@@ -12,7 +12,7 @@ from scipy.cluster.vq import kmeans2
 _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _SLAB = 32  # slices at a time
-_MOST = 2**24  # voxels that regions and their noise are judged by
+_MOST = 2**24  # voxels by which regions and their noise are judged
 _PART = 2**22  # values whose errors are summed at a time
 
 Array = NDArray[np.floating]
@@ -157,8 +157,8 @@ def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np
     """Dense and empty regions by k-means with k = 2 on the voxel values, within the inscribed cuboid.
 
     Args:
-        volume: [z, y, x], with enough contrast to separate the two regions; the mask then serves for other volumes of
-            the same sample.
+        volume: [z, y, x], with enough contrast to separate the two regions. The mask also serves for other volumes of
+        the same sample.
         seed: of the sample and of the k-means++ start.
         margin: see `inscribed_cuboid`.
 

@@ -19,12 +19,12 @@ class Curve:
 
     Attributes:
         method: its name in `recon.methods`.
-        counted: the setting of the method that its steps are; empty for one without steps.
+        counted: the method's setting that counts its steps; empty for a method without steps.
         binning: of detector pixels.
         share: Gaussians at the start, relative to the default number for the volume; 0 for a method on voxels.
-        pace: CPU time of a step. Of a fit relative to a step with binning 1 and share 1, of a method on voxels to a
-            sweep of FISTA-TV over the same views and voxels.
-        sweeps: what it takes beside its steps and the choice of its weight, such as a fit's finish, in such sweeps.
+        pace: CPU time of a step. For a fit relative to a step with binning 1 and share 1, for a method on voxels to a
+        sweep of FISTA-TV over the same views and voxels.
+        sweeps: time beside its steps and the choice of its weight, such as a fit's finish, in such sweeps.
         points: (steps, dB above the FBP of the unbinned views), steps rising.
     """
 
@@ -49,7 +49,7 @@ class Curve:
         finished = self.share == 0 or math.isfinite(speeds.sweep)
         sweeps, trials = (self.sweeps * speeds.sweep, speeds.trials) if self.sweeps > 0 and finished else (0.0, 0.0)
         bins = self.binning * further
-        return (speeds.fbp + sweeps) / bins**3 + trials / bins**2 + placed  # trials are of as many rows in any case
+        return (speeds.fbp + sweeps) / bins**3 + trials / bins**2 + placed  # trials have equally many rows in any case
 
     def step(self, speeds: Speeds, further: int = 1) -> float:
         """Seconds of a step."""
@@ -124,12 +124,12 @@ class Choice:
 
     Attributes:
         method: its name in `recon.methods`.
-        counted: its setting that `steps` are; empty for a method without steps.
+        counted: its setting that counts `steps`; empty for a method without steps.
         binning: of detector pixels, on top of the selection's.
         share: Gaussians at the start, relative to the default number for the unbinned volume; 0 for none.
         steps: number of steps for which the time suffices.
         gain: expected dB above the FBP of the unbinned views, from the measured curve.
-        seconds: that it is expected to take.
+        seconds: expected time.
     """
 
     method: str
@@ -158,14 +158,14 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
     """For each method the settings with the best expected quality within `budget` seconds; the best method first.
 
     Each measured curve gives the quality of a kind of reconstruction after the steps for which the time suffices. A
-    method that needs more is left out. If all need more, the one that takes the least time is there alone, with a gain
-    of -inf.
+    method that needs more is left out. If all need more, only the one with the least time is returned, with a gain of
+    -inf.
 
     Args:
         budget: s for everything: FBP, placing, steps, finish and filling the volume.
         speeds: times of this machine and scan.
         largest_binning: largest binning that the detector allows.
-        methods: names of those to consider; None: all that were measured.
+        methods: names of the methods to consider; None: all with a measured curve.
 
     Raises:
         ValueError: for a budget that is not positive.
@@ -192,18 +192,18 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
 
 
 def best_steps(method: str) -> int:
-    """Steps of this method beyond which no measured curve gains: more follow the noise."""
+    """Steps of this method beyond which no measured curve gains: further steps follow the noise."""
     found = (max(c.points, key=lambda point: point[1])[0] for c in CURVES if c.method == method)
     return max(found, default=DEFAULT_STEPS)
 
 
 def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choice | None:
-    """The choice of one kind that the time suffices for; None: it does not."""
+    """The longest run of one kind within the time; None if the time is too short."""
     left, step = budget - curve.fixed(speeds, further), curve.step(speeds, further)
     first, last = curve.points[0][0], max(curve.points, key=lambda point: point[1])[0]
     if not left >= first * step:
         return None
-    # More steps than were best follow the noise, see `best_steps`.
+    # More steps follow the noise, see `best_steps`.
     return _choice(curve, further, int(min(left / step, last)) if step > 0 else last, speeds)
 
 

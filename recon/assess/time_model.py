@@ -61,7 +61,7 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
     slope = float(x @ y / (x @ x))  # dB for each factor of e in time
     scatter = y - y.mean() - slope * x
     error = math.sqrt(float(scatter @ scatter) / (x.size - 2) / float(x @ x))
-    # The slope is known no better than this, also for a record of two dozen points without scatter.
+    # The least error of the slope, even for a record of two dozen points without scatter.
     error = max(error, 1e-3 * abs(slope))
     if slope <= 2 * error:
         return none
@@ -73,8 +73,8 @@ def next_decibel(seconds: ArrayLike, residuals: ArrayLike) -> NextDecibel:
 def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
     """Additional time for a fit to gain a dB, from the quality of fits of other lengths (`CURVES`).
 
-    A fit's own record is no basis. Much of its gain towards the end comes from the falling learning rates; a longer fit
-    has that gain only once, too. The curves are means over four scans; `low` and `high` are the best and the worst of
+    A fit's own record does not tell. Much of its last gain comes from the falling learning rates, and a longer fit has
+    that gain only once. The curves are means over four scans; `low` and `high` are the best and the worst of
     the curves for different numbers of Gaussians. Beyond its last point a curve is extrapolated with its last slope, to
     at most four times its steps.
 

@@ -1,4 +1,4 @@
-"""Choices and figures that options name: apart from what computes, so that a command's help loads neither."""
+"""Choices and figures that options name. They load without computing modules, so that help is quick."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ KERNEL = Kernel.COMPACT
 """Shape of a fit's Gaussians."""
 
 DEFAULT_STEPS = 400
-"""Steps of a fit that a finish on voxels follows."""
+"""Steps of a fit before a finish on voxels."""
 
 SHORT_STEPS = 200
-"""Steps where the noise of the views hides what more would gain."""
+"""Steps if the noise of the views hides the gain of more steps."""
 
 NECK = 0.8
-"""Two parts are one particle where the neck between them is at least so wide as the narrower part, as a share."""
+"""Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
 
 N_GAUSSIANS, SIDE = 50_000, 256
 """Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view."""
 
 FEW_PHOTONS = 100
-"""In a pixel of the open beam: below, counts are better than their logarithm (docs/notes/exploration.md)."""
+"""Photons in a pixel of the open beam; with fewer, counts are better than logarithms (docs/notes/exploration.md)."""

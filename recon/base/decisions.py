@@ -1,4 +1,4 @@
-"""Decisions: numbers that a method takes from its data, kept so that other slabs of the same scan follow them."""
+"""Decisions: numbers that a method derives from its data, kept so that other slabs of the same scan use them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ T = TypeVar("T")
 
 
 class Decisions:
-    """What a run decides by its data, by name and in order.
+    """The decisions of a run by its data, by name and in order.
 
     A weight of total variation, a step or a restart that follows from sums over a whole volume would differ from slab
-    to slab, and show as a seam. So one slab decides, and the others follow: `Decisions(seed, first.made)`. What was not
-    decided before is decided then.
+    to slab, and show as a seam. So one slab decides, and the others follow: `Decisions(seed, first.made)`. Decisions
+    that `made` does not hold are then made.
 
     Attributes:
         seed: of every random choice.
@@ -26,7 +26,7 @@ class Decisions:
         self._followed = followed or {}
 
     def __call__(self, name: str, decide: Callable[[], T]) -> T:
-        """The next decision of this name: as it was decided before, else what `decide` returns."""
+        """The next decision of this name: the earlier one if it was made, otherwise the result of `decide`."""
         before, made = self._followed.get(name, ()), self.made.setdefault(name, [])
         made.append(before[len(made)] if len(made) < len(before) else decide())
         value: T = made[-1]

@@ -13,7 +13,7 @@ default.
 Cone beam: the source lies at -sod * d, the detector sdd away from it. A point at depth w = sod + x·d falls on column
 axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_pitch, with pixel_pitch on the detector.
 
-A real set-up departs from that in three ways, each given for every view. `tilt` leans the rotation axis along the beam
+A real set-up departs from this in three ways, each given for every view. `tilt` leans the rotation axis along the beam
 (laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector.
 """
 
@@ -31,8 +31,8 @@ from recon.base.picture import fan, html
 
 F64 = NDArray[np.float64]
 
-_OFF_MIDDLE = 0.05  # of the detector's width: with the axis farther off, a tenth of the field is on one side
-_SHORT_OF_SOURCE = 0.7  # of sod: the corners of a box of this half width do not reach the source
+_OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
+_SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +218,7 @@ class Geometry:
         """The same set-up at other angles (radians), with the shift, roll and tilt common to all views.
 
         Raises:
-            ValueError: for bad angles, or if shift, roll or tilt differ between views: new views have no known ones.
+            ValueError: for bad angles, or if shift, roll or tilt differ between views: new views have unknown ones.
         """
         for name, own in (("shifts", self.shifts), ("roll", self.roll), ("tilt", self.tilt)):
             widest = float(np.ptp(own, axis=0).max())
@@ -252,7 +252,7 @@ class Geometry:
         """The same geometry for detector rows start..stop.
 
         For a parallel beam v is then measured from the middle of these rows, so that a slab is a scan of its own. The
-        central ray of a cone stays where it is.
+        central ray of a cone keeps its place.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:

@@ -15,7 +15,7 @@ class Kernel(StrEnum):
     R gives the compact kernel the second moment of the Gaussian, so that a covariance means the same with both. Its
     line integral is of the same form with exponent m + 1/2, a polynomial at m = 3/2. Nothing has to be truncated. ∫ (1
     - t² - s²)₊^m ds = √π Γ(m + 1) / Γ(m + 3/2) (1 - t²)₊^(m + 1/2). Its shadow is steeper at the edge and has no tail,
-    which suits matter that ends.
+    which suits matter with sharp edges.
     """
 
     GAUSSIAN = "gaussian"
@@ -30,7 +30,7 @@ class Kernel(StrEnum):
         """The kernel of this exponent, infinite for a Gaussian, as files hold it.
 
         Raises:
-            ValueError: there is none.
+            ValueError: no kernel has this exponent.
         """
         for kernel in cls:
             if kernel.exponent == exponent:
@@ -66,5 +66,5 @@ class Kernel(StrEnum):
         return (2 / 3, 4 / 3, 10 / 3, 256 / 21) if self.is_compact else (1 / 2, 1.0, 3 / 2, 6.0)
 
     def reach(self, sigmas: float) -> float:
-        """Where it is cut off, in standard deviations: a Gaussian at `sigmas`, a compact kernel at its own end."""
+        """Where it is cut off, in standard deviations: a Gaussian at `sigmas`, a compact kernel at its end."""
         return self.radius if self.is_compact else sigmas

@@ -19,7 +19,7 @@ Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[
 
 @dataclass(frozen=True, eq=False)
 class RayWeights:
-    """Weights of rays [view, row, col] as a product; only the part that is asked for is computed.
+    """Weights of rays [view, row, col] as a product; only the requested part is computed.
 
     Attributes:
         factors: float32 [view, row, col] each, one at least; see numpy.broadcast_to.
@@ -32,10 +32,10 @@ class RayWeights:
 
 
 def plan_fill(mask: Mask) -> Fill:
-    """Order in which to fill masked pixels: rings from the outside in, each the mean of neighbours filled before.
+    """Order in which to fill masked pixels: rings from the outside in, each the mean of neighbours filled earlier.
 
     Raises:
-        ValueError: where all pixels [row, col] are masked.
+        ValueError: all pixels [row, col] are masked.
     """
     rows, cols = mask.shape
     known = ~mask
@@ -58,7 +58,7 @@ def plan_fill(mask: Mask) -> Fill:
 def areas(mask: Mask) -> Mask:
     """[row, col] masked pixels that lie in an area of 3 x 3 or more, the detector's edges counting as masked.
 
-    What fills them from their neighbours is a guess; a single pixel or a line is interpolated well.
+    Their fill values are guesses. A single pixel or a line is interpolated well.
     """
     full = np.pad(mask, 1, constant_values=True)
     return np.asarray(ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)

@@ -1,7 +1,7 @@
-"""Method: what every reconstruction method is, and the values that go in and come out.
+"""Method: the interface of every reconstruction method, and the values that go in and come out.
 
-A method is a frozen dataclass of its settings that meets the Protocol `Method`. `recon.methods` registers it. What only
-some can do is a Protocol beside it.
+A method is a frozen dataclass of its settings that meets the Protocol `Method`. `recon.methods` registers it. Abilities
+of some methods are Protocols beside it.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class Progress:
     """Where a reconstruction stands.
 
     Attributes:
-        step, steps: done and planned, or iterations (0: not known, such as of a fit while views still arrive).
+        step, steps: done and planned, or iterations (0: unknown, as in a fit while views still arrive).
         seconds: since the start, by the caller's clock.
         loss: running mean of the loss, in normalised units.
         residual: running mean of |rendered - measured| / |measured| (root mean squares), over the views just used.
         n_gaussians, n_views: in the model and in the data.
-        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN where there are none.
-        unit: what steps are where they are no steps of a fit and no iterations, such as slices; loss and residual are
-            NaN there.
+        held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN without such views.
+        unit: name of the steps of a direct method or of a part of the work, such as slices; loss and residual are then
+        NaN.
     """
 
     step: int
@@ -75,7 +75,7 @@ class RunControl:
         checkpoint_every: s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.
         now: a clock in s.
-        decide: takes what the method decides by its data, and may follow another run; None: the run decides alone.
+        decide: keeps the method's decisions by its data, and may follow another run; None: the run decides alone.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -89,7 +89,7 @@ class RunControl:
 
 @dataclass(frozen=True, eq=False)
 class ReconProblem:
-    """What a method reconstructs.
+    """The data and the grid of a reconstruction.
 
     Attributes:
         projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
@@ -110,10 +110,10 @@ class ReconProblem:
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What a method returns; the attributes are those of `recon.Reconstruction`.
+    """The result of a method; attributes as in `recon.Reconstruction`.
 
-    `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import. `method` is the name of
-    the method that another one chose.
+    `gaussians` is a `recon.splatting.gaussians.Gaussians`, which this module must not import. `method` names the
+    chosen method, if a method chose another one.
     """
 
     volume: Volume
@@ -126,18 +126,18 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Traits:
-    """What a method can do beyond turning line integrals into a volume.
+    """Abilities of a method, beyond turning line integrals into a volume.
 
     Attributes:
         direct: one pass without iterations: it has no history, and cannot be stopped.
-        device: it computes on any device, not on the CPU alone.
+        device: it computes on any device, not only on the CPU.
         held_out: views can be held out.
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
         budget: a time budget chooses its settings, see `recon.assess.plans`.
         any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
             the grid is modelled, too.
-        needs_matter: it refuses views without any, such as those of a slab of air.
+        needs_matter: it refuses views without matter, such as those of a slab of air.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
     """
 
@@ -158,7 +158,7 @@ class Method(Protocol):
     Attributes:
         name: in commands, files and events.
         label: in reports.
-        traits: what it can do.
+        traits: its abilities.
     """
 
     name: ClassVar[str]
@@ -178,13 +178,13 @@ class Method(Protocol):
         ...
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        """Bytes that `run` takes at most beside the projections, and their weights where they are `weighted`."""
+        """Most bytes that `run` takes beside the projections, and beside their weights if they are `weighted`."""
         ...
 
 
 @runtime_checkable
 class DividedMethod(Method, Protocol):
-    """A method with settings that depend on how much of a volume it makes."""
+    """A method with settings that depend on its share of a volume."""
 
     def for_part(self, share: float, of_time: float) -> Self:
         """The method for this share of a volume, in this share of its seconds."""
@@ -196,7 +196,7 @@ class PresetMethod(Method, Protocol):
     """A method with the trait `presets`."""
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
-        """With the settings of a preset, for a grid that is worth `default_count` Gaussians."""
+        """The method with the settings of a preset, for a grid with `default_count` Gaussians by default."""
         ...
 
 
@@ -205,7 +205,7 @@ class TimedMethod(Method, Protocol):
     """A method that ends by itself when a time is over."""
 
     def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
-        """The method begun on these views, which takes the seconds that are `left` then."""
+        """Start the method on these views; the result runs within the seconds that are then `left`."""
         ...
 
 
@@ -215,15 +215,15 @@ class CheckpointedMethod(Method, Protocol):
 
     @property
     def planned_steps(self) -> int | None:
-        """Steps that end it; None where a time does."""
+        """Number of steps; None if a time ends the method."""
         ...
 
     @property
     def made_by(self) -> tuple[Any, Mapping[str, Plain]]:
-        """Everything of its settings that decides what a step is: a dataclass, and more by name."""
+        """All settings that determine the steps, which a resumed run must share: a dataclass, and more by name."""
         ...
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:
-    """The methods that it chooses among, by preference; itself where it does not choose."""
+    """The methods that it chooses among, by preference; only itself if it does not choose."""
     return getattr(method, "candidates", (method,))

@@ -13,34 +13,34 @@ from scipy.signal import find_peaks
 
 F32 = NDArray[np.float32]
 
-_MEDIAN = 0.6745  # of the absolute value of a normal variable with standard deviation 1
+_MEDIAN = 0.6745  # median of |x| for a normal variable x with standard deviation 1
 _VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
 _SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
 _CLIPPED, _ROUNDS = 4.0, 20  # standard deviations of air, rounds
-_GROWTH = 4.0  # of the deviation of air over that of what is below its commonest value
+_GROWTH = 4.0  # largest deviation of air, over that of the values below its commonest value
 
 
 def noise_level(images: F32) -> float:
     """Standard deviation of the noise of a typical pixel, white or blurred after it arose.
 
-    Matter changes slowly from pixel to pixel, noise does not: differences of order n both ways keep the noise and
-    little else. Those of white noise have C(2n, n) times its standard deviation. Noise that was blurred, by
+    Matter changes slowly from pixel to pixel, noise does not: differences of order n both ways keep mostly noise.
+    Differences of white noise have C(2n, n) times its standard deviation. Noise that was blurred, by
     interpolation or in a scintillator, has less at high frequencies. So the fourth differences, divided by C(8, 4), are
     smaller than the third ones, divided by C(6, 3). Their ratio gives the width of the blur, taken as Gaussian, and so
-    the noise at all frequencies. What all views have in a pixel (rings) does not count. [our own; median of
+    the noise at all frequencies. Offsets of a pixel in all views (rings) do not count. [our own; median of
     differences: Immerkær 1996, Comput. Vis. Image Underst. 64, 300]
 
     White noise on real samples is found within a third, noise blurred by up to 0.7 pixel within a half, see
     tests/recon/base/test_noise.py. Fine texture in almost noiseless views counts as noise.
 
     Args:
-        images: [view, a, b], line integrals; an axis shorter than five pixels is left alone. Some 16 views are read.
+        images: [view, a, b], line integrals; an axis shorter than five pixels is not used. Some 16 views are read.
 
     Returns:
-        0 where both axes are too short.
+        The standard deviation; 0 if both axes are too short.
     """
     some, axes = _sample(images), len(_long_axes(images))
     low, high = _differences(some, _LOW), _differences(some, _HIGH)
@@ -59,12 +59,11 @@ def median_deviation(images: NDArray[np.floating[Any]]) -> float:
 
 
 def ring_offsets(residual: F32) -> F32:
-    """Offsets of single pixels [row, col] that stay in all views: what becomes rings in a volume.
+    """Offsets of single pixels [row, col] that stay in all views and become rings in a volume.
 
-    The median over the views of what a model leaves of them, less its own neighbourhood along the row, and along the
-    column: the wall of a can around the axis stays in all views, too, but in all rows alike (-1.1 dB on a battery). 0
-    where it does not stand out of its scatter by three standard errors. With few views noise cannot be told from the
-    sample: then it is 0.
+    It is the median of the residual over the views, less its neighbourhood along the row and along the column. The wall
+    of a can around the axis stays in all views, too, but in all rows alike (-1.1 dB on a battery). Offsets below three
+    standard errors of their scatter are 0. With few views noise cannot be separated from the sample: then all are 0.
 
     Args:
         residual: views less a model's views, [view, row, col].
@@ -83,8 +82,8 @@ def ring_offsets(residual: F32) -> F32:
 def air_level(values: F32) -> tuple[float, float]:
     """The level of air among the values of a volume, and its standard deviation.
 
-    The lowest value that many voxels have; from there the values within four deviations, until these stay. Where air
-    is uneven, its deviation is up to four times that of the values below the first.
+    It begins at the lowest value that many voxels have, and repeatedly takes the values within four deviations. The
+    deviation of uneven air is at most four times that of the values below the first level.
     """
     values = values.ravel()
     values = values[:: max(1, values.size // _SAMPLED)]
@@ -100,7 +99,7 @@ def air_level(values: F32) -> tuple[float, float]:
     first = noise = median_deviation(below)
     for _ in range(_ROUNDS):
         near = values[np.abs(values - level) <= _CLIPPED * noise]
-        if not near.size:  # all that is below is the same
+        if not near.size:  # all lower values are equal
             break
         level = float(np.median(near))
         noise = min(median_deviation(near - level), _GROWTH * first)
@@ -131,7 +130,7 @@ def _differences(images: F32, order: int) -> float:
 
 @cache
 def _blurs() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """For Gaussian blurs of rising width, of the variance along an axis: `_HIGH` over `_LOW`, and all over `_LOW`."""
+    """Ratios of variances along an axis, for Gaussian blurs of rising width: `_HIGH` and all over `_LOW`."""
     widths = np.linspace(0, _LARGEST_BLUR, 301)
     f = (np.arange(4096) + 0.5) / 8192  # cycles a pixel
     passed = np.exp(-((2 * np.pi * widths[:, None] * f) ** 2))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 U8 = NDArray[np.uint8]
 _SIDE = 256  # pixels of a slice's longer side, at most
 _GAP = 4  # pixels between slices
-_SEEN = (0.5, 99.8)  # percentiles that are black and white
+_SEEN = (0.5, 99.8)  # percentiles shown black and white
 
 
 def html(title: str, pixels: U8, facts: Mapping[str, str]) -> str:
@@ -41,7 +41,7 @@ def png(pixels: U8) -> bytes:
 def middle_slices(data: NDArray[np.float32]) -> tuple[U8, tuple[float, float]]:
     """The middle slices across z, y and x of a volume [z, y, x], side by side, and the values of black and white.
 
-    y and z point downwards. Voxels are left out where a side is longer than 256 of them; what is not finite is black.
+    y and z point downwards. Long sides are thinned out to 256 voxels; values that are not finite are black.
     """
     nz, ny, nx = data.shape
     step = -(-max(data.shape) // _SIDE)

@@ -1,4 +1,4 @@
-"""Slabs: slices of a volume that are reconstructed by themselves, from the detector rows of a parallel beam."""
+"""Slabs: parts of a volume, some slices each, that are reconstructed separately from rows of a parallel beam."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _ON_A_ROW = 1e-6  # rows
 
 @dataclass(frozen=True)
 class Slab:
-    """A slab, and what a method sees for it.
+    """A slab and its halo.
 
     Attributes:
-        own: slices of the volume that are its own.
+        own: slices of the volume that this slab gives.
         slices: these and the halo beside them, which are reconstructed.
-        fade: slices on either side of the edge between two slabs over which one gives way to the other.
+        fade: slices on either side of the edge between two slabs, over which one fades into the other.
     """
 
     own: slice
@@ -30,7 +30,7 @@ class Slab:
 
     @property
     def share(self) -> NDArray[np.float32]:
-        """[slice]: how much of each slice reconstructed is the volume's; those of all slabs add up to 1."""
+        """[slice]: weight of each reconstructed slice in the volume; the weights of all slabs add up to 1."""
         at, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
         share = np.ones(at.size)
         if self.slices.start < self.own.start:
@@ -41,7 +41,7 @@ class Slab:
 
 
 def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
-    """Slabs of `height` slices each, the last one of fewer, with a halo wherever there are further slices."""
+    """Slabs of `height` slices each (the last may have fewer), with a halo towards further slices."""
     parts = (slice(first, min(first + height, slices)) for first in range(0, slices, height))
     fade = min(halo, height) // 2
     return [Slab(own, slice(max(own.start - halo, 0), min(own.stop + halo, slices)), fade) for own in parts]
@@ -50,7 +50,7 @@ def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
 def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geometry, Grid]:
     """The detector rows that show these slices in any view, the geometry of these rows, and the slices' grid in it.
 
-    Views that are shifted along the axis see further slices at the edges of these rows, which the grid does not hold.
+    Views shifted along the axis also see slices outside this grid at the edges of the rows.
 
     Args:
         geometry: a parallel beam, straight.

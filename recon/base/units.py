@@ -1,4 +1,4 @@
-"""Numbers that do not look like what they are said to be: degrees for radians, counts for line integrals."""
+"""Units: warns of values that look like another quantity: degrees for radians, counts for line integrals."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 _TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
-_FEWEST = 5  # of fewer views nothing is said
-_OPAQUE = 15.0  # exp(-15) of the light: no detector measures that in nine of ten pixels
+_FEWEST = 5  # with fewer views there is no warning
+_OPAQUE = 15.0  # exp(-15) of the light, which no detector measures in nine of ten pixels
 _LOOKED_AT = 2**16  # values
 
 
 def look_like_degrees(angles: NDArray[np.floating]) -> bool:
-    """Whether angles [view] that are said to be radians are degrees, by the look of them.
+    """Whether angles [view] given as radians look like degrees.
 
-    They are degrees if all are whole numbers, or if they span 180 or 360. They are also if they span more than ten
-    turns and are round to two digits.
+    They do if all are whole numbers, or if they span 180 or 360. They also do if they span more than ten turns and are
+    round to two digits.
     """
     distinct = np.unique(angles)
     if distinct.size < _FEWEST or not np.isfinite(distinct).all():
@@ -34,7 +34,7 @@ def look_like_degrees(angles: NDArray[np.floating]) -> bool:
 
 
 def warn_of_degrees(angles: NDArray[np.floating]) -> None:
-    """A UserWarning where angles look like degrees, at the line that calls the function which asks."""
+    """A UserWarning if angles look like degrees; it names the line that called the asking function."""
     if look_like_degrees(angles):
         warnings.warn(
             f"angles reach {np.abs(angles).max():.5g} rad and look like degrees. They are radians here: give "
@@ -44,10 +44,10 @@ def warn_of_degrees(angles: NDArray[np.floating]) -> None:
 
 
 def look_like_counts(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] that are said to be line integrals are counts, by the look of some of them.
+    """Whether values [view, row, col] given as line integrals look like counts, by a sample of them.
 
-    They are counts if nine in ten are so large that no detector could have measured the light that is left. Half of
-    them suffice if all are whole numbers.
+    They do if nine in ten are too large for any detector to measure the remaining light. If all are whole numbers, half
+    of them suffice.
     """
     flat = projections.reshape(-1)
     some = flat[:: max(1, flat.size // _LOOKED_AT)]

@@ -93,7 +93,5 @@ def _even(views: NDArray[np.int64], theta: NDArray[np.float64], n: int, period: 
     place = np.mod(theta[views] - theta[views[0]] + 0.05 * step, period)  # counted from the first view
     order = np.argsort(place, kind="stable")
     starts = np.flatnonzero(np.diff(place[order], prepend=-np.inf) > 0.1 * step)
-    distinct = (
-        np.minimum.reduceat(order, starts) if starts.size >= n else order
-    )  # the earliest of the views at one angle
+    distinct = np.minimum.reduceat(order, starts) if starts.size >= n else order  # the earliest view at each angle
     return np.sort(views[distinct[np.arange(n) * distinct.size // n]])

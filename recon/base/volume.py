@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.base.picture import html, middle_slices
 
-# Box of a fit over the field, across, where the sample is wider. Two regions of interest: +2.0 and +3.8 dB. 1.4 gains
-# as much there, and loses 0.5 to 1.5 dB where the matter ends with the box (1.2: 0 and 0.8).
+# Width of a fit's box over the field, if the sample is wider. Gains on two regions of interest: 2.0 and 3.8 dB. 1.4
+# gains as much there, but loses 0.5 to 1.5 dB if the matter ends with the box (1.2: 0 and 0.8).
 _WIDER = 1.2
-_COARSEST = 4.0  # pixels: largest voxel of a fit's box, also where the volume wanted is coarser
+_COARSEST = 4.0  # pixels: largest voxel of a fit's box, even if the requested volume is coarser
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,8 @@ class Grid:
         With shifted views it covers every position that is seen by at least half as many views as the position seen
         most often: small alignment shifts change nothing, views that step up and down give all heights.
 
-        Where the axis stands off the detector's middle (`Geometry.is_off_middle`), the box is as wide as a full turn of
-        such views sees, as in `of_field`, whatever angles there are: matter that views see and that has no voxel would
-        be put into others.
+        If the axis stands off the detector's middle (`Geometry.is_off_middle`), the box holds the field of a full turn
+        of such views, as in `of_field`. Matter that views see but that has no voxel would be put into others.
         """
         across, (down, middle) = _spread(geometry, 0)[0], _spread(geometry, 1)
         if geometry.is_off_middle:
@@ -65,7 +64,7 @@ class Grid:
 
     @classmethod
     def of_field(cls, geometry: Geometry, voxel_size: float) -> Grid:
-        """A box around the rotation axis that holds all that any view sees, wherever the axis is on the detector.
+        """A box around the rotation axis that holds all that any view sees, wherever the axis lies on the detector.
 
         It spans what shifted views see, also for an axis outside the detector; rolled and tilted views count as
         straight ones. The field of a cone is measured at the rotation axis, the usual convention. Matter nearer the
@@ -80,10 +79,10 @@ class Grid:
 
     @classmethod
     def for_fit(cls, geometry: Geometry, wanted: Grid, *, wider: bool = False) -> Grid:
-        """The box that a fit covers: the whole field, in voxels of the size wanted.
+        """The box that a fit covers: the whole field, in voxels of the requested size.
 
-        A sample that is wider than the field (`wider`) gets a fifth more across. Matter beyond adds to every view; left
-        out, it appears inside as a bright rim.
+        For a sample wider than the field (`wider`) the box is a fifth wider. Matter beyond the field is in every view.
+        Without voxels for it, a bright rim would appear inside.
 
         The voxels are at least one pixel, the limit that views resolve, and at most four, the coarsest first volume
         from which a fit can start.

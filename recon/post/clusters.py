@@ -1,4 +1,4 @@
-"""Clusters of grey values by k-means: how many by the elbow rule, and the threshold of the brightest."""
+"""Clusters of grey values by k-means: their number by the elbow rule, and the threshold of the brightest."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ MOST = 6
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Grey values parted by k-means.
+    """Grey values grouped by k-means.
 
     Attributes:
         centres: float64 [cluster], rising.
         shares: of all values in each.
-        inertias: mean squared distance to the centres for 1, 2, ... clusters, where the elbow was looked for.
+        inertias: mean squared distance to the centres for 1, 2, ... clusters, if the elbow rule was used.
     """
 
     centres: F64
@@ -31,9 +31,9 @@ class Clusters:
 
     @property
     def threshold(self) -> float:
-        """Half-way between the brightest centre and that of the largest of the other clusters.
+        """Half-way between the brightest centre and the centre of the largest other cluster.
 
-        Clusters between those two are edges, which hold both; half-way is where an edge is (ISO 50 % rule).
+        Clusters between those two are edges, mixtures of both; an edge lies half-way (ISO 50 % rule).
         """
         return float(self.centres[-1] + self.centres[:-1][self.shares[:-1].argmax()]) / 2
 
@@ -96,7 +96,7 @@ def _fitted(sample: F64, k: int, seed: int) -> tuple[F64, float]:
     for _ in range(_STARTS):
         try:
             centres = np.sort(kmeans2(sample[:, None], k, iter=30, minit="++", rng=rng, missing="raise")[0].ravel())
-        except ClusterError:  # a start that loses a cluster; the others do not
+        except ClusterError:  # a start may lose a cluster
             continue
         nearest = centres[np.searchsorted((centres[1:] + centres[:-1]) / 2, sample)]
         inertia = float(np.mean((sample - nearest) ** 2))

@@ -19,7 +19,7 @@ _SAMPLE = 4_000_000  # voxels from which percentiles are computed
 def sample_circle(volume: F32) -> tuple[float, float, float]:
     """Centre (y, x) and radius of the sample seen along z, in voxels.
 
-    The mean over z is parted by k-means in two; the circle is that of the largest connected part's extent.
+    K-means divides the mean over z into two classes; the circle has the extent of the largest connected part.
 
     Args:
         volume: [z, y, x], finite.
@@ -79,7 +79,7 @@ def enhanced(
 ) -> F32:
     """Rescaled, raised to the power `gamma`, then smoothed by a Gaussian.
 
-    With another gamma than 1 half of the grey value is no longer half of the attenuation, which moves edges.
+    A gamma other than 1 moves edges, since half of the grey value is then not half of the attenuation.
 
     Args:
         volume: [z, y, x].

@@ -1,4 +1,4 @@
-"""Particles: a mask cleaned, parted where particles touch, and each with its size and place."""
+"""Particles: cleans a mask, separates touching particles, and measures the size and place of each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ F32 = NDArray[np.float32]
 
 _GRID = 0.5
 """Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
-are parted, with it 1. With it 38 of 40 pairs of touching balls are parted, without it 40."""
+are split in error, with it 1. With it 38 of 40 pairs of touching balls are separated, without it 40."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Particles:
         label: int32 [particle], in the labelled volume.
         volume: float64, of a voxel's unit of length cubed.
         centroid: float64 [particle, 3], (z, y, x).
-        cut: bool, it touches a face of the volume, so that it may be larger than it is here.
+        cut: bool, it touches a face of the volume, so that its true size may be larger.
     """
 
     label: Labels
@@ -42,7 +42,7 @@ class Particles:
         return np.cbrt(6 * self.volume / np.pi)
 
     def statistics(self) -> dict[str, float]:
-        """Number, how many are cut; mean and 10th, 50th and 90th percentile of the diameters of the others."""
+        """Numbers of particles and of cut ones; mean and 10th, 50th and 90th percentile of the other diameters."""
         whole = self.diameter[~self.cut]
         found = {"particles": float(self.label.size), "cut": float(self.cut.sum())}
         if whole.size:
@@ -60,7 +60,7 @@ def ball(radius: int) -> Mask:
 def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
     """Opened, closed, holes filled, and parts of fewer than `smallest` voxels removed.
 
-    The faces of the volume count as if it went on beyond them, so that a particle there loses nothing.
+    The volume is continued beyond its faces, so that a particle there loses nothing.
 
     Args:
         mask: [z, y, x].
@@ -85,10 +85,10 @@ def cleaned(mask: Mask, radius: int = 1, smallest: int = 8) -> Mask:
 
 
 def parted(mask: Mask, neck: float = NECK) -> Labels:
-    """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, parted where they are only joined by a neck.
+    """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, separated at narrow necks.
 
     Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two basins are joined again
-    where the distance on the neck between them is at least `neck` of the smaller maximum, widest necks first.
+    if the distance on the neck between them is at least `neck` times the smaller maximum, widest necks first.
 
     Args:
         neck: 0: connected parts as they are; above 1: every maximum is a particle.
@@ -136,7 +136,7 @@ def measured(
 def _basins(inside: Mask) -> tuple[Labels, F32]:
     """The basin of each maximum of the distance to the outside, and that distance; False on all faces of `inside`.
 
-    Every voxel belongs to the maximum that the steepest way up leads to. (`scipy.ndimage.watershed_ift` grows by the
+    Every voxel belongs to the maximum at the end of its steepest ascent. (`scipy.ndimage.watershed_ift` grows by the
     differences of neighbours, not by their values, and does not find the necks of a smooth distance.)
     """
     distance = ndimage.distance_transform_edt(inside).astype(np.float32)
@@ -156,7 +156,7 @@ def _basins(inside: Mask) -> tuple[Labels, F32]:
 
 
 def _joined(basins: Labels, distance: F32, neck: float) -> Labels:
-    """The basins numbered anew, 1, 2, ..., after those with a wide neck between them were joined."""
+    """Join basins with a wide neck between them; number the results 1, 2, ..."""
     n = int(basins.max())
     peak = np.zeros(n + 1)
     np.maximum.at(peak, basins.ravel(), distance.ravel())

@@ -12,7 +12,7 @@ _BANDS = 8  # of rows, at most
 
 
 def edge_profiles(transmission: F32) -> F32:
-    """What `air_columns` needs to know of each view: medians [view, side, band of rows, column from the edge].
+    """Input of `air_columns` from each view: medians [view, side, band of rows, column from the edge].
 
     Args:
         transmission: float32 [view, row, col].
@@ -46,7 +46,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
         relative = profile / np.where(level > 0, level, 1e-30)[:, None, None] - 1
         wide = profile.shape[2] > 1
         noise = _MAD * float(np.median(np.abs(np.diff(relative, axis=2)))) / np.sqrt(2) if wide else 0.0
-        # One view in twenty may deviate: the median over the columns tolerates that, and noise has tails.
+        # One view in twenty may deviate: noise has tails, and the median over the columns tolerates it.
         darkest = np.quantile(relative.min(axis=1), 0.05, axis=0, method="higher")
         steady = (darkest > -max(tolerance, 4 * noise)) & (np.median(relative, axis=(0, 1)) < 0.1)
         n = int(np.argmin(np.append(steady, False)))

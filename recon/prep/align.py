@@ -22,14 +22,14 @@ Floats = NDArray[np.float64]
 
 _MOST_VIEWS, _MOST_ROWS, _MOST_COLS = 256, 16, 1024  # enough for 0.1 px
 _STEP = 0.25  # px between candidates
-_WIDEST_GAP = np.deg2rad(20)  # in a half turn; with a wider gap the double wedge does not determine the axis
+_WIDEST_GAP = np.deg2rad(20)  # share of a half turn; with a wider gap the double wedge does not determine the axis
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64
-_EDGE = 25  # of the columns, one in so many at each edge is too near it for an axis
+_EDGE = 25  # one column in so many, at each edge, is too near to it for an axis
 _AGREE = 1.0  # px by which independent estimates may differ and still count as equal
 
 
 class AxisError(ValueError):
-    """The best axis lies at the edge of the search range or outside it: there is no estimate."""
+    """The best axis lies at or outside the edge of the search range, so there is no estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class AxisEstimate:
     Attributes:
         value: axis_col in pixels, 0 at the centre of the first column.
         candidates: float64 [n], the columns tested.
-        curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 is none.
+        curve: float64 [n], mismatch at each candidate: 0 is perfect agreement, about 1 no agreement.
         confident: False if the minimum of the curve is shallow, or parts of the data disagree.
         method: "pair", "opposite views", "double wedge", "centre of mass" or "views held out".
     """
@@ -90,8 +90,8 @@ def axis_from_opposites(
 ) -> AxisEstimate:
     """Axis from all pairs of opposite views of a full turn, also where it stands near an edge of the detector.
 
-    As `axis_from_pair`, of the views' slopes along the columns, which have no trend in common where the overlap is
-    narrow. The sum is over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
+    As `axis_from_pair`, but from the views' slopes along the columns, which share no trend if the overlap is narrow.
+    The sum is over up to 64 pairs and over rows (the overlap of wide-field scans: Vo et al. 2021, Opt. Express
     29, 17849).
 
     Args:
@@ -117,7 +117,7 @@ def _opposite_candidates(cols: int) -> Floats:
 
 
 def _opposites(projections: NDArray[np.floating], angles: Floats) -> tuple[Floats, Floats]:
-    """Slopes along the columns [pair, row, col - 1] of some rows of views, and of those half a turn on, negated."""
+    """Slopes along the columns [pair, row, col - 1] of some rows of views, and of opposite views, negated."""
     theta, cols = np.mod(np.asarray(angles, np.float64), 2 * np.pi), projections.shape[2]
     away = np.abs(np.mod(theta[:, None] - theta + np.pi, 2 * np.pi) - np.pi)
     opposite = away.argmax(axis=1)
@@ -140,7 +140,7 @@ def _rows_of(views: Floats) -> Floats:
 def _mirror_mismatch(a: Floats, b: Floats, candidates: Floats) -> Floats:
     """1 - normalised correlation of a[i] with b[2 axis - i], over the columns that both have and over all rows.
 
-    Set to 1 where these columns hold almost none of the views' variance: air alone always matches.
+    It is 1 if these columns hold too little of the views' variance: air alone always matches.
     """
     rows, cols = a.shape
     a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
@@ -218,7 +218,7 @@ def _axis_from_mass(data: Floats, theta: Floats, search: tuple[float, float] | N
     solution = covariance @ (basis.T @ centre)
     residual = centre - basis @ solution
     value, left_over = float(solution[0]), float(residual @ residual)
-    # Another axis raises the sum of squares by this much a px²; the curve is in units of a quarter of the field.
+    # An error of the axis adds this much a px² to the sum of squares; the curve is in units of a quarter of the field.
     rise = 1 / covariance[0, 0]
     candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
     curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
@@ -272,7 +272,7 @@ def _covers_half_a_turn(theta: Floats) -> bool:
 
 
 def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
-    """Views and columns, as many as are needed; their angles; and the columns that were averaged."""
+    """The necessary views and columns, their angles, and the number of columns that were averaged."""
     views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
     bin_ = -(-data.shape[2] // _MOST_COLS)
     cols = data.shape[2] // bin_
@@ -281,7 +281,7 @@ def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
 
 
 def _power(part: Floats) -> int:
-    """Exponent of the frequency by which residuals weigh: 2 where the rim is not air, which spoils low ones, else 1."""
+    """Exponent of the frequency that weighs residuals: 2 if the rim is not air (bad low frequencies), otherwise 1."""
     rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
     return 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
 
@@ -299,7 +299,7 @@ def _axis_from_wedge(data: Floats, theta: Floats, search: tuple[float, float] | 
         weighted = fit * omega**power
         return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
 
-    power = _power(part)  # one more and one less must give the same axis
+    power = _power(part)  # one harmonic more and one less must give the same axis
     curve = curve_for(power)
     full = candidates * bin_ + (bin_ - 1) / 2
     value, depth = _optimum(full, curve, search)
@@ -352,8 +352,8 @@ def find_axis(
 ) -> AxisEstimate:
     """The rotation axis of a scan from all views, checked against a pair half a turn apart if there is one.
 
-    Where all views do not tell it and they go round the full turn, pairs of opposite views do. The axis of a wide field
-    stands near an edge of the detector.
+    If all views together give no axis, and they cover the full turn, pairs of opposite views do. The axis of a wide
+    field stands near an edge of the detector.
 
     Args:
         projections: float32 [view, row, col], line integrals.
@@ -361,8 +361,8 @@ def find_axis(
         search: (lowest, highest) column; None: the whole detector.
 
     Returns:
-        The estimate from all views, or that of opposite views or of the pair if only that is confident; not confident
-        if they disagree.
+        The estimate from all views, or from opposite views or the pair if only these are confident. It is not
+        confident if they disagree.
 
     Raises:
         ValueError, AxisError: as `axis_from_sinogram`.
@@ -387,7 +387,7 @@ def find_axis(
         return from_all
     try:
         from_pair = axis_from_pair(projections[pair[0]], projections[pair[1]], search)
-    except AxisError:  # these two views do not show the axis; all views together do
+    except AxisError:  # these two views do not show the axis, but all views together do
         return from_all
     if not from_pair.confident:
         return from_all
@@ -399,14 +399,14 @@ def find_axis(
 def _confident_opposites(
     projections: NDArray[np.floating], theta: Floats, search: tuple[float, float] | None
 ) -> AxisEstimate | None:
-    with suppress(ValueError):  # an AxisError is one, too
+    with suppress(ValueError):  # an AxisError is a ValueError, too
         estimate = axis_from_opposites(projections, theta, search)
         return estimate if estimate.confident else None
     return None
 
 
 def _closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
-    """The two views nearest to half a turn apart; None if none are within the tolerance (radians)."""
+    """The two views nearest to half a turn apart; None if no pair is within the tolerance (radians)."""
     order = np.argsort(np.mod(theta, 2 * np.pi))
     turned = np.mod(theta[order], 2 * np.pi)
     extended = np.concatenate([turned, turned + 2 * np.pi])

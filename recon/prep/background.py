@@ -1,8 +1,8 @@
 """Background of the beam: the smooth surface that each view shows where its rays miss the sample.
 
 The open beam of the views may differ from the flats: it bends, moves or fades between them. Line integrals then have a
-smooth surface beside the sample's. What of it is negative, a volume without negative densities cannot hold, and takes
-from weak matter instead.
+smooth surface beside the sample's. A volume without negative densities cannot hold its negative part, and loses weak
+matter instead.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ HIGHEST = 3
 """Order of the polynomials in column and row, at most."""
 
 LEAST_SIZE = 0.005
-"""Root mean square of the surfaces, in line integrals, from which on they are taken where nobody asked for them."""
+"""Root mean square of the surfaces, in line integrals, from which on they are removed by default."""
 
-_SMOOTH = 1.5  # voxels: weak matter stands out of the noise when it is smoothed
-_SIGMAS, _MARGIN = 5.0, 4  # of the smoothed air; voxels around matter that count as matter
+_SMOOTH = 1.5  # voxels of smoothing, by which weak matter stands out of the noise
+_SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around matter that count as matter
 _MAD, _CLIPPED = 1.4826, 4.0  # normal standard deviation over median deviation; such deviations
 _BLOCK = 8  # pixels a side: every other block of air is predicted from those between
-_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # of the rays of a view; of the views
+_LEAST_AIR, _LEAST_VIEWS = 0.03, 0.9  # share of the rays of a view; share of the views
 _WINDOWS = (45, 15, 5, 1)  # views that share a surface
-_BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75  # of the mean square left: fewer views, or a higher order, must pay
-_BETTER = 0.99  # so must any surface
-_LEFT = 2.0  # times the noise: where a surface leaves more, there is no air
+_BETTER_WINDOW, _BETTER_ORDER = 0.95, 0.75  # shares of the mean square that fewer views, or a higher order, must reach
+_BETTER = 0.99  # share that any surface must reach
+_LEFT = 2.0  # times the noise: if a surface leaves more, the rays are not air
 _FARTHEST = 1000.0  # largest variance of a surface over that of a constant: beyond it extrapolates
 _ROWS_A_POWER = 4
 
@@ -65,13 +65,13 @@ class Background:
     level: float
 
     def confirmed(self, noise: float) -> bool:
-        """It is not too small, and leaves little beside the noise of binned rays in air that it was not fitted on."""
+        """It is large enough, and in air outside its fit it leaves little more than the noise of binned rays."""
         pays = self.after**2 < _BETTER * self.before**2
         return self.size >= LEAST_SIZE and pays and self.after < _LEFT * noise + LEAST_SIZE
 
     @property
     def may_be_matter(self) -> bool:
-        """It is positive: weak matter all around the sample looks like this, and a volume can hold it."""
+        """It is positive: it looks like weak matter all around the sample, which a volume can hold."""
         return self.level > 0
 
     def remove(self, views: F32, factor: int = 1) -> None:
@@ -141,12 +141,12 @@ class AirSums:
         self._totals.append([*totals])
 
     def fit(self, order: int | None = None) -> Background | None:
-        """The surfaces that predict blocks of air best that they were not fitted on; None where air is too little.
+        """The surfaces that best predict blocks of air outside their fit; None if there is too little air.
 
-        Neighbouring views share a surface as long as that predicts as well; a higher order has to pay.
+        Neighbouring views share a surface as long as it predicts equally well; a higher order must predict better.
 
         Args:
-            order: None: up to 3, as far as it pays and extrapolates little.
+            order: None: up to 3, as far as it predicts better and extrapolates little.
         """
         squares, products, totals = (np.array(x) for x in (self._squares, self._products, self._totals))
         rays, n_views = totals[..., 0], len(totals)
@@ -165,7 +165,7 @@ class AirSums:
                 break
             for width in (w for w in _WINDOWS if w <= max(n_views, 1)):
                 wide_g, wide_b = _around(g, width), _around(b, width)
-                c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # of each half by the other one
+                c = _solved(wide_g[:, ::-1], wide_b[:, ::-1])  # errors of each half by the other's surface
                 left = np.einsum("...i,...ij,...j", c, g, c) - 2 * np.einsum("...i,...i", c, b) + totals[..., 2]
                 error = float(left.sum() / count)
                 if best is None or error < best[0] * (_BETTER_WINDOW if n == best[1] else _BETTER_ORDER):
@@ -190,7 +190,7 @@ class AirSums:
         return float(np.einsum("ri,ij,rj->r", terms, np.linalg.pinv(g, hermitian=True), terms).max() * g[0, 0])
 
     def _without_outliers(self, view: F32, air: Mask) -> Mask:
-        """Air without rays that stand out of a surface of the second order."""
+        """Air, without rays that deviate from a surface of the second order."""
         t, p = self._terms[air][:, :6], view[air].astype(np.float64)
         if p.size < 2 * t.shape[1]:
             return air
@@ -200,12 +200,12 @@ class AirSums:
 
 
 def _around(values: F64, width: int) -> F64:
-    """Sums over so many views around each [view, ...]; at both ends over the first and the last of them."""
+    """Sums over so many views around each [view, ...]; at both ends over the first and the last views."""
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, axis=0)))
     first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
     return np.asarray(total[first + width] - total[first])
 
 
 def _solved(squares: F64, products: F64) -> F64:
-    """Least squares [..., term]; terms that no ray tells are 0."""
+    """Least squares [..., term]; terms that no ray determines are 0."""
     return np.asarray(np.einsum("...ij,...j", np.linalg.pinv(squares, hermitian=True), products))

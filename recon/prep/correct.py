@@ -25,15 +25,15 @@ class UnlitViewsError(ValueError):
 class References:
     """Darks and flats: the images without beam, and with beam but without a sample.
 
-    Of a stack of frames [frame, row, col], any real type, the mean is kept.
+    A stack of frames [frame, row, col], any real type, is replaced by its mean.
 
     Attributes:
-        dark: float32 [row, col], mean or median of the darks; or all of them, as a stack.
+        dark: float32 [row, col], mean or median of the darks; or all darks, as a stack.
         flats: (position, float32 [row, col]) of each group of flats, or (position, stack); the position counts frames
             of the scan.
         dynamic: how flats differ from one another; None: a view's flat is interpolated between groups.
-        part_starts: ascending, the first frame of each part of the scan. A view's flat is that of the flats of its own
-            part; of the nearest group, where this part has none.
+        part_starts: ascending, the first frame of each part of the scan. A view's flat comes from the flats of its own
+        part, or from the nearest group if its part has no flats.
     """
 
     dark: Image
@@ -54,7 +54,7 @@ class References:
 
 
 def _mean(frames: Image, what: str) -> Image:
-    """The mean of a stack; an image as it is."""
+    """The mean of a stack; an image is returned as it is."""
     if np.ndim(frames) != 3:
         return frames
     if not len(frames):
@@ -72,8 +72,8 @@ class CorrectionSettings:
             its neighbours to be masked; inf masks none.
         zinger_threshold: robust standard deviations by which a pixel must be brighter than its neighbours, and than
             itself in the neighbouring views, to be replaced; inf replaces none.
-        air: columns (left, right) that see no sample in any view and are scaled to a transmission of 1, or "auto" to
-            find them, or "none". Where both sides have some, the line through their levels is.
+        air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
+        divided by their level, or by the line through the levels of both sides.
     """
 
     floor: float = 1e-4
@@ -118,7 +118,7 @@ class Projections:
 
 
 def _flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
-    """Net flat at a frame's position: interpolated between groups of its part, the nearest group outside."""
+    """Net flat at a frame's position: interpolated between groups of its part; beyond them, the nearest group."""
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
     groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
@@ -132,7 +132,7 @@ def _flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tu
 
 @dataclass(frozen=True, eq=False)
 class Transmission:
-    """Views divided by the flat, before air and zingers are dealt with.
+    """Views divided by the flat, before the correction of air and zingers.
 
     Attributes:
         data: float32 [view, row, col], finite; `Correction.line_integrals` takes it over.
@@ -152,8 +152,7 @@ class Correction:
 
     For each batch: `transmission`, then `survey`, then `line_integrals`. A view depends on the references, on the air
     columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
-    With the same references and air columns the line integrals are the same to the bit, however the views were split
-    into batches.
+    With the same references and air columns the line integrals are the same to the bit for any split into batches.
     """
 
     def __init__(
@@ -191,7 +190,7 @@ class Correction:
             ]
         self._part_starts = references.part_starts
         self._profiles: list[NDArray[np.float32]] = []
-        self._before: Image | None = None  # the last view given out, before the logarithm
+        self._before: Image | None = None  # the last returned view, before the logarithm
         self._waiting: tuple[Transmission, NDArray[np.float32]] | None = None  # the newest view, and its air
 
     @property
@@ -200,8 +199,9 @@ class Correction:
         return self._waiting is not None
 
     def provisional(self) -> Projections | None:
-        """Line integrals of the view that waits, as if none came after it; None where none waits. It goes on waiting:
-        only its two neighbours tell all its zingers."""
+        """Line integrals of the waiting view, as if no view came after it; None without one.
+
+        It keeps waiting, because all its zingers show only beside both neighbours."""
         if self._waiting is None:
             return None
         waiting, before = self._waiting, self._before
@@ -211,7 +211,7 @@ class Correction:
 
     @property
     def air_columns(self) -> tuple[int, int]:
-        """(left, right) columns of air, as far as the views surveyed tell; (0, 0) for none."""
+        """(left, right) columns of air by the views surveyed so far; (0, 0): no columns."""
         air = self._settings.air
         if air == "auto":
             return air_columns(np.concatenate(self._profiles), self._dark.shape[1]) if self._profiles else (0, 0)
@@ -276,15 +276,15 @@ class Correction:
     def line_integrals(
         self, views: Transmission | None, last: bool = True, told: Callable[[int], None] = lambda done: None
     ) -> Projections:
-        """Line integrals of these views and of the one that waited; without `last` the newest of them waits in turn.
+        """Line integrals of these views and of the waiting one; without `last` the newest view then waits.
 
         Args:
-            views: the next ones, which the result takes over; None: the scan has ended with the one that waits.
+            views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
             last: no view comes after these.
             told: how many views are free of zingers, after each; the logarithm that follows takes little time.
 
         Raises:
-            UnlitViewsError: for views whose air columns are dark, by number.
+            UnlitViewsError: the air columns of some views are dark; it has their numbers.
         """
         settings, columns = self._settings, self.air_columns
         if views is None:
@@ -342,7 +342,7 @@ class Correction:
         beam[...] = np.where(self.masked, 0, w)
 
     def _remove_zingers(self, data: NDArray[np.float32], n: int, told: Callable[[int], None]) -> int:
-        """Take zingers out of the first `n` views; how many pixels they hit."""
+        """Remove zingers from the first `n` views; returns the number of pixels."""
         if not np.isfinite(self._settings.zinger_threshold):
             return 0
         replaced = 0
@@ -398,7 +398,7 @@ def correct(
 
 
 def merge_and_empty(parts: list[Projections]) -> Projections:
-    """Batches of one scan's views as one. The list is emptied on the way, so that no view is in memory twice for long.
+    """Batches of one scan's views as one. The list is emptied meanwhile, so that no view is in memory twice for long.
 
     The air columns and the mask are those of the last batch.
     """

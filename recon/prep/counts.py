@@ -1,4 +1,4 @@
-"""Counts: photons counted behind a sample, and their likelihood as line integrals with weights, for any method.
+"""Counts: the photons counted behind a sample, and their likelihood as line integrals with weights, for any method.
 
 The logarithm of few counts is biased (E log n < log E n), and zero has none. The likelihood has neither fault.
 """
@@ -14,11 +14,11 @@ from scipy import ndimage
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-# Smoothing of the counts that the likelihood is expanded around, in pixels. Chosen from 1, 1.5, 2 and 3 by the error of
-# the expansion on three samples at 10 to 10 000 photons, see docs/notes/exploration.md. So are the other two.
+# Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
+# of the expansion on three samples at 10 to 10 000 photons (docs/notes/exploration.md). So are the other two.
 _SIGMA, _SPREAD = 1.5, 2.0
-_DETAIL = 1.5  # variance over that of counting beyond which a place has detail
-_FEWEST = 0.25  # photons: the least that a ray is taken to expect
+_DETAIL = 1.5  # variance over that of counting; places with more have detail
+_FEWEST = 0.25  # photons: least expectation of a ray
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Photons:
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """What a detector counted, and what it counts without the sample and without the beam.
+    """Counts of a detector with the sample, without the sample (flat), and without the beam (dark).
 
     The model of a pixel (shifted Poisson: Snyder, Hammoud & White 1993, J. Opt. Soc. Am. A 10, 1014; Yavuz & Fessler
     1998): (counts - dark) / gain + v is Poisson with mean (flat - dark) / gain x e^(-line integral) + v, where v is
@@ -53,7 +53,7 @@ class Counts:
         flat: counts with the beam and without the sample, [row, col] or [view, row, col].
         dark: counts without the beam, a number or [row, col].
         gain: counts a photon, see `photon_transfer`.
-        variance: of a pixel of one dark frame, counts², a number or [row, col]: readout, and photons of no use.
+        variance: of a pixel of one dark frame, counts², a number or [row, col]: readout, and useless photons.
     """
 
     counts: ArrayLike
@@ -96,7 +96,7 @@ class Counts:
 
 
 def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64]:
-    """Line integrals and weights whose weighed squares expand the likelihood to second order, element by element.
+    """Line integrals and weights whose weighted squares are the likelihood to second order, element by element.
 
     With λ = beam e^(-p0) + extra expected at p0 = `around` and n = photons + extra counted, the negative log-likelihood
     is Σ λ - n ln λ. At p0 it has the gradient of ½ w (p - p~)², and that square's curvature is Fisher's information. p~
@@ -110,8 +110,8 @@ def expanded(photons: F64, beam: F64, extra: F64, around: F64) -> tuple[F64, F64
 def line_integrals(counts: Counts) -> tuple[F32, F32]:
     """Line integrals and weights [view, row, col] that carry the likelihood of counts to any method.
 
-    Each view is expanded around its own counts, smoothed where they show nothing but the noise of counting (Lee 1980,
-    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). Where counts are many, it is the logarithm. The weights are the
+    Each view is expanded around its own counts, smoothed where they show only the noise of counting (Lee 1980,
+    IEEE Trans. Pattern Anal. Mach. Intell. 2, 165). With many counts the result is the logarithm. The weights are the
     inverse variances of the line integrals, by the smoothed counts. Pixels that are not finite or have no beam get NaN
     and weight 0.
     """
@@ -125,12 +125,12 @@ def line_integrals(counts: Counts) -> tuple[F32, F32]:
 
 
 def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """As `line_integrals`, of one view [row, col]: what `Counts.photons` gives."""
+    """As `line_integrals`, for one view [row, col] by the images of `Counts.photons`."""
     good = np.isfinite(photons) & (beam > 0)
     light = np.where(good, beam, 1.0)
     level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
     p, _ = expanded(np.where(good, photons, level), light, extra, -np.log(level / light))
-    # Weights that follow each ray's own noise would hide noise from whoever whitens by them.
+    # Weights that follow each ray's own noise would hide this noise from methods that whiten by them.
     _, w = expanded(smooth, light, extra, -np.log(smooth / light))
     return np.where(good, p, np.nan), np.where(good, w, 0)
 
@@ -139,12 +139,12 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
     """Counts a photon, and the variance of a pixel of a dark frame (counts²), from repeated frames [frame, row, col].
 
     The variance of light grows by `gain` with its mean (photon transfer: Janesick 2007). Differences of successive
-    frames, scaled to equal means, see no fixed pattern and no drift of the beam. Medians over the pixels of what each
-    has see no defects. Blur after the photons (a scintillator's glow, resampling) lowers the variance: then the gain
+    frames, scaled to equal means, contain no fixed pattern and no drift of the beam. Medians over the pixels are free
+    of defects. Blur after the photons (a scintillator's glow, resampling) lowers the variance: then the gain
     is too small and the photons are too many.
 
     Args:
-        darks: None: the detector gives 0 without beam, and has no noise of its own.
+        darks: None: the detector gives 0 without beam, and adds no noise.
 
     Raises:
         ValueError: for fewer than two frames, or flats whose variance does not grow with the light.
@@ -166,7 +166,7 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
 
 
 def _expected(n: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
-    """Photons expected in each pixel [row, col], above 0: counts smoothed where they show no detail, and everywhere."""
+    """Photons expected in each pixel [row, col], above 0: counts smoothed where they show no detail, or all."""
     mean = _smooth(n, _SIGMA) / np.maximum(_smooth(beam, _SIGMA), 1e-12) * beam
     left = 1 - 0.75 / (np.pi * _SIGMA**2)  # of white noise's variance, in n - mean: 1 - 2 / 2πσ² + 1 / 4πσ²
     found = _smooth((n - mean) ** 2, _SPREAD) / left

@@ -74,12 +74,12 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
 
 
 def _around(image: Image, r: NDArray[np.intp], c: NDArray[np.intp]) -> tuple[Image, Image]:
-    """Median and third brightest of the eight neighbours of each (r, c); at the image edge the brightest."""
+    """Median and third brightest of the eight neighbours of each (r, c); at the image's edge the brightest."""
     rows, cols = image.shape
     nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
     inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
     values = np.where(inside, image[np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)], np.float32(np.nan))
-    values.sort(axis=1)  # NaN, the places outside, come last
+    values.sort(axis=1)  # NaN, for places outside, come last
     n, at = inside.sum(axis=1), np.arange(r.size)
     return (values[at, (n - 1) // 2] + values[at, n // 2]) / 2, values[at, np.where(n == 8, 5, n - 1)]
 

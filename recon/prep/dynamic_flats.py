@@ -1,8 +1,8 @@
-"""Dynamic flats: how the beam's shape changes from flat to flat, and how much of each change a view was taken with.
+"""Dynamic flats: components of the change of the beam from flat to flat, and their weights in each view.
 
 After Van Nieuwenhove, De Carlo, De Beenhouwer, Batenburg & Sijbers 2015, Opt. Express 23, 27975. They are principal
-components of the flats, as many as parallel analysis finds. For each view come the weights at which the corrected view
-has the least total variation. [our own: components of the logarithm, so that a flat is mean * exp(weights @ components)
+components of the flats, as many as parallel analysis finds. The weights of a view minimise the total variation of the
+corrected view. [our own: components of the logarithm, so that a flat is mean * exp(weights @ components)
 and the weights of a view are a convex fit of its line integrals]
 """
 
@@ -22,18 +22,18 @@ F64 = NDArray[np.float64]
 _FEWEST = 4  # flats
 _MOST = 10  # components
 _RANDOM = 10  # draws of parallel analysis
-_SAMPLED = 1 << 16  # pixels for the components, and for the weights of a view
+_SAMPLED = 1 << 16  # pixels used for the components, and for the weights of a view
 _APART = 4  # pixels between which differences are taken: a beam changes more slowly than noise does
 _ROUNDS = 20  # of reweighting
 _SMOOTHED = 5  # pixels a side, to tell air
-_LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1  # percentile of line integrals that is air's, its range, and its least share
-_MOST_LEFT = 3.0  # times the noise: what is left where there is matter is more
-_DARKEST = 0.05  # of the median flat; darker pixels tell nothing
+_LOWEST, _AIR, _ENOUGH = 5.0, 0.04, 0.1  # percentile of line integrals that is air; range and least share of air
+_MOST_LEFT = 3.0  # times the noise: matter leaves more
+_DARKEST = 0.05  # share of the median flat; darker pixels are not used
 
 
 @dataclass(frozen=True, eq=False)
 class DynamicFlats:
-    """What the flats of a scan have in common, and how they differ.
+    """The mean of the flats of a scan, and the components of their differences.
 
     Attributes:
         mean: float32 [row, col], of the flats without their dark.
@@ -48,24 +48,24 @@ class DynamicFlats:
         return DynamicFlats(self.mean[rows], self.components[:, rows])
 
     def flat_of(self, view: F32, floor: float = 1e-4) -> F32:
-        """The flat that this view [row, col], without its dark, was taken with; its level is that of the mean."""
+        """The flat of this view [row, col] (without its dark); it has the level of the mean."""
         w = self.weights_of(view, floor)
         return np.asarray(self.mean * np.exp(np.tensordot(w, self.components, axes=1)), np.float32)
 
     def weights_of(self, view: F32, floor: float = 1e-4) -> F32:
         """Weights [part] at which the line integrals of this view vary least from pixel to pixel (sum of absolutes).
-        Where some pixels turn out to be air, least squares of these follow.
+        If some pixels turn out to be air, least squares on these follow.
 
         Args:
             view: float32 [row, col], counts without the dark.
-            floor: lowest transmission; darker pixels tell nothing.
+            floor: lowest transmission; darker pixels are not used.
         """
         light = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
         known = light > floor
         if not len(self.components) or known.mean() < _ENOUGH:
             return np.zeros(len(self.components), np.float32)
         integral = -np.log(np.where(known, light, 1.0))
-        share = np.sqrt(np.where(known, light, 0))  # the noise of a line integral goes with one over this
+        share = np.sqrt(np.where(known, light, 0))  # the noise of a line integral is proportional to one over this
         targets, columns = [], []
         for axis in [axis for axis, size in enumerate(view.shape) if size > 1]:
             apart = min(_APART, view.shape[axis] - 1)
@@ -79,7 +79,7 @@ class DynamicFlats:
         return self._by_air(w, integral, known).astype(np.float32)
 
     def _by_air(self, w: F64, integral: F32, known: NDArray[np.bool_]) -> F64:
-        """The weights by the pixels that have no sample before them; `w` where these are few, or do not fit."""
+        """The weights by the pixels without sample; `w` if these are few, or do not fit."""
         found: NDArray[Any] = w
         for _ in range(2):
             left = integral + np.tensordot(found, self.components, axes=1)
@@ -103,9 +103,9 @@ def find_dynamic_flats(
     """Mean and principal components of flats.
 
     Args:
-        flats: gives them, float32 [row, col] without the dark, one after another, at each of three calls alike.
+        flats: returns the flats, float32 [row, col] without the dark, one after another; called three times.
         rng: for parallel analysis.
-        masked: bool [row, col], pixels that tell nothing; None: none.
+        masked: bool [row, col], pixels that are not used; None: all are used.
 
     Raises:
         ValueError: for fewer than four flats, which show no components.
@@ -133,7 +133,7 @@ def find_dynamic_flats(
 
 
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
-    """The logarithm of a flat over the mean, without its level; 0 where it tells nothing."""
+    """The logarithm of a flat over the mean, without its level; 0 in unused pixels."""
     ratio = np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0))
     shape = np.log(ratio)
     return np.asarray(np.where(good, shape - shape[good].mean(), 0), np.float32)
@@ -168,7 +168,7 @@ def _least_absolute(matrix: F64 | F32, target: F64 | F32) -> F64:
 
 
 def _shifted(axis: int, apart: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Where the first and the second pixel of each pair along an axis are."""
+    """Slices of the first and the second pixel of each pair along an axis."""
     whole = (slice(None), slice(None))
     first, second = list(whole), list(whole)
     first[axis], second[axis] = slice(None, -apart), slice(apart, None)

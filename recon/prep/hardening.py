@@ -18,7 +18,7 @@ F64 = NDArray[np.float64]
 
 _NODES = 2048
 _FEWEST_RAYS, _MOST_RAYS = 100, 5000
-_LEAST_EXPLAINED = 0.9  # of the variance of line integrals, by thickness, for a sample of one material
+_LEAST_EXPLAINED = 0.9  # share of the variance of line integrals that thickness explains, for a sample of one material
 
 
 class NoCurveError(ValueError):
@@ -44,7 +44,7 @@ class Curve:
             raise ValueError("a curve needs two nodes or more, measured and corrected ascending")
 
     def linearise(self, views: F32, weights: F32 | None = None) -> None:
-        """Replace line integrals of any shape by corrected ones, and inverse variances by theirs, in place."""
+        """Replace line integrals of any shape, and their inverse variances, by corrected ones, in place."""
         slopes = np.diff(self.corrected) / np.diff(self.measured)
         for n, view in enumerate(views):
             piece = np.clip(np.searchsorted(self.measured, view) - 1, 0, slopes.size - 1)
@@ -59,7 +59,7 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
     Args:
         weights: shares of the light detected at these energies, of any sum.
-        highest: measured line integral that it must reach.
+        highest: measured line integral at the curve's end, at least.
     """
     mu, w = np.asarray(attenuations, np.float64), np.asarray(weights, np.float64)
     mu = mu / (mu @ w / w.sum())
@@ -69,19 +69,20 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
 
 def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
-    """The curve of two energies that is closest to line integrals over paths through the material. (Van de Casteele et
-    al. 2002, Phys. Med. Biol. 47, 4181): it always rises, and less and less.
+    """The curve of two energies closest to line integrals over paths through the material.
+
+    (Van de Casteele et al. 2002, Phys. Med. Biol. 47, 4181.) It always rises, with a falling slope.
 
     Args:
         measured: line integrals.
-        paths: lengths of the rays inside the material, in any unit; 0 of rays beside it, which have to be air.
+        paths: lengths of the rays inside the material, in any unit; 0 for rays beside it, which must be air.
         highest: as of `curve_of_spectrum`.
 
     Returns:
         The curve, and the share of the line integrals' variance that it explains.
 
     Raises:
-        NoCurveError: there are few rays, or the sample is not of one material.
+        NoCurveError: there are too few rays, or the sample has several materials.
     """
     p, length = np.ravel(np.asarray(measured, np.float64)), np.ravel(np.asarray(paths, np.float64))
     few = slice(None, None, max(1, p.size // _MOST_RAYS))

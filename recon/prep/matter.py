@@ -1,7 +1,7 @@
 """Matter: how a material attenuates and delays X-rays, for the corrections of phase and beam hardening.
 
 Cross sections are those of xraylib from 0.1 to 800 keV (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011). The
-simulator reads the same tables and states the same compositions and densities. All else is computed here anew: no
+simulator reads the same tables and states the same compositions and densities. All formulas here are separate: no
 correction is tested with the formulas that made its data.
 """
 
@@ -59,7 +59,7 @@ def delta_beta(name: str, energy_kev: float) -> float:
         name: of a known material, or a chemical formula.
 
     Raises:
-        ValueError: neither of them, or an energy outside the tables.
+        ValueError: an unknown name or formula, or an energy outside the tables.
     """
     beta = 0.1 * float(mass_attenuation(name, energy_kev)) * HC / energy_kev / (4 * math.pi)
     electrons = sum(
@@ -69,7 +69,7 @@ def delta_beta(name: str, energy_kev: float) -> float:
 
 
 def mass_attenuation(name: str, energies: ArrayLike) -> F64:
-    """Mass attenuation in cm²/g at energies in keV, float64, of their shape; errors as of `delta_beta`."""
+    """Mass attenuation in cm²/g at energies in keV, float64, same shape; errors as in `delta_beta`."""
     e = np.asarray(energies, np.float64)
     if not ((e >= _LEAST_KEV) & (e <= _MOST_KEV)).all():
         raise ValueError(
@@ -89,7 +89,7 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
         filters: mm of each known material before the sample.
 
     Returns:
-        Energies in keV, float64 [energy], and the shares of the photons at them, of any sum.
+        Energies in keV, float64 [energy], and their shares of the photons, of any sum.
 
     Raises:
         ValueError: a voltage outside 5 ... 800 kV, a filter without a known density, or no light behind the filters.

@@ -1,4 +1,4 @@
-"""Phase: rims that a wave gets between sample and detector, turned into contrast by the filter of a single distance."""
+"""Phase: turns the bright rims of a propagated wave into contrast, by the filter for a single distance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ F32 = NDArray[np.float32]
 
 HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""
-_REACH = 4.0  # lengths, beyond which a pixel is felt by exp(-4)
+_REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,13 @@ class Paganin:
     """Line integrals of a sample of one material, from its intensity at one distance behind it.
 
     The transmission's transform is divided by 1 + (2 pi f length)², f in cycles a pixel (Paganin et al. 2002, J.
-    Microsc. 206, 33, equation 12). The frame's edges are mirrors. Where absorption is weak and noise strong, it lowers
-    the noise most; detail finer than its length is noise's again.
+    Microsc. 206, 33, equation 12). The frame's edges are mirrors. It lowers the noise most if absorption is weak;
+    detail finer than its length is lost to noise.
 
     Attributes:
         length: sqrt(distance delta / mu), in pixels, see `length_of`.
-        unsharp: (sigma in pixels, weight) of a mask that gives fine detail back: weight times what a Gaussian blur
-            takes from the transmission is added; None: none.
+        unsharp: (sigma in pixels, weight) of a mask that restores fine detail: it adds weight times the difference of
+        the transmission and its Gaussian blur. None: no mask.
     """
 
     length: float
@@ -42,11 +42,11 @@ class Paganin:
 
     @property
     def reach(self) -> int:
-        """Pixels from which a pixel takes something."""
+        """Distance in pixels up to which others influence a pixel."""
         return math.ceil(_REACH * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
 
     def retrieve(self, views: F32, floor: float) -> None:
-        """Replace line integrals [view, row, col] as they were seen by those of the sample, in place.
+        """Replace measured line integrals [view, row, col] by those of the sample, in place.
 
         Args:
             floor: lowest transmission that counts.

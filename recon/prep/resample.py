@@ -1,8 +1,7 @@
-"""Resampling: views of a detector that is turned about the beam, or behind a lens that distorts, as a straight one sees
-them.
+"""Resampling: corrects views of a detector that is turned about the beam, or behind a lens that distorts.
 
 Positions are pixels of the whole detector, 0 at the centre of the first one. A pixel (col, row) of the new view is
-taken from where it was seen: first turned about the middle of the detector, then displaced by the lens.
+taken from its place on the detector: first turned about the detector's middle, then displaced by the lens.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_TAPS = 6  # pixels along each side that a new pixel is made of
+_TAPS = 6  # taps: pixels along each side that make a new pixel
 _BEFORE = _TAPS // 2 - 1  # taps before a place
-_PHASES = 4096  # steps of a pixel by which weights are tabled
+_PHASES = 4096  # steps in a pixel at which weights are tabulated
 _LOOKED_AT = 65  # positions along each side at which the reach is measured
 
 
@@ -46,10 +45,10 @@ class Distortion:
 
     @classmethod
     def parse(cls, text: str) -> Distortion:
-        """What discorpy writes to a text file: lines of a name and a value, xcenter, ycenter, factor0, factor1 ...
+        """Read discorpy's text file: lines of a name and a value, xcenter, ycenter, factor0, factor1 ...
 
         Raises:
-            ValueError: there are other lines, or values that are no such model.
+            ValueError: there are other lines, or values that do not form such a model.
         """
         lines = [line.replace("=", " ").replace(":", " ").split() for line in text.splitlines() if line.strip()]
         expected = ["xcenter", "ycenter", *(f"factor{i}" for i in range(len(lines) - 2))]
@@ -74,8 +73,8 @@ class Resampling:
         shape: (rows, cols) of the whole detector.
         tilt: radians by which the rotation axis leans in the detector's plane: its column grows by tan(tilt) a row. A
             `Geometry` calls such a lean roll; its own tilt is the one along the beam.
-        distortion: of the lens; None: none.
-        binning: pixels of the views are the means of so many a side.
+        distortion: of the lens; None: no distortion.
+        binning: each pixel of the views is a mean of so many pixels a side.
     """
 
     shape: tuple[int, int]
@@ -85,7 +84,7 @@ class Resampling:
 
     @property
     def reach(self) -> int:
-        """Rows, binned, beside a row from which it takes something."""
+        """Distance in binned rows up to which others influence a row."""
         rows, cols = (np.linspace(0, n - 1, _LOOKED_AT) for n in self.shape)
         seen = self._seen_at(*np.meshgrid(cols, rows))[1]
         return math.ceil(float(np.abs(seen - rows[:, None]).max()) / self.binning) + _TAPS // 2
@@ -93,10 +92,10 @@ class Resampling:
     def apply(self, views: F32, first: int) -> None:
         """Replace views [view, row, col] by resampled ones, in place.
 
-        What lies beyond the rows and columns given is taken from the nearest pixel.
+        Pixels beyond the given rows and columns take the value of the nearest one.
 
         Args:
-            first: row of the detector at which they begin.
+            first: detector row of the views' first row.
         """
         rows, cols = self._places(views.shape[1:], first)
         table = _weights()
@@ -118,14 +117,13 @@ class Resampling:
         return (rows < -0.5) | (rows > high - 0.5) | (cols < -0.5) | (cols > wide - 0.5)
 
     def places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
-        """(row, col) on the detector, each [row, col], at which the pixels of views that begin at row `first` were
-        seen."""
+        """Places (row, col) on the detector, each [row, col], of the pixels of views that begin at row `first`."""
         rows, cols = (np.arange(length) * self.binning + (self.binning - 1) / 2 for length in shape[-2:])
         col, row = self._seen_at(*np.meshgrid(cols, rows + first))
         return row, col
 
     def _places(self, shape: tuple[int, ...], first: int) -> tuple[F64, F64]:
-        """(row, col) in the views given, of each of their new pixels."""
+        """Places (row, col) in the given views, of each new pixel."""
         row, col = self.places(shape, first)
         middle = (self.binning - 1) / 2
         return (row - middle) / self.binning - first / self.binning, (col - middle) / self.binning

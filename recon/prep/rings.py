@@ -1,4 +1,4 @@
-"""Rings: pixels that answer unequally to the beam make stripes in a sinogram, rings in a slice; here they are removed.
+"""Rings: removes the stripes that pixels with unequal response make in a sinogram; in a slice they are rings.
 
 A sinogram is float32 [view, col] of one detector row, line integrals in the order of their angles, where a stripe is a
 column. Stripes of views that cover little angle cannot be told from the sample's own edges.
@@ -21,12 +21,12 @@ from recon.base.choices import Rings
 F32 = NDArray[np.float32]
 
 _ROBUST = 1.4826  # median deviation to standard deviation, for normal values
-_FAR = 3.0  # standard deviations from which on a column is another than its neighbours (Vo 2018: snr 3)
-_FEWEST_VIEWS, _NARROWEST = 8, 64  # in 40 columns what was put in was more than what was taken out
+_FAR = 3.0  # standard deviations by which a column differs from its neighbours (Vo 2018: snr 3)
+_FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more than they remove
 _MOST = 0.1  # of the columns
-_EVEN = 0.4  # of a shift by which it may differ from view to view (standard deviation)
+_EVEN = 0.4  # share of a shift by which it may differ from view to view (standard deviation)
 _SEEN = 4.5  # `stripe_score` from which on there are stripes: 1.4 to 3.6 without, 5 to 10 in two real scans
-_LEVELS, _DAMPING = 2, 1.0  # of the wavelets; more levels take wider stripes, and more of the sample
+_LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
 
 # Scaling filter of Daubechies' wavelet with five vanishing moments (Daubechies 1992, table 6.1).
 _DB5 = np.array(
@@ -36,17 +36,17 @@ _DB5 = np.array(
 
 
 def width_for(cols: int) -> int:
-    """Odd number of columns for a median along them, wider than small stripes and narrower than the sample. 31 for
-    2048, 7 for 160, 3 for 40."""
+    """Odd number of columns for a median: wider than small stripes and narrower than the sample. 31 for 2048, 7 for
+    160, 3 for 40."""
     return 2 * round(max(cols * 0.015, min(6.0, cols / 24)) / 2) + 1
 
 
 def by_sorting(sinogram: F32, width: int | None = None) -> F32:
-    """Small and medium stripes out: a median along the columns of values sorted in each column.
+    """Remove small and medium stripes by a median across columns, after sorting the values of each column.
 
     A stripe shifts all values of its column. Sorted, neighbouring columns look alike, so that the difference is the
     stripe (Vo, Atwood & Drakopoulos 2018, Opt. Express 26, 28396, algorithm 3). [our own: a stripe adds about the same
-    to all views, and only that is taken; edges of metal made black streaks across the slice]
+    to all views, and only that is removed; otherwise edges of metal leave black streaks across the slice]
     """
     order = np.argsort(sinogram, axis=0, kind="stable")
     ranked = np.take_along_axis(sinogram, order, axis=0)
@@ -59,10 +59,10 @@ def by_sorting(sinogram: F32, width: int | None = None) -> F32:
 
 
 def without_dead_columns(sinogram: F32) -> F32:
-    """Columns that hardly answer, or flicker, filled from their neighbours (Vo et al. 2018, algorithm 6).
+    """Fill columns that hardly respond, or flicker, from their neighbours (Vo et al. 2018, algorithm 6).
 
-    They are told by how much they vary from view to view, against a median of the columns around. [our own: by the
-    median of the views; edges of metal cross a column in a few of them]
+    Such a column varies more or less from view to view than the median of the columns around. [our own: by the median
+    of the views, because edges of metal cross a column in a few views]
     """
     rough = np.median(np.abs(sinogram - uniform_filter1d(sinogram, 11, axis=0, mode="nearest")), axis=0)
     bad = _outliers(np.log(np.maximum(rough, 1e-12) / np.maximum(_around(rough, 4), 1e-12)), 2 * _FAR)
@@ -70,11 +70,11 @@ def without_dead_columns(sinogram: F32) -> F32:
 
 
 def without_large_stripes(sinogram: F32) -> F32:
-    """Wide or strong stripes shifted onto their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
+    """Shift wide or strong stripes to the level of their neighbours (Vo et al. 2018, algorithm 5, in line integrals).
 
-    A column is changed only where its sorted values lie off those around by three times the noise of a pixel. They must
-    do so over their middle four fifths, by about as much everywhere. If that is a tenth of all columns, no column is
-    changed. [our own: the second condition; metal near the axis was taken for a stripe]
+    A column is changed only if its sorted values differ from those around by three times the noise of a pixel. They
+    must do so over their middle four fifths, by about as much everywhere. If a tenth of all columns do, no column is
+    changed. [our own: the second condition; without it metal near the axis counts as a stripe]
     """
     ranked = np.sort(sinogram, axis=0)
     smooth = median_filter(ranked, (1, 2 * width_for(sinogram.shape[1]) + 1), mode="nearest")
@@ -84,18 +84,18 @@ def without_large_stripes(sinogram: F32) -> F32:
     far = np.abs(shift) > _FAR * max(_noise(sinogram), _ROBUST * float(np.median(np.abs(shift))))
     far &= off.std(axis=0) < _EVEN * np.abs(shift)
     if far.mean() > _MOST:
-        return sinogram  # so many are the sample's own
+        return sinogram  # so many columns belong to the sample
     return sinogram - np.where(far, shift, 0).astype(np.float32)
 
 
 def by_vo(sinogram: F32) -> F32:
-    """Dead columns, large stripes, then small ones, one after another (Vo et al. 2018, section 3.7)."""
+    """Remove dead columns, then large stripes, then small ones (Vo et al. 2018, section 3.7)."""
     return by_sorting(without_large_stripes(without_dead_columns(sinogram)))
 
 
 def by_wavelets(sinogram: F32, levels: int = _LEVELS, damping: float = _DAMPING) -> F32:
-    """Stripes out of the wavelet coefficients that hold them (Münch, Trtik, Marone & Stampanoni 2009, Opt. Express 17,
-    8567).
+    """Remove stripes from the wavelet coefficients that hold them (Münch, Trtik, Marone & Stampanoni 2009, Opt. Express
+    17, 8567).
 
     Coefficients that are smooth along the views and rough along the columns hold the stripes. There, frequencies k
     along the views are damped by 1 - exp(-k² / (2 damping²)).
@@ -125,10 +125,10 @@ REMOVERS: Mapping[str, Callable[[F32], F32]] = MappingProxyType(
 
 
 def stripe_score(sinogram: F32) -> float:
-    """How far columns lie off the four beside them in most views, in the noise of that figure; about 1 without stripes.
+    """Typical difference of a column from the four beside it, over its own noise; about 1 without stripes.
 
-    The median over views leaves out edges of the sample, which cross a column in a few views. A body that stands on the
-    axis stays, and counts as a stripe.
+    It is a median over views, without edges of the sample, which cross a column in a few views. A body on the axis
+    stays in its columns, and counts as a stripe.
     """
     x = sinogram
     off = (x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4) / math.sqrt(1.25)
@@ -145,8 +145,8 @@ class WithoutRings:
 
     Attributes:
         data: float32 [view, row, col], line integrals.
-        taken: float32 [row, col], what was taken from a view on average.
-        said: what was done, in a sentence.
+        taken: float32 [row, col], mean removed part of a view.
+        said: a sentence about the removal.
     """
 
     data: F32
@@ -182,11 +182,11 @@ def remove_rings_in_place(views: F32, angles: NDArray[np.float64], rings: Rings)
     Args:
         views: in any order; fewer than 8, or of fewer than 64 columns, are not changed.
         angles: [view], radians.
-        rings: the way; "auto": by `stripe_score` of some rows, `sort` where stripes are seen and `vo` where columns
-            are dead or far off, or nothing.
+        rings: the method. "auto" looks at `stripe_score` of some rows: `sort` for stripes, `vo` for columns that are
+        dead or far off, otherwise nothing.
 
     Returns:
-        float32 [row, col], what was taken from a view on average, and a sentence about it; "" where nothing was asked.
+        float32 [row, col], mean removed part of a view, and a sentence about it; "" for "none".
     """
     taken = np.zeros(views.shape[1:], np.float32)
     if rings == "none":
@@ -255,7 +255,7 @@ def _outliers(values: NDArray[np.floating], limit: float) -> NDArray[np.bool_]:
 
 
 def _filled(sinogram: F32, bad: NDArray[np.bool_]) -> F32:
-    """Bad columns by the line between the good ones beside them; nothing where more than half are bad."""
+    """Bad columns filled by the line between the good ones beside them; unchanged if more than half are bad."""
     if not bad.any() or bad.mean() > 0.5:
         return sinogram
     good, wanted = np.flatnonzero(~bad), np.flatnonzero(bad)

@@ -1,4 +1,4 @@
-"""find_tilt: by how much the rotation axis leans in the detector's plane, from its place in bands of rows."""
+"""find_tilt: the angle by which the rotation axis leans in the detector's plane, from its column in bands of rows."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from recon.prep.align import opposite_curves, wedge_curves
 F64 = NDArray[np.float64]
 
 STEEPEST = math.radians(5)
-"""Tilts beyond it are not looked for."""
+"""Largest tilt of the search, radians."""
 FEWEST_BANDS = 4
-_DEEP = 0.2  # by which the logarithm of the mismatch must be lower at the axes found than it is typically
-_FLOOR = 1e-3  # mismatch; lower ones say nothing more
-_NEWTON, _CLOSE = 20, 1e-4  # steps, and px at which they end
-_OWN = 6  # px from the line within which a band's own axis is looked for
+_DEEP = 0.2  # least difference of the logarithm of the mismatch between the found axes and typical ones
+_FLOOR = 1e-3  # least mismatch that counts
+_NEWTON, _CLOSE = 20, 1e-4  # steps, and the change in px at which they end
+_OWN = 6  # px from the line: search range of a band's own axis
 
 
 @dataclass(frozen=True)
@@ -41,23 +41,23 @@ class TiltEstimate:
 def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEstimate:
     """The straight line through the axes of bands of rows with the least sum of the logarithms of their mismatches.
 
-    The mismatch of a band with an axis is that of the double wedge. Where that does not tell it and the views go round
-    the full turn, it is that of opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band
-    whose noise is not known: it weighs little where a band fits badly with any axis, as air or a clipped row does. The
-    uncertainty has two parts: that of the jackknife over bands, or over neighbouring ones together, which see the same
-    sample, where that is larger (Efron & Stein 1981, Ann. Stat. 9, 586); and the scatter of the bands' own axes about
-    the line, as the jackknife is too small where few bands carry the estimate.
+    The mismatch of a band with an axis comes from the double wedge. If that fails and the views cover the full turn, it
+    comes from opposite views (see `recon.prep.align`). Its logarithm is the likelihood of a band with unknown noise: a
+    band that fits badly with any axis, such as air or a clipped row, weighs little. The uncertainty has two parts. One
+    is the jackknife over bands, or over groups of neighbours (which see the same sample) if that is larger (Efron &
+    Stein 1981, Ann. Stat. 9, 586). The other is the scatter of the bands' own axes about the line, as the jackknife is
+    too small if few bands carry the estimate.
 
-    A tilt also turns the views: rows mix by tilt times half the width. The estimate is exact where that is little, and
-    is better of views that were levelled by a first one.
+    A tilt also turns the views: rows mix by tilt times half the width. The estimate is exact if that is small, and
+    better on views levelled by a first estimate.
 
     Args:
         bands: [view, band, col], line integrals of thin bands of rows.
-        heights: [band], px of the bands' middles from the row that `axis_col` is of.
+        heights: [band], px of the bands' middles from the row of `axis_col`.
         angles: [view], radians.
 
     Raises:
-        ValueError: fewer than 4 bands, or bands that do not tell where the axis is.
+        ValueError: fewer than 4 bands, or bands that do not show the axis.
     """
     data, heights = np.asarray(bands, np.float64), np.asarray(heights, np.float64)
     if data.ndim != 3 or heights.shape != data.shape[1:2] or len(angles) != len(data):
@@ -110,10 +110,10 @@ def _line(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
 
 
 def _scatter(splines: list[CubicSpline], heights: F64, line: F64) -> float:
-    """Standard deviation of the slope by how far from the line the bands have their own axes (weighted least squares).
+    """Standard deviation of the slope from the distances of the bands' own axes to the line (weighted least squares).
 
-    A band's weight is the bend of its logarithm. Those at the ends, which turn the line, may be few. So the scatter is
-    divided by how many bands carry the slope, not by their number.
+    A band's weight is the curvature of its logarithm. Few bands may lie at the ends, which determine the slope. The
+    scatter is therefore divided by the effective number of bands for the slope, not by their total.
     """
     at = line[0] + line[1] * heights
     value, second = (np.array([spline(x, order) for spline, x in zip(splines, at, strict=True)]) for order in (0, 2))
@@ -136,7 +136,7 @@ def _descend(splines: list[CubicSpline], heights: F64, bands: NDArray[np.int64],
             np.array([splines[b](x, order) for b, x in zip(bands, at, strict=True)]) for order in range(3)
         )
         weight = 1 / np.maximum(value, _FLOOR)
-        first, second = weight * first, weight * np.maximum(second, 0)  # beyond its own trough a band bends nothing
+        first, second = weight * first, weight * np.maximum(second, 0)  # a band counts only within its own minimum
         bend = np.array([[second.sum(), (h * second).sum()], [(h * second).sum(), (h * h * second).sum()]])
         if np.linalg.det(bend) <= 0:
             raise ValueError("no clear optimum")

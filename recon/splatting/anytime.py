@@ -1,9 +1,9 @@
-"""Rates and mean of a fit whose number of steps is not known.
+"""Anytime: rates and mean of a fit with an unknown number of steps.
 
 The rates fall as 1 / (1 + t / 60) with the steps t, and the model is the mean of the parameters over the last quarter
-of them. A step follows one or two views, so at a high rate the parameters wander about the point where all views would
-have them. Their mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit
-whose rates were planned to end there (docs/notes/performance.md, "Streaming").
+of them. A step uses one or two views, so at a high rate the parameters wander about the optimum of all views. Their
+mean does not (Polyak & Juditsky 1992). After any number of steps the mean is about as good as a fit whose rates
+were planned to end there (docs/notes/performance.md, "Streaming").
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from recon.splatting.settings import FitSettings
 
 HALF = 60.0  # steps after which the rates are half of the first ones
 _WINDOW = 0.25  # share of the steps over which the mean is taken
-_EVERY = 4  # steps between two of the mean
+_EVERY = 4  # steps between two terms of the mean
 
 WHILE_VIEWS_COME = FitSettings(decay=0.02, policy=DensityPolicy(start=0.0, stop=2.0))
-"""The rates of a fit to all views, to a lower end; density control at any rate, as far as the rounds make room."""
+"""The rates of a fit to all views, with a lower end; density control in every round, within the round's limit."""
 
 
 def while_views_come(settings: FitSettings) -> FitSettings:
-    """The same, with what a caller's settings have other than the defaults."""
+    """The same, with the caller's settings where these differ from the defaults."""
     usual = FitSettings()
     chosen = {
         f.name: value for f in fields(FitSettings) if (value := getattr(settings, f.name)) != getattr(usual, f.name)
     }
-    if isinstance(policy := chosen.get("policy"), DensityPolicy):  # how many steps there will be is not known
+    if isinstance(policy := chosen.get("policy"), DensityPolicy):  # the number of steps to come is not known
         chosen["policy"] = replace(policy, start=0.0, stop=2.0)
     return replace(WHILE_VIEWS_COME, **chosen)
 
 
 def fallen(steps: int, settings: FitSettings) -> float:
-    """How far the rates have come after so many steps on their logarithmic way to the last ones, 0..1.
+    """Share, 0..1, of the rates' logarithmic way to the last ones after so many steps.
 
     Rates that are lower from the start fall as much later.
     """
@@ -44,7 +44,7 @@ def fallen(steps: int, settings: FitSettings) -> float:
 
 
 def average(state: FitState, since: int) -> None:
-    """Take the parameters into their mean, at every fourth step; the first ones are the mean.
+    """Add the parameters to their mean, at every fourth step; the first ones start it.
 
     Args:
         since: the step that the last quarter is counted from.
@@ -60,5 +60,5 @@ def average(state: FitState, since: int) -> None:
 
 
 def averaged(state: FitState) -> FitState:
-    """The state with the mean of its parameters in their place, where one is kept; it shares their memory."""
+    """The state with the mean in place of its parameters, if a mean is kept; it shares their memory."""
     return state if state.mean is None else replace(state, parameters=state.mean)

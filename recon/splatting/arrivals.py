@@ -1,5 +1,4 @@
-"""Views that arrive one by one: what of them is taken, which of them a step learns, and how an axis that moves moves
-what they show."""
+"""Arrivals: views that arrive one by one: their checks, the order of learning, and the effect of a moved axis."""
 
 from __future__ import annotations
 
@@ -45,9 +44,9 @@ def span(theta: NDArray[np.float64]) -> float:
 
 
 def shift_with_axis(theta: NDArray[np.float64], moved: float) -> NDArray[np.float32]:
-    """The shift (x, y) of all points that is nearest to one of the axis by `moved` in the views at `theta`.
+    """The shift (x, y) of all points that best matches a shift of the axis by `moved` in the views at `theta`.
 
-    An axis that is off by d puts a point x cos θ + y sin θ + d off; the shift (a, b) has a cos θ + b sin θ nearest to
+    With an axis off by d a point appears at x cos θ + y sin θ + d. The shift (a, b) makes a cos θ + b sin θ nearest to
     d: (0, 4 d / π) for evenly spread views.
     """
     across = np.stack((np.cos(theta), np.sin(theta)), 1)

@@ -119,7 +119,7 @@ def backend_for(device: str) -> Backend[Any]:
     Raises:
         ImportError: triton is not installed.
         RuntimeError: torch sees no CUDA device.
-        ValueError: another kind of device, or a CUDA device that is not there or not the current one.
+        ValueError: another kind of device, or a CUDA device that is missing or not the current one.
     """
     if device == "cpu":
         return Cpu()

@@ -46,10 +46,10 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
 def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None = None) -> FitState:
     """The inverse of `arrays_of`: the fit continues as if it had not been interrupted.
 
-    Without `kernel_exponent`, as checkpoints were before there was another kernel, it is one of Gaussians.
+    Without `kernel_exponent` the kernel is Gaussian.
 
     Raises:
-        ValueError: where arrays are missing, disagree in length, or hold values that are not finite.
+        ValueError: arrays are missing, disagree in length, or hold values that are not finite.
     """
     device, arrays = backend or Cpu(), {"kernel_exponent": np.array(math.inf), **arrays}
     groups = ("parameters", "first", "second")

@@ -26,15 +26,15 @@ Rule = Literal["mass", "published"]
 class DensityPolicy:
     """When density control runs, and its thresholds.
 
-    `every`, `stop` and `threshold` are those of Zha et al. 2024, the rest is for short fits. See `published` for all
-    of theirs.
+    `every`, `stop` and `threshold` are those of Zha et al. 2024, the others are for short fits. `published` has all
+    published settings.
 
     Attributes:
         start, stop: first and last step as fractions of all steps.
         every: steps between two rounds.
         threshold: mean gradient of the loss with respect to a centre, per half detector width, above which a Gaussian
             is split or cloned.
-        large: fraction of the field above whose length it is split; a smaller one is cloned.
+        large: a Gaussian longer than this fraction of the field is split; a smaller one is cloned.
         prune_below: density (in density units) below which a Gaussian is removed.
         growth: largest number of Gaussians, relative to the number at the start.
         rule: "mass": clones and splits conserve the mass of the Gaussian, see `control`. "published": a clone is two
@@ -87,8 +87,8 @@ def control(
 ) -> Change:
     """Compute one round. By the rule "mass" every clone and split conserves ρ √|Σ|: the projections hardly change.
 
-    Pruning comes first: a model at its limit may add as many Gaussians as were pruned. Together the two then relocate
-    Gaussians, at a constant number, from where they are faint or outside the box to where the statistic is largest.
+    Pruning comes first: a model at its limit may add as many Gaussians as were pruned. The number then stays constant,
+    and faint or outside Gaussians are in effect relocated to places where the statistic is largest.
     Only the mass of the pruned ones is lost, which is negligible.
 
     Args:
@@ -133,7 +133,7 @@ def _halves(
     """Splits and clones Gaussians by the rule "mass".
 
     Splitting: two Gaussians at ±0.75 σ along the longest axis with σ √(1 - 0.75²) conserve mass, mean and covariance.
-    Cloning: two of half the density, a small distance apart, since two equal ones would always get equal gradients.
+    Cloning: two of half the density, a small distance apart, since equal ones would always get equal gradients.
 
     Returns:
         Shifts of the first and second halves [n, 3] mm, what is added to their log scales [n, 3], and what their

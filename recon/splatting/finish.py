@@ -203,7 +203,7 @@ def _deviation(left: F32, weights: F32 | None) -> float:
 
 
 def _without_outliers(data: F32, weights: F32 | None, model: F32) -> tuple[F32, F32 | None]:
-    """Data and weights where single rays that disagree with the model by as much as it has matter weigh nothing.
+    """Data and weights, with weight zero for single rays that differ from the model by as much as its matter.
 
     The fit, which counts absolute differences, is not led astray by them; squares would be.
     """

@@ -1,4 +1,4 @@
-"""FitMethod: what a fit of Gaussians is asked for; StreamingMethod: one whose volume can grow while views arrive."""
+"""FitMethod: the interface of a fit of Gaussians; StreamingMethod: methods whose volume can grow while views arrive."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FitMethod(Method, Protocol):
 
     @property
     def planned_steps(self) -> int | None:
-        """Steps that end the fit; None where `seconds` alone do."""
+        """Number of steps of the fit; None if only `seconds` end it."""
         ...
 
     def finish_sweeps(self, geometry: Geometry) -> int:
@@ -52,7 +52,7 @@ class FitMethod(Method, Protocol):
 
 @runtime_checkable
 class StreamingMethod(FitMethod, Protocol):
-    """A method whose volume can grow while views arrive; its `seconds` are those of the last round, over all views."""
+    """A method whose volume can grow while views arrive; `seconds` is the time of the last round, over all views."""
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit of views with the geometry of `template`, whose angles are ignored."""

@@ -18,7 +18,7 @@ from recon.base.kernel import Kernel
 class Gaussians:
     """σ(x) = Σ_i ρ_i f((x - p_i)ᵀ Σ_i⁻¹ (x - p_i)),  Σ = R S² Rᵀ,  f(q) = exp(-q/2)   (Zha et al. 2024).
 
-    With another kernel f they keep their name, and S its meaning of standard deviations.
+    With another kernel f they are still called Gaussians, and S still holds standard deviations.
 
     Attributes:
         means: [n, 3] mm, (x, y, z).

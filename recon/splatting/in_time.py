@@ -1,4 +1,4 @@
-"""In time: what of a fit's seconds goes to its start, its steps, its finish on voxels, and its volume."""
+"""In time: divides a fit's seconds among its start, its steps, its finish on voxels, and its volume."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from recon.voxels.tv import TotalVariationProx, difference_weights
 Clock = Callable[[], float]
 
 FINISH_SHARE = 0.8
-"""Of what is left after the first steps, at most: a finish adds more than most of the steps before it."""
+"""Largest share of the finish in the time after the first steps: it adds more than most steps before it."""
 
-_GROWTH = 1.5  # how many times as many Gaussians a fit may end with, and so how much longer filling takes
+_GROWTH = 1.5  # a fit may end with so many times the Gaussians, and filling then takes so many times longer
 _SLAB = 16  # slices that are filled to measure it
 _DRAWN = 8  # slices that Gaussians are drawn from to measure it
 _SWEPT_VIEWS = 8
-_COLS = 96  # of binned pixels, by which the time of a start is guessed
-# What goes before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a
-# subset, projections and an FBP.
+_COLS = 96  # binned pixels by which the time of a start is estimated
+# Work before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a subset,
+# projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 
 
 def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     """Time of a sweep of FISTA-TV over all views; infinite for rolled or tilted ones, which voxels do not take.
 
-    A few views are projected there and back, and one proximal step of total variation is taken, to measure it.
+    It is measured on projections of a few views in both directions and one proximal step of total variation.
     """
     if not geometry.is_straight:
         return math.inf
@@ -52,7 +52,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """The same of straight views, guessed before anything else from binned pixels, in little time."""
+    """The same for straight views, estimated quickly at the beginning from binned pixels."""
     straight = geometry.straightened()
     factor = max(1, min(straight.detector_shape[1] // _COLS, straight.detector_shape[0]))
     coarse = straight.binned(factor)
@@ -62,7 +62,7 @@ def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def first_draw_seconds(grid: Grid, count: int, now: Clock) -> float:
-    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, which is all matter."""
+    """Time to draw so many Gaussians from a first volume, measured on some slices of noise, which count as matter."""
     nz, ny, nx = grid.shape
     slices = min(_DRAWN, nz)
     slab, rng = grid.part(slice(0, slices), slice(0, ny), slice(0, nx)), np.random.default_rng(0)
@@ -83,16 +83,16 @@ def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
 def finish_within(
     seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock
 ) -> tuple[int | None, float]:
-    """Sweeps of a fit's finish that `seconds` suffice for, at most `SWEEPS`, and the seconds that they will take.
+    """Sweeps of a fit's finish within `seconds`, at most `SWEEPS`, and the time that they will take.
 
-    None: as many as views held out prefer, where the seconds `beside_steps` suffice for the most, and for the trials of
-    them. Fewer than two sweeps are none: what goes before them takes as long.
+    None: as many as views held out prefer, if the seconds `beside_steps` suffice for the most sweeps and their trials.
+    A time for fewer than two sweeps gives 0, because the work before them takes as long.
     """
     if seconds <= 0:
         return 0, 0.0
     sweep = sweep_seconds(geometry, grid, now)
     if geometry.is_cone:
-        sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps begin anew
+        sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps run twice
     eigenvalue = _EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS)
     before = (eigenvalue + _FIRST_SWEEPS + choice_sweeps(geometry)) * sweep
     asking = sweeps_choice_cost(geometry)

@@ -36,15 +36,15 @@ MATTER = 0.05
 # 0.6 is as good as 0.8 in a tenth less time, since a Gaussian covers fewer pixels.
 _SPREAD = 0.6
 
-# Of the published start: density of a Gaussian over that of its voxel, and its least width over the field's.
+# The published start: density of a Gaussian over that of its voxel, and its least width over the field's.
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
 
 # A pixel counts as wild above this many times the largest pixel of other views, a ratio that no sample reaches. Up to a
 # tenth of the views, and at least one, may contain such pixels.
 _WILD, _WILD_VIEWS = 10.0, 0.1
 
-# Edges at this share of the largest distance from the axis count. Below this share of a mean value they are empty: the
-# air of a measured walnut is 0.07 of it.
+# Edges at this share of the largest distance from the axis, or farther, count. Below this share of a mean value they
+# are empty: the air of a measured walnut has 0.07.
 _FARTHEST, _EMPTY = 0.95, 0.15
 
 _SWEEP_WEIGHT = 0.004  # density units
@@ -107,10 +107,10 @@ def place(
 
 
 def leaves_the_field(projections: NDArray[np.float32], geometry: Geometry) -> bool:
-    """Whether the sample is wider than the field: projections [view, row, col] do not fall to nothing at their edges.
+    """Whether the sample is wider than the field: projections [view, row, col] do not fall to zero at their edges.
 
-    Only edges that are farthest from the rotation axis count: with the axis far off the detector's middle, opposite
-    views see what lies beyond the nearer one.
+    Only edges far from the rotation axis count: with the axis far off the detector's middle, opposite views see the
+    region beyond the nearer edge.
     """
     cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
     away = np.stack((axis + 0.5, cols - 0.5 - axis), 1)
@@ -215,8 +215,8 @@ def sample_as_published(
 ) -> Gaussians:
     """The published start (Zha et al. 2024): voxels above 5 % of the density unit, all equally likely.
 
-    A Gaussian is as wide as its neighbours are far, with 0.15 of its voxel's density. Theirs sit half a voxel off the
-    centres of the voxels; these sit at the centres. Arguments and errors as of `sample_gaussians`.
+    A Gaussian's width is the distance to its neighbours, its density 0.15 of its voxel's. The published ones lie half
+    a voxel off the centres of the voxels, ours at the centres. Arguments and errors as in `sample_gaussians`.
     """
     data, unit, candidates = _matter(volume, field_radius, 0.0)
     chosen = rng.permutation(candidates)[:n]

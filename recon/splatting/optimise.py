@@ -28,10 +28,10 @@ _NORMALISE = 100  # steps between two normalisations of the quaternions
 
 @dataclass(eq=False)
 class FitState:
-    """Everything that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
+    """All that a step reads and changes; with the settings it is a complete checkpoint (see `checkpoint`).
 
     `step` updates the arrays in place: at 50k Gaussians copying them costs as much as the kernels. They live on the
-    backend's device. `mean` is a running mean of the parameters, see `averaging`; None where none is kept.
+    backend's device. `mean` is a running mean of the parameters, or None, see `anytime`.
     """
 
     parameters: dict[str, Any]
@@ -63,7 +63,7 @@ def problem_of(
     backend: Backend[Any] | None = None,
     weights: F32 | None = None,
 ) -> FitProblem:
-    """The problem that these settings pose; see `make_problem`. None computes on the CPU."""
+    """The problem for these settings; see `make_problem`. None computes on the CPU."""
     return make_problem(
         projections, geometry, grid, unit, backend or Cpu(),
         weights=weights, loss=settings.loss, ssim_weight=settings.ssim_weight,
@@ -169,7 +169,7 @@ def misfit_of(state: FitState, problem: FitProblem, settings: FitSettings) -> fl
 
 
 def renders(state: FitState, problem: FitProblem, settings: FitSettings, views: Iterable[int]) -> Iterator[Any]:
-    """What the model says of these views [row, col], in units of the problem's images, on its device."""
+    """The model's render of these views [row, col], in units of the problem's images, on its device."""
     p, cut = state.parameters, settings.truncation
     run = problem.backend.begin(
         p["means"], p["log_scales"], p["quaternions"], p["raw"], 1 / problem.half_field, state.kernel
@@ -243,8 +243,8 @@ def _update(
 def _normalise_quaternions(state: FitState, backend: Backend[Any]) -> None:
     """Quaternions of length 1 that turn as before, with Adam's moments in their measure.
 
-    A gradient is across its quaternion, so that every step makes it longer and the next turn smaller. Without this it
-    is twice as long after 30 000 steps. What has no direction is left as it is.
+    A gradient is orthogonal to its quaternion, so that every step makes the quaternion longer and the next turn
+    smaller. Without this it is twice as long after 30 000 steps. Quaternions without a direction stay as they are.
     """
     values = backend.numpy(state.parameters["quaternions"]).astype(np.float64)
     length = np.linalg.norm(values, axis=1, keepdims=True)
@@ -267,7 +267,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     origin = np.concatenate((change.keep, change.parents))
     fresh = change.keep.size
     if origin.size == 0:
-        return  # all are faint, as in views of nothing: later views may need them
+        return  # all Gaussians are faint, as in empty views: later views may need them
     grown = {
         "means": change.means,
         "log_scales": change.log_scales,
@@ -278,7 +278,7 @@ def _grow(state: FitState, problem: FitProblem, policy: DensityPolicy) -> None:
     if state.mean is not None:
         for name, new in grown.items():
             mean = backend.numpy(state.mean[name])[origin]
-            changed = new != p[name][origin]  # what was split or cloned; its other half is new, too
+            changed = new != p[name][origin]  # parents of splits and clones; their other halves are new, too
             changed[fresh:] = True
             state.mean[name] = backend.array(np.where(changed, new, mean)[order])
     state.parameters = {name: backend.array(values[order]) for name, values in grown.items()}

@@ -23,7 +23,7 @@ _KINDS = {"l1": L1, "l2": L2, "poisson": POISSON}
 # Images hold values of about one. No matter in the field can cause values beyond this limit. In SSIM the sums of
 # products of their squares would exceed the range of float32.
 _LARGEST = 1e6
-# For later views, where the unit may come from noise before the sample was there: the limit of SSIM in float32.
+# For later views, whose unit may come from noise before the sample came: the limit of SSIM in float32.
 _LARGEST_LATER = 1e9
 
 
@@ -110,8 +110,8 @@ def extend(
 ) -> FitProblem:
     """The problem with more views [view, row, col]; those it has are not copied.
 
-    Large values are let in up to what the loss can hold: where the first views showed nothing, it is the density unit
-    that is wrong. Only beyond a thousand million half fields times density units they get no weight.
+    Large values are accepted up to the limit of the loss: if the first views were empty, the density unit is wrong.
+    Values beyond a thousand million half fields times density units get no weight.
 
     Raises:
         ValueError: where the problem's views differ in shift, roll or tilt, see `Geometry.at`, or a view has no value
@@ -133,12 +133,12 @@ def with_projections(problem: FitProblem, projections: F32) -> FitProblem:
 
 
 def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
-    """The geometry of factor x factor binned pixels, each in the middle of its own, while the sample stays in place.
+    """The geometry of factor x factor binned pixels, each centred on its own pixels, while the sample stays in place.
 
-    `Geometry.binned` counts a parallel beam's heights from the middle of the rows that are left: a sample of its own.
+    `Geometry.binned` instead counts a parallel beam's heights from the middle of the remaining rows.
 
     Raises:
-        ValueError: where the detector has fewer rows or columns than are to be binned.
+        ValueError: the detector has fewer rows or columns than the factor.
     """
     if factor > min(geometry.detector_shape):
         rows, cols = geometry.detector_shape
@@ -152,8 +152,8 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
 def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) -> FitProblem:
     """The same problem on binned pixels: a first look at the large scales for a fraction of the time.
 
-    A binned pixel is the weighted mean of its pixels and weighs their mean weight. So pixels that were not measured
-    have no part in it.
+    A binned pixel is the weighted mean of its pixels and has their mean weight. Unmeasured pixels thus do not
+    contribute.
 
     Raises:
         ValueError: as `binned_geometry`.

@@ -21,7 +21,7 @@ def published_fit() -> FitSettings:
     """The published weights, rates and limits.
 
     Three departures stay. Widths are bounded in pixels from below, not by a sigmoid. Total variation leaves centres in
-    place, as it does in effect in the published code. A Gaussian ends at 3σ of its ellipse, not at a square of tiles.
+    place, as in effect in the published code. A Gaussian ends at 3σ of its ellipse, not at a square of tiles.
     """
     policy = DensityPolicy(
         start=500 / _STEPS, stop=0.5, every=100, threshold=5e-5, large=0.1, prune_below=1e-5, growth=10.0,

@@ -37,14 +37,14 @@ class R2:
         steps: of the fit. 0 gives the starting point. None takes 400. It takes 200 where a finish follows and the noise
             of the views hides the gain of more (see `schedule.Schedule`). With `seconds` it takes as many as fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
-            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. Where they
-            do not suffice for the start, a warning says so before it, and the start is made of binned views.
+            it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
+            are too few for the start, a warning says so before it, and the start uses binned views.
         gaussians: how many to start from, or the Gaussians to start from; None derives a number from the detector.
         start: the volume that Gaussians are drawn from, see `initialise.first_volume`.
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
-            that had it lowest.
+        with the lowest residual.
         finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8
-            to 24 as views held out prefer. Rolled or tilted views have none, since the voxel projector does not take
+            to 24 as views held out prefer. Rolled or tilted views get none, since the voxel projector does not take
             them. The result's `gaussians` stay the model as it was fitted.
         allow_negative: the finish keeps voxels below zero; Gaussians have none.
         fit: weights, rates and limits.
@@ -104,7 +104,7 @@ class R2:
         return run_fit(self, problem, control)
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
-        """A fit of views to come, from this number of Gaussians.
+        """A fit of future views, from this number of Gaussians.
 
         Settings of `fit` that differ from the defaults replace those of `WHILE_VIEWS_COME`.
 
@@ -116,7 +116,7 @@ class R2:
         return StreamingFit(template, seed=seed, gaussians=self.gaussians, settings=while_views_come(self.fit), now=now)
 
     def for_part(self, share: float, of_time: float) -> Self:
-        """As many Gaussians as belong to this share of a volume, in this share of the seconds."""
+        """The fit of this share of a volume: its share of the Gaussians, in this share of the seconds."""
         count, seconds = self.gaussians, self.seconds
         return replace(
             self,
@@ -125,7 +125,7 @@ class R2:
         )
 
     def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
-        """The fit from Gaussians that are placed here, in what is `left` then."""
+        """The fit from Gaussians that are placed here, within the seconds `left` afterwards."""
         field = Grid.of_field(geometry, geometry.sample_pitch)
         assert not isinstance(self.gaussians, Gaussians)
         rng = np.random.default_rng(seed)

@@ -26,10 +26,10 @@ class Schedule:
     """The length of a fit.
 
     Attributes:
-        steps: end the fit; None: `seconds` alone do.
+        steps: end the fit; None: only `seconds` end it.
         seconds: end it, too.
-        by_content: after 100 steps it is shortened where the views ask for no more.
-        bend: step and fraction from which on the fraction rises evenly to 1.
+        by_content: after 100 steps it may be shortened, see `look`.
+        bend: step and fraction after which the fraction rises evenly to 1.
     """
 
     steps: int | None
@@ -39,7 +39,7 @@ class Schedule:
 
     @classmethod
     def resumed(cls, planned: Schedule, checkpoint: Mapping[str, NDArray[Any]]) -> Schedule:
-        """The schedule of a checkpoint; that planned where it holds none."""
+        """The schedule of a checkpoint; the planned one if it holds none."""
         if not planned.by_content or "schedule" not in checkpoint:
             return planned
         steps, at, fraction = checkpoint["schedule"]
@@ -56,7 +56,7 @@ class Schedule:
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
     def look(self, state: FitState, problem: FitProblem) -> None:
-        """Shorten the fit where its residual after 100 steps is near the noise of the views."""
+        """Shorten the fit if its residual after 100 steps is near the noise of the views."""
         if not (self.by_content and state.step == _LOOKED_AT and self.steps and self.steps > SHORT_STEPS):
             return
         if residual_over_noise(state, problem) < _NEAR_NOISE:
@@ -65,6 +65,6 @@ class Schedule:
 
 
 def residual_over_noise(state: FitState, problem: FitProblem) -> float:
-    """Root mean square of what the last steps left of their views, over the noise of a pixel."""
+    """Root mean square residual of the last steps' views, over the noise of a pixel."""
     squares = [float(np.mean(np.square(problem.backend.numpy(image)))) for image in problem.images]
     return float(state.residual) * math.sqrt(float(np.mean(squares))) / problem.noise

@@ -1,4 +1,4 @@
-"""Settings of a fit: weights, rates and limits, and the values of those that depend on the scan and the grid."""
+"""Settings of a fit: weights, rates and limits, and values that depend on the scan and the grid."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from recon.splatting.problem import FitProblem, Loss
 NAMES = ("means", "log_scales", "quaternions", "raw")
 """Parameters of the model, in the order of their rates."""
 
-# Total variation is a prior: it weighs the more, the noisier a pixel (variance) and the fewer pixels a Gaussian has.
+# Total variation is a prior: its weight grows with the noise of a pixel (variance), and falls with a Gaussian's pixels.
 # Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.
 _TV_OF_NOISE, _TV_RANGE = 3e5, (0.02, 0.25)
-# A box of a 64th of the grid: seen more seldom, total variation comes in kicks. Adam's moments take these for
-# steepness, which brakes all the rest (-1.8 dB on a battery of 256³ voxels).
+# A box of a 64th of the grid: in a smaller one, a place would see total variation in rare kicks. Adam's moments take
+# these for steepness, which slows everything down (-1.8 dB on a battery of 256³ voxels).
 _TV_SHARE, _TV_SIZES = 4, (32, 96)
 
 
@@ -34,8 +34,8 @@ class FitSettings:
             times the density unit). That is divided by the pixels of a Gaussian and kept between 0.02 and 0.25.
         tv_size: voxels per side of the random box on which total variation acts; None takes a quarter of the grid's
             side, 32 to 96.
-        tv_moves: total variation may move centres. The published code has that gradient too small by the voxel size
-            squared, so that in effect it does not (there the weight is 0.05). With the right gradient we measure +0.2
+        tv_moves: total variation may move centres. In the published code that gradient is too small by the voxel size
+        squared, and has no effect (its weight there is 0.05). With the right gradient we measure +0.2
             dB on the walnut (60 views) and +0.4 dB on the battery (90 views).
         rates: of means (per half field), log scales, quaternions, raw densities, at the first step.
         pace: factor on all rates. The published ones are for 30 000 steps; with them a fit of 1000 is far from its end.
@@ -44,7 +44,7 @@ class FitSettings:
         decay: last rate / first rate; log-linear in between.
         policy: density control; None keeps the count.
         truncation: where Gaussians end; a compact kernel ends by itself.
-        smallest: standard deviation, in pixels, below which none shrinks: point sampling sees nothing thinner.
+        smallest: least standard deviation, in pixels: point sampling sees nothing thinner.
         views_per_step: gradients of so many views are averaged.
         coarse, coarse_until: the fit begins on pixels binned by this factor, until this fraction of its steps.
         rays: the integral of a Gaussian along a ray; matters for cones.
@@ -109,5 +109,5 @@ def tv_size(settings: FitSettings, grid: Grid) -> int:
 
 
 def growth(settings: FitSettings) -> float:
-    """How many times its first count a model may have."""
+    """Largest number of Gaussians, as a multiple of the first count."""
     return 1.0 if settings.policy is None else settings.policy.growth

@@ -39,7 +39,7 @@ class _Project(torch.autograd.Function):
         shared, views = Scratch.of(len(active.densities), geometry.detector_shape), []
         differentiable = any(ctx.needs_input_grad)
         for view, image in enumerate(images):
-            # Each view needs its own table until its backward pass, where there will be one.
+            # Each view needs its own table until its backward pass, if there will be one.
             scratch = replace(shared, table=footprint_table(len(active.densities))) if differentiable else shared
             rendered = render_view(active, geometry, view, faint, cut, model, image=image, scratch=scratch)
             if differentiable:
@@ -91,7 +91,7 @@ def project(
 ) -> Tensor:
     """Line integrals [view, row, col] (dimensionless) of the Gaussians; exact for a parallel beam up to truncation.
 
-    For a cone they are those of the affine footprint, or of the true ray if `model` asks for it. Differentiable in all
+    In a cone the footprint is affine, or integrated along the true ray if `model` asks for it. Differentiable in all
     four parameter tensors. The reference implementation does not truncate.
 
     Raises:

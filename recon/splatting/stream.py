@@ -1,11 +1,11 @@
 """StreamingFit: views arrive while the sample turns, and the Gaussian volume grows with them.
 
-The first Gaussians come from an FBP of the first well-spread views. Where there is time for many steps, they are placed
-anew when the views have grown by half: from the model's volume and an FBP of what it leaves of the views. From then on
-the model stays. Each time the views have grown by half, a new round makes room for more Gaussians. Density control
+The first Gaussians come from an FBP of the first well-spread views. If there is time for many steps, they are placed
+anew when the views have grown by half: from the model's volume and an FBP of its residual. From then on the model
+stays. Each time the views have grown by half, a new round makes room for more Gaussians. Density control
 clones and splits them where the new views ask for it. Between arrivals the model keeps fitting, at rates that suit any
-number of steps to come (`anytime`). The step after its arrival learns a view, every third of the others takes one of
-the newest, the rest replay all of them evenly (`arrivals`).
+number of steps to come (`anytime`). The first step after its arrival learns a view. Every third other step takes one of
+the newest views, the rest replay all views evenly (`arrivals`).
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ Clock = Callable[[], float]
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
 _LAST_GROWTH = 0.5  # density control ends at this share of the last round
-_AXIS_ANEW = 0.3  # px; an axis that moves by so much starts the rates anew, by less in part
-_NEW = 0.2  # weight of the newest of the views that were looked at before they were learnt
-_BLIND = 100.0  # data so many times larger than the density unit implies: the first views showed no sample
-_PLACED_FROM = 2**22  # voxels at most, for a placement in a second: views that come meanwhile wait
+_AXIS_ANEW = 0.3  # px; a move of the axis by so much starts the rates anew, a smaller one in part
+_NEW = 0.2  # weight of the newest view in the running mean over views before they were learnt
+_BLIND = 100.0  # data so many times larger than the density unit implies show that the first views were empty
+_PLACED_FROM = 2**22  # most voxels, for a placement in a second: views that arrive meanwhile wait
 _ROUND_GROWTH = 0.25  # share of the first count that a round may add; the last round may add the rest of the growth
 
 
@@ -53,8 +53,7 @@ class StreamingFit:
     """An R²-Gaussian fit whose views arrive in time.
 
     Args:
-        template: geometry of the views to come; its angles are ignored, the shift, roll and tilt of its views are
-            those of all views to come.
+        template: geometry of all future views, with their shift, roll and tilt; its angles are ignored.
         grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
         seed: of every random choice.
         gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
@@ -111,7 +110,7 @@ class StreamingFit:
 
     @property
     def started(self) -> bool:
-        """There is a model; before, there are not enough views for one."""
+        """Whether there is a model; before, there are too few views for one."""
         return self._state is not None
 
     def add_views(self, data: F32, angles: ArrayLike) -> None:
@@ -136,7 +135,7 @@ class StreamingFit:
             self.unlearnt = (1 - _NEW) * kept + _NEW * left
 
     def newest_view(self) -> tuple[F32, F32]:
-        """The newest view and what the model says of it, line integrals [row, col].
+        """The newest view and the model's render of it, line integrals [row, col].
 
         Raises:
             ValueError: there is no model yet.
@@ -148,10 +147,10 @@ class StreamingFit:
         return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale
 
     def replace_views(self, data: F32, angles: ArrayLike | None = None) -> None:
-        """Other line integrals [view, row, col] of all views so far, in their order: their correction has changed.
+        """Replace the line integrals [view, row, col] of all views so far, in order: their correction has changed.
 
-        The model stays and goes on from where it is. With `angles` [view] in radians these are all views that count
-        from now on, and the rates start again: the model has learnt from views that turned out bad.
+        The model stays and goes on. With `angles` [view] in radians only these views count from then on, and the rates
+        start again, because the model has learnt from bad views.
 
         Raises:
             ValueError: where the shape is not that of the views, or values are not finite; nothing is changed.
@@ -170,7 +169,7 @@ class StreamingFit:
             self._unseen = []
 
     def replace_newest(self, data: F32) -> None:
-        """Other line integrals [row, col] of the newest view: its correction has changed.
+        """Replace the line integrals [row, col] of the newest view: its correction has changed.
 
         Raises:
             ValueError: as `add_views`, or there is no view; nothing is changed.
@@ -190,9 +189,9 @@ class StreamingFit:
         self._problem = extend(others, images, theta[-1:])
 
     def move_axis(self, axis_col: float) -> None:
-        """Move the rotation axis. The model moves to where the views have it about the new axis, and stays.
+        """Move the rotation axis. The model moves with it to its place in the views.
 
-        What is left of the error doubles edges, which the model must learn anew: the rates rise again.
+        Remaining errors double edges, which the model must learn anew: the rates rise again.
         """
         moved = float(axis_col) - self._template.axis_col
         self._template = replace(self._template, axis_col=float(axis_col))
@@ -217,7 +216,7 @@ class StreamingFit:
         `on_progress` is called about ten times a second and ends the fit by returning True.
 
         Raises:
-            ValueError: where no view has come, or where the views hold no matter.
+            ValueError: no view has arrived, or the views hold no matter.
         """
         if not self._angles:
             raise ValueError("no view has arrived, there is nothing to finish")
@@ -227,7 +226,7 @@ class StreamingFit:
         return self._advance(seconds, finishing=True, on_progress=on_progress)
 
     def snapshot(self) -> Volume:
-        """The volume as it stands, 1/mm; all zero before the first model."""
+        """The current volume, 1/mm; all zero before the first model."""
         if self._state is None:
             return Volume(np.zeros(self._grid.shape, np.float32), self._grid)
         return fit.volume_of(averaged(self._state), self._grid, self._settings)
@@ -292,7 +291,7 @@ class StreamingFit:
                 self._round_views = self.n_views
                 return
         elif self._problem is not None:
-            # The sample or the beam came later: the density unit is of noise. Or so few views place Gaussians badly.
+            # The sample or the beam came later, so the density unit is noise. Or so few views place Gaussians badly.
             blind = max(float(image.max()) for image in self._problem.images) > _BLIND
             if blind or (not force and self.n_views < _YOUNG and self._state.step >= HALF):
                 self._data = list(self._problem.projections)
@@ -305,7 +304,7 @@ class StreamingFit:
         self._state.drawn = []  # draw from all views from now on
 
     def _place_first(self, known: fit.FitState | None = None) -> None:
-        """Place all Gaussians: by an FBP of the views, or by what is `known` of the sample and an FBP of the rest."""
+        """Place all Gaussians: by an FBP of the views, or by a `known` volume and an FBP of its residual."""
         geometry = self._template.at(self._angles)
         data = np.stack(self._data)
         wider = leaves_the_field(data, geometry)

@@ -38,11 +38,11 @@ from recon.splatting.schedule import Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.voxels.projector import data_residual
 
-_TIMED = 3  # steps by which it is planned what a fit's seconds suffice for
+_TIMED = 3  # steps after which a fit's seconds are planned
 _LOOK = 50  # steps between two measurements of the views held out
 _BEST = "best."  # names of the best model's arrays in a checkpoint begin so
-_START_SHARE = 0.5  # of seconds that are too few, what a start from binned views may take
-_PATIENCE = 0.2  # of the steps planned, and at least six looks, may pass without a better one
+_START_SHARE = 0.5  # share of too few seconds that a start from binned views may take
+_PATIENCE = 0.2  # share of the planned steps, and at least six measurements, that may pass without a better model
 
 
 @dataclass(eq=False)
@@ -60,7 +60,7 @@ class _HeldOutTracker:
     def over(
         cls, problem: FitProblem | None, settings: FitSettings, step: int, resume: Mapping[str, NDArray[Any]]
     ) -> _HeldOutTracker:
-        """A tracker for a fit at `step`, or the one that a checkpoint holds."""
+        """A tracker for a fit at `step`, or the tracker of a checkpoint."""
         if problem is None or "watch" not in resume:
             return cls(problem, settings, best_step=step)
         best, best_step = resume["watch"]
@@ -108,7 +108,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
     seen, known = geometry.select(used), None if weights is None else weights[used]
     field_grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))
-    binned_geometry(seen, settings.coarse)  # refuses what cannot be binned before anything is computed
+    binned_geometry(seen, settings.coarse)  # refuses views that cannot be binned before any computation
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
         factor = 1 if method.seconds is None else _factor_in_time(method, seen, field_grid, now, end)
@@ -203,10 +203,10 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
 
 
 def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], end: float) -> int:
-    """The binning of the views that a fit starts from, so that its seconds suffice for the start.
+    """The binning of the views for the start of a fit, so that its seconds suffice for the start.
 
     Warns:
-        UserWarning: where they do not suffice for that of all pixels.
+        UserWarning: they do not suffice for a start from all pixels.
     """
     if isinstance(method.gaussians, Gaussians):
         return 1
@@ -230,8 +230,8 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
 def _finish_in_time(
     method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
 ) -> tuple[int | None, float]:
-    """The sweeps of the finish and their seconds, of so many `left` after the first steps, at `step` seconds each.
-    `finish_within` gives the sweeps; where the time suffices for two, the method's own are taken."""
+    """The sweeps of the finish and their seconds, if `left` seconds remain after first steps of `step` seconds each.
+    `finish_within` gives the sweeps; if the time suffices for two, the method's own number is used."""
     room = FINISH_SHARE * left
     sweeps, seconds = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
     return (sweeps, seconds) if method.finish is None or sweeps == 0 else (method.finish, room)
@@ -243,14 +243,14 @@ def _until(control: RunControl, end: float) -> Callable[[], bool]:
 
 
 def _worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
-    """The finished volume explains the views held out worse than the fit's by more than 0.1 dB."""
+    """Whether the finished volume explains the views held out worse than the fit's, by more than 0.1 dB."""
     return data_residual(finished, unseen, views) > 10 ** (0.1 / 20) * data_residual(fitted, unseen, views)
 
 
 def _usual(weights: F32, data: F32) -> float:
-    """The weight of a typical ray through matter: the mean of all that weigh, each as often as its line integral.
+    """The weight of a typical ray through matter: the mean over rays with weight, each counted by its line integral.
 
-    Where rays past the sample weigh most, as by photons, a mean of all rays would leave the sample to total variation.
+    Rays past the sample may weigh most, as with photons. A plain mean would then leave the sample to total variation.
     """
     top = max(float(np.percentile(data.reshape(-1)[:: max(1, data.size // 100_003)], 99)), 0.0)
     matter, weighed = 0.0, 0.0

@@ -3,9 +3,9 @@
 f(x, y) = Σ_view q_view(x cos θ + y sin θ), where q interpolates the columns of a view linearly. Ray by ray it costs
 views x voxels. Gridding costs views x columns and a few FFTs. By the projection-slice theorem a view is a line through
 the middle of the volume's Fourier plane (O'Sullivan 1985, IEEE Trans. Med. Imaging 4, 200). That plane is periodic, as
-the volume is sampled. So it also holds what linear interpolation adds beyond the sampling frequency. Both ways give one
-volume, wherever all views see it. Beyond, they differ by how a view ends: ray by ray with half a pixel more, in
-gridding with a ramp to 0 within one.
+the volume is sampled. So it also holds the part that linear interpolation adds beyond the sampling frequency. Both ways
+give one volume where all views see it. Beyond, they differ at the end of a view: ray by ray adds half a pixel, gridding
+a ramp to 0 within one pixel.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ SLICES = lanes.WIDTH
 """Slices that are back-projected together."""
 
 _f = np.float32
-_ACROSS, _DOWN = 16, 8  # voxels by voxels by 16 slices of one job: 8 KiB
+_ACROSS, _DOWN = 16, 8  # voxels along each edge of one job of 16 slices: 8 KiB
 _TILE = 32  # cells of the Fourier plane along each edge of one job
 _FINER = 1.25  # cells of the Fourier plane a voxel, at least
 _REACH = 6  # cells across the kernel
-_STEPS = 2048  # of the kernel's table within a cell
-_LEAST = 7e-5  # 1/pixel, of filter and linear interpolation: what the latter adds is followed down to it
+_STEPS = 2048  # steps of the kernel's table within a cell
+_LEAST = 7e-5  # 1/pixel, least gain of filter and linear interpolation that is followed
 _MOST = 30  # cycles a column, at most
 
 # ns for sixteen slices, on two cores (sum of both) with AVX-512 in halves. They are for a voxel in a view, a point on
@@ -55,7 +55,7 @@ def _line_of_lanes(n):  # type: ignore[no-untyped-def]
 def _ray_by_ray(columns: F32, cosines: F64, sines: F64, axis_cols: F64, x: F64, y: F64, out: F32) -> None:
     """out[z, y, x] = Σ_view columns[view, 1 + x cos + y sin + axis, z]; x and y in pixels.
 
-    A view's first and last column stand twice; what lies more than half a pixel beyond them is not seen.
+    A view's first and last column stand twice; the view ends half a pixel beyond them.
     """
     views, cols = columns.shape[0], columns.shape[1] - 2
     nz, ny, nx = out.shape
@@ -94,7 +94,7 @@ def _cell(frequency, n):  # type: ignore[no-untyped-def]
 def _runs(k: I32, n: int, fx: F64, fy: F64, shape: tuple[int, int], tiles: I32, runs: I32) -> int:
     """Cut each view's line of points where it enters another tile of the plane, or another period.
 
-    Fills tiles [run], and runs [run, (view, first point, end)] as far as they reach; returns how many there are.
+    Fills tiles [run], and runs [run, (view, first point, end)], up to their lengths; returns the number of runs.
     """
     across, found, last = shape[1] // _TILE, 0, -1
     for v in range(fx.size):
@@ -174,11 +174,11 @@ def _crop(plane: F32, down: F32, across: F32, out: F32) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Gridding:
-    """What gridding needs to know of a set of views and a plane of voxels, for all slices.
+    """The plan of gridding for a set of views and a plane of voxels, for all slices.
 
     Attributes:
         fx, fy: [view], cycles a voxel of the first frequency.
-        phase: complex64 [view, k], of one period, for where the axis and the middle voxel are.
+        phase: complex64 [view, k], of one period, for the places of the axis and of the middle voxel.
         turns: float32 [view, period, 2], the phase of each period.
         k, gain: [point], frequencies in turns a period, and the transfer function of linear interpolation there.
         runs: [run, (view, first point, end)], the points of all views by tiles of the Fourier plane.
@@ -233,7 +233,7 @@ def gridding(angles: F64, axis_cols: F64, cols: int, x: F64, y: F64, response: C
 
 
 def _frequencies(n: int, response: Callable[[int], F32]) -> tuple[I32, F32]:
-    """Frequencies that linear interpolation of filtered views has, in turns per n columns, and its gain there."""
+    """Frequencies of linearly interpolated filtered views, in turns per n columns, and the gain there."""
     k = np.arange(-_MOST * n, _MOST * n, dtype=np.int32)
     gain = np.sinc(k / n) ** 2
     within = np.mod(k, n)
@@ -243,7 +243,7 @@ def _frequencies(n: int, response: Callable[[int], F32]) -> tuple[I32, F32]:
 
 
 def _period(cosines: F64, sines: F64, axis_cols: F64, cols: int, x: F64, y: F64) -> int:
-    """Samples a view is made longer to, so that no voxel sees it a period on."""
+    """Length in samples to which a view is padded, so that no voxel sees its next period."""
     ends = np.array([(a, b) for a in (x[0], x[-1]) for b in (y[0], y[-1])])
     t = ends[:, 0] * cosines[:, None] + ends[:, 1] * sines[:, None] + axis_cols[:, None]
     return int(fft.next_fast_len(math.ceil(max(cols - t.min(), t.max(), cols)) + 2))
@@ -259,7 +259,7 @@ _SHAPE = math.pi * math.sqrt((_REACH / _FINER * (_FINER - 0.5)) ** 2 - 0.8)
 
 
 def _kernel_table() -> F32:
-    """Weights [step, cell] of the cells around a point that lies so far, in steps, beyond the cell left of it."""
+    """Weights [step, cell] of the cells around a point, by its distance in steps from the cell left of it."""
     beyond = (np.arange(_STEPS) + 0.5) / _STEPS
     distance = beyond[:, None] - np.arange(1 - _REACH // 2, _REACH // 2 + 1)
     return np.i0(_SHAPE * np.sqrt(np.maximum(1 - (2 * distance / _REACH) ** 2, 0))).astype(np.float32) / np.float32(
@@ -290,19 +290,19 @@ def by_gridding(plan: Gridding, columns: F32, out: F32) -> None:
 
 
 def ray_by_ray(angles: F64, axis_cols: F64, x: F64, y: F64, columns: F32, out: F32) -> None:
-    """As `by_gridding`, by interpolation at every voxel; x and y in pixels, spaced as they like."""
+    """As `by_gridding`, by interpolation at every voxel; x and y in pixels, with any spacing."""
     _ray_by_ray(columns, np.cos(angles), np.sin(angles), axis_cols, x, y, out)
 
 
 def compile_gridding() -> None:
-    """Grid a slice of nothing, so that its kernels are compiled."""
+    """Grid an empty slice, so that its kernels are compiled."""
     angles, x = np.arange(2.0), np.arange(4.0)
     plan = gridding(angles, np.full(2, 2.0), 4, x, x, lambda n: np.ones(n // 2 + 1, np.float32))
     by_gridding(plan, columns_of(2, 4), np.empty((1, 4, 4), np.float32))
 
 
 def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]) -> bool:
-    """Whether gridding takes less time than going ray by ray, by what both took (docs/notes/performance.md)."""
+    """Whether gridding takes less time than going ray by ray, by measured times (docs/notes/performance.md)."""
     rays, gridded = nanoseconds(views, cols, voxels, slices, response)
     return rays > gridded
 
@@ -310,7 +310,7 @@ def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, r
 def nanoseconds(
     views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]
 ) -> tuple[float, float]:
-    """What sixteen slices of so many cost there, ray by ray and by gridding."""
+    """Times of sixteen slices of so many columns there, ray by ray and by gridding."""
     points = views * _frequencies(max(cols, *voxels), response)[0].size
     blocks = -(-slices // SLICES)
     plane = _cells(voxels[0]) * _cells(voxels[1])

@@ -68,7 +68,7 @@ def direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
 ) -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp`, which alone takes `out`, and `fdk`."""
+    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp` and `fdk`. Only `fbp` takes `out`."""
     if geometry.is_cone:
         return fdk(projections, geometry, grid, filter, on_block)
     return fbp(projections, geometry, grid, filter, on_block, out)

@@ -1,6 +1,6 @@
-"""Displacement: by how much a sample that slipped on its stage lies elsewhere, from the views before and after.
+"""Displacement: the shift and turn of a sample that slipped on its stage, from the views before and after.
 
-Views of one part of the scan predict those of another wherever both see the sample from near directions. So a volume of
+Views of one part of the scan predict those of another if both see the sample from near directions. So a volume of
 the longest part is projected into the views of the others. A shift and a turn of the sample explain the differences.
 Then all views together, corrected, give the next volume (joint reconstruction and reprojection: Gürsoy et al. 2017,
 Sci. Rep. 7, 11818; here with one rigid displacement a part in place of one shift a view).
@@ -26,14 +26,12 @@ F32 = NDArray[np.float32]
 Parts = NDArray[np.integer]
 
 SWEEPS = 10
-SMOOTH = (
-    8.0  # columns, width of the means that residuals are taken against: air and what is beyond the field are smooth
-)
-NEAR = math.radians(5)  # of the longest part's views: farther ones are hardly predicted by them
-TRIAL = 0.25  # pixels by which the sample is moved to see what changes
-FARTHEST = 4.0  # pixels that a step may move it
-RELAXED = 1.5  # the views that are corrected are in the volume, too, and hold it back
-_STEPS = 4  # of the first registration
+SMOOTH = 8.0  # columns: residuals are relative to means of this width, since air and matter beyond the field are smooth
+NEAR = math.radians(5)  # radians from the longest part's views: farther views are hardly predicted
+TRIAL = 0.25  # pixels by which the sample is moved for derivatives
+FARTHEST = 4.0  # most pixels of a step
+RELAXED = 1.5  # factor on a step: the corrected views are in the volume, too, and make steps too small
+_STEPS = 4  # steps of the first registration
 _HELD_OUT = 8  # one of so many views judges
 
 
@@ -52,20 +50,20 @@ class Displacement:
     turn: float = 0.0
 
     def farthest(self, radius: float) -> float:
-        """Upper bound, about, of the motion in mm of a point so far from the axis."""
+        """Approximate upper bound of the motion, mm, of a point at this distance from the axis."""
         return math.hypot(self.x, self.y, self.z) + abs(self.turn) * radius
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """How well views that were held out of a volume are predicted by it, see `judge`.
+    """How well a volume predicts views held out of it, see `judge`.
 
     Attributes:
-        alone: deviation of the longest part's views, where the volume is of that part.
-        together: the same, where it is of all parts.
-        others: deviation of the views of each part where the volume is of all.
+        alone: deviation of the longest part's views from a volume of that part.
+        together: deviation of the same views from a volume of all parts.
+        others: deviation of the views of each part from a volume of all parts.
         longest: the longest part.
-        overall: mean deviation of all views, where the volume is of all parts.
+        overall: mean deviation of all views from a volume of all parts.
     """
 
     alone: float
@@ -103,7 +101,7 @@ def displacements(
 ) -> list[Displacement]:
     """The displacement of each part against the longest one.
 
-    Precise to some 0.1 pixel where matter has edges. Motion by more than a tenth of the field, or with deformation, is
+    Precise to some 0.1 pixel if matter has edges. Motion by more than a tenth of the field, or with deformation, is
     not found, see `judge`.
 
     Args:
@@ -111,8 +109,8 @@ def displacements(
         geometry: of a parallel beam.
         parts: [view] number of the part that each belongs to, from 0.
         known: [row, col] pixels that were measured.
-        start: from coarser pixels; None: from the longest part alone.
-        rounds: volumes of all views.
+        start: displacements from coarser pixels; None: begin with the longest part alone.
+        rounds: number of volumes of all views.
     """
     problem = _Problem(projections, geometry, parts, known)
     moves = list(start) if start is not None else [Displacement()] * problem.count
@@ -137,9 +135,9 @@ def displacements(
 def judge(
     projections: F32, geometry: Geometry, parts: Parts, known: NDArray[np.bool_], moves: Sequence[Displacement]
 ) -> Judgement:
-    """Deviations of views held out of volumes of the longest part, and of all parts; arguments as `displacements`.
+    """Deviations of views held out, from volumes of the longest part and of all parts; arguments as `displacements`.
 
-    Where the displacement is right, the other parts add to what predicts the longest one's views.
+    If the displacement is right, the other parts improve the prediction of the longest part's views.
     """
     problem, corrected = _Problem(projections, geometry, parts, known), displaced(geometry, parts, moves)
     views = np.arange(geometry.n_views)
@@ -201,7 +199,7 @@ class _Problem:
         return solve(method, Projector(geometry, self.grid), projections, weight=self.weights(geometry))
 
     def residual(self, volume: Volume, geometry: Geometry, views: NDArray[np.integer]) -> tuple[F32, F32]:
-        """Views less those of the volume, without what is smooth, and the weights of their rays."""
+        """Views less those of the volume, without smooth differences, and the weights of their rays."""
         geometry = geometry.select(views)
         weight = self.weights(geometry)
         left = self.projections[views] - Projector(geometry, self.grid).forward(volume.data)
@@ -211,7 +209,7 @@ class _Problem:
         self, volume: Volume, move: Displacement, views: NDArray[np.integer], weight: NDArray[np.float64],
         relaxation: float = 1.0,
     ) -> Displacement:  # fmt: skip
-        """The displacement of these views after a step of least squares (Gauss-Newton) to what the volume shows."""
+        """The displacement of these views after a step of least squares (Gauss-Newton) towards the volume's views."""
         geometry = self.geometry.select(views)
         pitch, all_one = geometry.pixel_pitch, np.zeros(views.size, np.int64)
         now = np.array([move.x, move.y, move.z, move.turn])
@@ -243,7 +241,7 @@ def _apart(geometry: Geometry, views: NDArray[np.integer], others: NDArray[np.in
 
 
 def _without_smooth(images: F32, weight: F32) -> F32:
-    """What differs from its surroundings along the row, on rays that have weight."""
+    """Differences from the surroundings along the row, on rays that have weight."""
     seen = images * weight
     smooth = gaussian_filter1d(seen, SMOOTH, axis=2) / np.maximum(gaussian_filter1d(weight, SMOOTH, axis=2), 1e-3)
     return np.asarray((seen - smooth * weight), np.float32)

@@ -1,8 +1,8 @@
-"""When views are enough: what the views still to come would add to the volume, predicted without a truth.
+"""Enough views: predicts, without a truth, the gain of the volume by the views still to come.
 
-The volume of the views so far is taken for the sample: its views at all planned angles get the noise that it leaves of
-the measured ones. They are reconstructed from those so far and from all (a parametric bootstrap; Efron & Tibshirani
-1993, ch. 6.5). How much nearer the second volume is to the sample is the gain that is predicted.
+The volume of the views so far stands for the sample. Its views at all planned angles get noise like that in the
+measured ones. Two volumes are reconstructed: from the views so far and from all (a parametric bootstrap; Efron &
+Tibshirani 1993, ch. 6.5). The predicted gain says how much nearer to the sample the second volume is.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from recon.voxels.voxel_problem import VoxelProblem
 F32 = NDArray[np.float32]
 
 _SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3
-_ROWS, _PIXELS = (2, 8), 2**17  # of the slab: fewest and most rows, and pixels of all its slices, about
-_WIDEST_GAP = 3.0  # in even steps: golden-ratio angles leave gaps of 2.6
+_ROWS, _PIXELS = (2, 8), 2**17  # fewest and most rows of the slab, and approximate pixels of all its slices
+_WIDEST_GAP = 3.0  # largest gap, in even steps: golden-ratio angles leave gaps of 2.6
 
 
 @dataclass(frozen=True)
 class Goal:
-    """When views are enough; where there are two limits, both must be met.
+    """When views are enough; if there are two limits, both must be met.
 
     Attributes:
         psnr_gain_per_10_views: dB that ten more views may add; None: any.
@@ -48,14 +48,14 @@ class Goal:
             raise ValueError(f"a goal is at least one number of dB above 0, got {self}")
 
     def met(self, gain: Gain) -> bool:
-        """The upper ends of what is predicted are within the limits."""
+        """Whether the upper ends of the predictions are within the limits."""
         limits = ((self.psnr_loss, gain.high), (self.psnr_gain_per_10_views, gain.high * gain.share_of(10)))
         return all(limit is None or value <= limit for limit, value in limits)
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What the views to come would add, predicted.
+    """The predicted gain by the views to come.
 
     Attributes:
         n_views, planned: so far, and in all.
@@ -77,14 +77,14 @@ class Gain:
         return cls(n_views, planned, mean, mean - error, mean + error)
 
     def share_of(self, views: int) -> float:
-        """The share of the gain that the next `views` bring, where the error falls as a power of their number."""
+        """The share of the gain by the next `views`, if the error falls as a power of their number."""
         if self.n_views + views >= self.planned:
             return 1.0
         return math.log1p(views / self.n_views) / math.log(self.planned / self.n_views)
 
 
 def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, samples: int) -> list[float]:
-    """dB of PSNR that the views to come would add, so many random samples of it.
+    """Random samples of the gain by the views to come, dB of PSNR.
 
     Computed on the two to eight rows with most matter, by eight sweeps of FISTA-TV from FBP, the weight by the noise.
     Measured against true gains: tests/bench/test_enough_views.py.
@@ -124,9 +124,9 @@ def predicted_gains(data: F32, geometry: Geometry, rng: np.random.Generator, sam
 
 
 def well_spread(angles: ArrayLike) -> bool:
-    """No gap between the angles (modulo π) is wider than three even steps: they may be all there are.
+    """Whether no gap between the angles (modulo π) exceeds three even steps, so that they could be a whole scan.
 
-    Golden-ratio and interlaced angles are so at any time, a sequence only at the end of half a turn.
+    Golden-ratio and interlaced angles meet this at any time, a sequence only at the end of half a turn.
     """
     theta = np.sort(np.mod(np.asarray(angles, np.float64), np.pi))
     gaps = np.diff(theta, append=theta[:1] + np.pi)

@@ -2,7 +2,7 @@
 
 f(x, y) = ∫₀^π q_θ(x cos θ + y sin θ) dθ, where q_θ is a view convolved with the band-limited ramp
 (Kak & Slaney 1988, eq. 3.61 and 3.69). Rows are independent, so the work runs in blocks of sixteen slices, counted from
-the volume's first. Blocks that are asked for one by one equal those of the whole volume to the bit.
+the volume's first. Blocks computed one by one equal those of the whole volume to the bit.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class FbpPlan:
     Attributes:
         geometry, grid, filter: as given.
         share: float32 [view, 1, col], quadrature weight of each ray.
-        zeros: columns of zeros wanted before and after these.
+        zeros: columns of zeros to add before and after these.
         rows: [z], detector rows at which an unshifted view sees the slices.
         back_project: (columns [view, 1 + col + 1, 16], out [z, y, x]).
     """
@@ -118,7 +118,7 @@ class FbpPlan:
 
 
 def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
-    """What `fbp` does before it looks at the data.
+    """The part of `fbp` that does not depend on the data.
 
     Raises:
         ValueError: as `fbp`, for the filter and the geometry.
@@ -141,13 +141,13 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
 
 
 def fbp_memory(views: int, cols: int) -> int:
-    """Bytes that FBP of slices [cols, cols] takes beside projections and volume, about: of a plan and of one block."""
+    """Approximate bytes that FBP of slices [cols, cols] takes beside projections and volume: a plan and one block."""
     samples, cells = round(1.4 * cols), (round(1.25 * cols) + 64) ** 2
     return 64 * views * (cols + 2 * samples) + 16 * views * samples + 64 * cells + 4 * 32 * 16 * 8 * cols
 
 
 def fbp_nanoseconds(views: int, cols: int, slices: int) -> float:
-    """What FBP of so many slices [cols, cols] costs, on the machine of docs/notes/performance.md."""
+    """Time of FBP of so many slices [cols, cols], on the machine of docs/notes/performance.md."""
     response = partial(_transfer, pixel_pitch=1.0, filter="hann")
     return min(nanoseconds(views, cols, (cols, cols), slices, response)) * -(-slices // SLICES)
 
@@ -206,7 +206,7 @@ def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
 
 
 def _slab(projections: F32, shifts: F64, rows: F64, first: int, height: int) -> F32:
-    """Views at the detector rows that show the same heights, each where it was shifted to."""
+    """Views at the detector rows that show the same heights; each view has its own shift."""
     if not shifts.any():
         return _rows_at(projections, rows, first, height)
     moved = zip(projections, shifts, strict=True)
@@ -226,12 +226,12 @@ def fbp(
     Voxels take the filtered views by linear interpolation at their centres, many of them by gridding. This is within
     1e-3 of the peak (see `recon.voxels.back_project`): for voxels larger than a pixel bin the projections first. A
     voxel that a view does not see gets nothing from that view, unless its opposite does. A full turn with the axis off
-    the middle of the detector, or beside it, reaches as far as its far columns.
+    the middle of the detector, or beside it, covers the field out to the far columns.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: where the views' rays run.
-        grid: voxels wanted; None: one a pixel, `Grid.matching(geometry)`.
+        grid: of the volume; None: one voxel a pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.
         out: float32 [z, y, x] to write to; None: a new one.
@@ -240,8 +240,8 @@ def fbp(
         float32 [z, y, x], 1/mm (1/pixel for a pitch of 1).
 
     Raises:
-        ValueError: where the shape does not belong to the geometry, values are not finite, the filter is unknown, or
-            the geometry is a cone, rolled or tilted.
+        ValueError: the shape does not fit the geometry, values are not finite, the filter is unknown, or the geometry
+        is a cone, rolled or tilted.
     """
     expected = (geometry.n_views, *geometry.detector_shape)
     if projections.shape != expected:

@@ -20,7 +20,7 @@ from recon.voxels.view_weights import circle_weights, fan_shares
 F64 = NDArray[np.float64]
 
 _f = np.float32
-_SAMPLES = 4  # of a projector take as long as a voxel in a view
+_SAMPLES = 4  # samples of a projector that take as long as a voxel in a view
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
 
 
@@ -83,9 +83,9 @@ def fdk(
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
         geometry: a cone, straight (no roll, no tilt); views may be shifted.
-        grid: voxels wanted; None: `Grid.matching(geometry)`.
+        grid: of the volume; None: `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
-        on_block: told how many of how many layers are there, by the views that they have.
+        on_block: told how many of how many layers are done, counted by their views.
 
     Returns:
         float32 [z, y, x], 1/mm.

@@ -194,7 +194,7 @@ def _errors_by_round(
 
 
 class _Trial:
-    """What weights make of a slab, judged by views that the trials have not seen."""
+    """Volumes of a slab with several weights, judged by views that the trials have not seen."""
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
         self.problem, self.start, self._unseen = replace(problem, go_on=self._go_on), start, unseen

@@ -62,12 +62,12 @@ def solve(
             ratios of weights matter. None: one for all.
         start: the volume to begin with; None: zero.
         nonnegative: voxels below zero are clipped in every step (CGLS: at the end).
-        on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) at the point
-            where its correction was computed: the volume it leaves is better. CGLS, ASD-POCS: of the volume itself.
-            The iterations end where it returns something true.
-        on_trial: called after each sweep of a trial, by which a method chooses its weight on some rows. The trials end
-            where it returns something true, and the iterations follow.
-        decide: takes what follows from the whole data, and has the seed of the order of views and subsets.
+        on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) before its
+        correction; the volume afterwards is better. CGLS, ASD-POCS: of the volume afterwards. The iterations end
+        if it returns something true.
+        on_trial: called after each sweep of a trial, by which a method chooses its weight on some rows. If it returns
+        something true, the trials end, and the iterations follow.
+        decide: keeps decisions that follow from the whole data, and has the seed of the order of views and subsets.
 
     Raises:
         ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
@@ -126,7 +126,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
 
 
 class _Units(NamedTuple):
-    """Powers of two near the lengths, line integrals and weights at hand: to change to them rounds nothing."""
+    """Powers of two near the lengths, line integrals and weights of the data: changing to these units is exact."""
 
     length: int
     integral: int
@@ -158,7 +158,7 @@ class _Units(NamedTuple):
 
 
 def _times_power(array: F32, power: int) -> F32:
-    """array *= 2^power, in steps that float32 holds."""
+    """array *= 2^power, in steps within float32's range."""
     while power:
         step = min(max(power, -100), 100)
         array *= np.float32(2.0**step)

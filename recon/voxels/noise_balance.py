@@ -37,7 +37,7 @@ _KNOWN_BEFORE = 2.5
 # band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
 _SETTLED = 3  # sweeps after which the residual is looked at
 _FOUND, _MOST_BY_FOUND = 1.75, 5.0
-_TOO_NOISY = 1.5  # times what a model leaves: such noise is none
+_TOO_NOISY = 1.5  # times a model's residual: larger "noise" is fine structure
 
 
 @dataclass(eq=False)

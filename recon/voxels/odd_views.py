@@ -20,17 +20,17 @@ from recon.voxels.projector import Projector, project, projection_images, volume
 F32 = NDArray[np.float32]
 
 LIMIT = 12.0
-"""Standard deviations of what is usual there: three clean real scans stay below 9.4 (docs/notes/exploration.md)."""
+"""Limit, in usual differences (standard deviations): clean real scans stay below 9.4 (docs/notes/exploration.md)."""
 
-_CELLS = 128  # columns of cells, at least, where the detector has so many pixels
-_BLUR = 4  # pixels that a blur by one reaches
+_CELLS = 128  # least columns of cells, if the detector has so many pixels
+_BLUR = 4  # pixels: reach of a blur by one pixel
 _BAND, _TOGETHER = 16, 32  # rows that are projected together; views that are compared together
 _AT_A_TIME = 8  # views of a cone that are projected together
 _BROAD = 3  # cells a side, over which a difference is averaged
-_AROUND, _BESIDE = 12, 3  # views on either side that say what is usual, without so many next to the one that is judged
-_OUTLIER = 3.0  # times the median of these, which one of them may add
-_SHARP = 0.1  # of what a blur of one pixel changes in a view, by which any volume may miss an edge
-_EXTENT = 0.5  # of the limit, above which a cell belongs to the region
+_AROUND, _BESIDE = 12, 3  # views on either side that define the usual difference; nearest ones left out
+_OUTLIER = 3.0  # times their median: largest contribution of one view
+_SHARP = 0.1  # share of the change by a blur of one pixel, by which any volume may miss an edge
+_EXTENT = 0.5  # share of the limit above which a cell belongs to the region
 _LEAST_VIEWS = 2 * _AROUND + 1
 
 
@@ -40,7 +40,7 @@ class OddView:
 
     Attributes:
         view: index in the projections.
-        score: difference in standard deviations; above 0 where the view absorbs more than the volume.
+        score: difference in standard deviations; above 0 if the view absorbs more than the volume.
         rows, cols: pixels of the projections, first and one after the last.
     """
 
@@ -58,23 +58,22 @@ def odd_views(
     limit: float = LIMIT,
     told: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[OddView, ...]:
-    """Views in which something crossed the beam or the sample was elsewhere, found in the differences p - A x, place by
-    place.
+    """Views in which something crossed the beam or the sample was displaced, found in the differences p - A x.
 
-    The difference of each view from the volume's projection, less what all its pixels have in common (light). It is
-    averaged over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views
-    fully: at edges that it blurs, at rings, at what lies outside the field. So a difference counts relative to the 18
-    views of the nearest angles at the same place. It also counts relative to the edges of the volume in the view
-    itself: a face or a crack parallel to the rays is sharp in few views only [our own].
+    The check takes each view's difference from the volume's projection, less the common change of its pixels (light).
+    It averages over 3 x 3 cells, in standard deviations of the view's noise and finest detail. No volume fits its views
+    fully at edges that it blurs, at rings, or outside the field. So a difference counts relative to the 18 views of the
+    nearest angles at the same place. It also counts relative to the edges of the volume in the view itself. A face or a
+    crack parallel to the rays is sharp in few views only [our own].
 
     Args:
         projections: [view, row, col].
         weights: of the rays [view, row, col]; those of weight 0 were not measured.
-        limit: score from which a view is odd.
-        told: how many of how many views were compared, of bands of rows by their share.
+        limit: least score of an odd view.
+        told: how many of how many views were compared; bands of rows count by their share.
 
     Returns:
-        In the order of the views; none of fewer than 25 views.
+        In the order of the views; empty for fewer than 25 views.
     """
     n = geometry.n_views
     if n < _LEAST_VIEWS:
@@ -140,7 +139,7 @@ def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slic
 
 
 def _sharp(models: F32) -> F32:
-    """What a blur by a pixel takes from projections [view, row, col]."""
+    """Projections [view, row, col] minus their blur by a pixel."""
     return np.abs(models - gaussian_filter(models, (0, 1, 1), truncate=_BLUR))
 
 
@@ -152,11 +151,13 @@ def _differences(
     side: int,
     told: Callable[[int, int], None],
 ) -> tuple[F32, F32]:
-    """The difference of the views from the volume, and the part of it that edges explain. [view, cell, cell] each,
-    averaged over cells, in standard deviations of noise."""
+    """The difference of the views from the volume, and its part that edges explain.
+
+    [view, cell, cell] each, averaged over cells, in standard deviations of noise.
+    """
     rows, cols = (n // side for n in geometry.detector_shape)
-    # Means over cells: of the difference in light, what edges explain of it, the pixels that are known, the view in
-    # light, the light, and the difference.
+    # Means over cells: the difference in light, its part explained by edges, the known pixels, the view in light, the
+    # light, and the difference.
     cells, edges, lit, seen, light, left = (np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6))
     compared, all_rows = 0, geometry.n_views * geometry.detector_shape[0]
     for views, part, model, sharp in _projected(volume, geometry):
@@ -171,13 +172,13 @@ def _differences(
         compared += len(model) * model.shape[1]
         told(compared * geometry.n_views // all_rows, geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
-        third = np.diff(seen[view], 3, axis=1)  # of the view: what is finest in the sample counts too
+        third = np.diff(seen[view], 3, axis=1)  # noise of the view; the finest detail of the sample counts as noise
         noise = median_deviation(third) / math.sqrt(20.0)
         if not lit[view].any() or not noise > 0:
             cell[...], edge[...] = 0, 0
             continue
         cell -= np.float32(np.median(left[view][lit[view] > 0])) * light[view]
-        # Sums over the cells that are there and lit, by their own noise: fewer at an edge, and of a single row.
+        # Sums over existing, lit cells, by their own noise; fewer at an edge, and with a single row.
         there = uniform_filter(lit[view], _BROAD, mode="constant")
         scale = np.divide(_BROAD / noise, np.sqrt(there), out=np.zeros_like(there), where=there > 0)
         cell[...] = uniform_filter(cell, _BROAD, mode="constant") * scale
@@ -186,7 +187,7 @@ def _differences(
 
 
 def _cells(images: F32, side: int) -> F32:
-    """Means of squares of pixels; rows and columns left over at the ends count for nothing."""
+    """Means of squares of pixels; remaining rows and columns at the ends are dropped."""
     rows, cols = (n // side for n in images.shape[1:])
     whole = images[:, : rows * side, : cols * side]
     return np.asarray(whole.reshape(len(images), rows, side, cols, side).mean(axis=(2, 4)), np.float32)

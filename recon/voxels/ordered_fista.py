@@ -21,7 +21,7 @@ from recon.voxels.voxel_problem import Momentum, VoxelProblem, largest_eigenvalu
 F32 = NDArray[np.float32]
 
 _LOOKED_AT = 9  # views of a sweep whose residual is looked at
-_LEAST_VIEWS = 12  # of a subset: fewer have other eigenvectors than all views, and the steps disagree
+_LEAST_VIEWS = 12  # least views of a subset: fewer have other eigenvectors than all views, and the steps disagree
 
 
 def ordered_fista(
@@ -43,9 +43,9 @@ def ordered_fista(
 
     Args:
         x: [y, x, z], not zero; overwritten.
-        weight: μ, or what chooses it after each sweep.
+        weight: μ, or an object that chooses it after each sweep.
         subsets: at most; each has at least twelve views.
-        tv_steps: dual steps of each proximal step, which go on where the last ones ended.
+        tv_steps: dual steps of each proximal step, which continue from the last ones.
     """
     projector = problem.projector
     count = subsets_of(projector.geometry, subsets)
@@ -80,17 +80,17 @@ def ordered_fista(
 
 
 def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subsets: int, tv_steps: int) -> F32:
-    """Two runs of `ordered_fista`, the second with what the first has left of the views added to them: 2 p - A x₁.
+    """Two runs of `ordered_fista`; the second adds the first one's residual to the views: 2 p - A x₁.
 
     Bregman iteration (Osher, Burger, Goldfarb, Xu & Yin 2005, Multiscale Model. Simul. 4, 460, eq. 3.1 to 3.3). Total
-    variation takes contrast from every structure, from small ones most. The second run gives it back, and takes only
-    what it takes from the sum. The residual does not grow from run to run (their proposition 3.2). The first run wants
-    a heavy weight, at which little noise is in its volume.
+    variation takes contrast from every structure, most from small ones. The residual holds this contrast; the second
+    run restores it. The residual does not grow from run to run (their proposition 3.2). The first run needs a heavy
+    weight, at which its volume has little noise.
 
     Args:
         x: as `ordered_fista`.
         weight: μ of both runs.
-        sweeps: of each run; where `problem.go_on` ends the first one, there is no second.
+        sweeps: of each run; if `problem.go_on` ends the first run, there is no second.
     """
     ended = False
 
@@ -111,7 +111,7 @@ def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subset
 
 
 def subsets_of(geometry: Geometry, most: int) -> int:
-    """How many subsets `ordered_fista` makes of these views."""
+    """Number of subsets that `ordered_fista` makes of these views."""
     return max(1, min(most, geometry.n_views // _LEAST_VIEWS))
 
 

@@ -31,7 +31,7 @@ class Projector:
     """Line integrals A through the voxels of `grid` along the rays of `geometry`, and their transpose Aᵀ.
 
     Joseph's interpolation (P. M. Joseph 1982, IEEE Trans. Med. Imaging 1, 192): a ray is sampled once in each plane
-    of voxels, bilinearly; outside the box is nothing. In mm times the volume's unit, float32.
+    of voxels, bilinearly. The volume is 0 outside the box. In mm times the volume's unit, float32.
 
     Raises:
         ValueError: for views that are rolled or tilted (Gaussians take these), or a box that reaches the source.
@@ -115,7 +115,7 @@ class Projector:
         return result
 
     def _heights(self) -> tuple[NDArray[np.float64], float]:
-        """The row on which z = 0 falls in each view, and the slice that is there."""
+        """The row on which z = 0 falls in each view, and the slice at z = 0."""
         middle = (self.grid.shape[0] - 1) / 2 - self.grid.centre[0] / self.grid.spacing[0]
         return self.geometry.axis_row + self.geometry.shifts[:, 1], middle
 
@@ -177,7 +177,7 @@ def data_residual(
     """||A x - p|| / ||p||: the share of the measured line integrals [view, row, col] that the volume does not explain.
 
     Args:
-        weights: of the rays, where they do not all count the same; those of weight 0 do not count.
+        weights: of the rays; None: equal weights. Rays of weight 0 do not count.
 
     Raises:
         ValueError: if `projections` does not fit `geometry`, or is all zero.
@@ -201,7 +201,7 @@ def residual_norms(
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
-    """[view, row] rays of a parallel beam that lie between the outer slices of the grid: the volume explains them."""
+    """[view, row] rays of a parallel beam between the outer slices of the grid, which the volume can explain."""
     rows = np.arange(geometry.detector_shape[0]) - geometry.axis_row - geometry.shifts[:, 1:]
     off = np.abs(rows * geometry.pixel_pitch - grid.centre[0]) / grid.spacing[0]
     return np.asarray(off <= (grid.shape[0] - 1) / 2 + _EDGE_ROWS)

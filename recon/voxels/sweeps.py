@@ -3,7 +3,7 @@
     x <- x + relaxation C A_sᵀ R (p_s - A_s x)        R = 1 / row sums of A,  C = 1 / column sums of A_s
 
 One subset of all views is SIRT (Gilbert 1972; Gregor & Benson 2008), one view a subset is SART (Andersen & Kak 1984).
-The largest column sums of all subsets are taken, so that one volume serves all and no step is too long.
+The column sums are the largest of all subsets, so that one volume serves all and no step is too long.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Sweeps:
     """Passes over all views, subset by subset. Memory: two volumes, and twice the projections.
 
     Attributes:
-        pace: of a sweep: a typical step along the gradient of ½||A x - p||² (rays weighed).
+        pace: a typical step of a sweep along the gradient of ½||A x - p||² (rays weighed).
         residual: p - A x of some views of the last sweep [view, col, row], times the root of their weight (NaN: 0).
     """
 

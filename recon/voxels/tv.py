@@ -21,7 +21,7 @@ class TotalVariationProx:
 
     A few steps of the dual problem a call (Chambolle 2004, J. Math. Imaging Vis. 20, 89; with the bound: Beck &
     Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field stays from one call to the next: in an outer
-    iteration x changes little, and the steps add up. Memory: three volumes.
+    iteration x changes little, so later calls continue the steps. Memory: three volumes.
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:

@@ -1,4 +1,4 @@
-"""unexplained: structure that a volume leaves in the views, such as a crack that it fills, told from their noise."""
+"""unexplained: structure that a volume leaves in the residual of its views, such as a filled crack, beside noise."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ F32 = NDArray[np.float32]
 
 LIMIT = 0.007
 """Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
-edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md)."""
+edges. Up to 0.004 in sixteen finished ones, up to 0.005 in true volumes (docs/notes/exploration.md).
+"""
 
-_SIGMAS = 4.0  # of the noise: its own share is below 1e-3
+_SIGMAS = 4.0  # standard deviations of the noise, above which noise has a share below 1e-3
 _FLIPS = 6
-_SMOOTH, _AROUND = 1.0, 4.0  # pixels: detail that is looked for, and of the map of the noise
-_ROWS, _COLS = 8, 256  # rows looked at, of so many columns; fewer of wider detectors
+_SMOOTH, _AROUND = 1.0, 4.0  # pixels: size of the detail, and of the map of the noise
+_ROWS, _COLS = 8, 256  # rows used, for so many columns; fewer for wider detectors
 _LEAST_VIEWS = 16
-_MATTER, _CLOSED = 0.2, 2  # of the 99th percentile; voxels: cracks belong to the matter
+_MATTER, _CLOSED = 0.2, 2  # share of the 99th percentile; voxels: cracks belong to the matter
 
 
 @dataclass(frozen=True, eq=False)
 class Unexplained:
-    """What the residual of the views would add to some slices of a volume.
+    """The residual of the views, back-projected on some slices of a volume.
 
     Attributes:
-        share: of the voxels of matter, those at which the residual has more than four standard deviations of its noise.
-        first: slice of the volume, the first looked at.
+        share: of the voxels of matter with a residual above four standard deviations of its noise.
+        first: number of the first of these slices.
         significance: float32 [z, y, x], filtered back-projection of the residual over its noise; positive where the
-            volume has too little.
+        volume is too low.
     """
 
     share: float
@@ -52,19 +53,19 @@ def unexplained(
     rng: np.random.Generator,
     weights: F32 | RayWeights | None = None,
 ) -> Unexplained | None:
-    """Filtered back-projection of the residual p - A x, over the noise that the same views have with random signs.
+    """Filtered back-projection of the residual p - A x, over its noise: that of the views with random signs.
 
-    Random signs of the views cancel structure, which all of them have in common, and keep noise [our own; after the
-    odd-even differences of half-sets]. Pixels that make rings are taken out first. Up to eight rows around the middle
-    of the matter are looked at, one of a detector of 700 columns or more.
+    Random signs of the views cancel structure, which all views share, and keep noise [our own; after the odd-even
+    differences of half-sets]. Pixels that make rings are removed first. Up to eight rows around the middle of matter
+    are used, one row if the detector has 700 columns or more.
 
     Args:
         volume: on the slices of the detector rows, 1/mm.
         projections: [view, row, col].
-        weights: of the rays; those of weight 0 were not measured, and show nothing.
+        weights: of the rays; rays of weight 0 were not measured, and are not used.
 
     Returns:
-        None for cones, rolled or tilted views, fewer than 16 views, other slices, and where there is no matter.
+        None for cones, rolled or tilted views, fewer than 16 views, other slices, or a volume without matter.
     """
     rows, same = geometry.detector_shape[0], volume.grid == Grid.matching(geometry)
     if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
@@ -119,7 +120,7 @@ def _smoothed(images: F32) -> F32:
 def _fbp_of_each(residual: F32, signs: F32, views: Geometry) -> list[F32]:
     """Slices of the residual times each row of signs [kind, view].
 
-    Where views do not move along the axis, they are slices of one volume: that takes less time.
+    If views do not move along the axis, all are slices of one volume, which takes less time.
     """
     rows, cols = views.detector_shape
     kinds = len(signs)

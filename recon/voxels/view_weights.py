@@ -20,7 +20,7 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
 
     Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
     where the half circle is covered. A gap of more than 8 median steps, and wider than random angles leave by chance,
-    is a missing wedge: the views beside it weigh as if the sampling went on, and the sum is the angle measured.
+    is a missing wedge: views beside it weigh as if the sampling continued, and the sum is the covered angle.
 
     Args:
         angles: [view], radians, any order and range.
@@ -89,17 +89,17 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     """Quadrature weight of each ray of a parallel beam, in radians, on a detector made wider by some columns of zeros.
 
     Over a full turn the ray at u in a view is measured again at -u half a turn on, if the detector reaches so far. The
-    two share their weight. Where the axis stands off the middle the rays of the far columns are measured once and have
-    it all. In between shares rise from 0 to 1 as sin² does. They rise over as many columns as are seen once, at most
+    two share their weight. If the axis stands off the middle, the rays of the far columns are measured once and have
+    all. In between shares rise from 0 to 1 as sin² does. They rise over as many columns as are seen once, at most
     half of those seen twice. So columns just off the middle stay means of two (Wang 2002, Med. Phys. 29, 1634, for cone
-    beams). Views that, as they stand, end at some -u need zeros up to there: what filtering spreads into them belongs
+    beams). Views that end before -u need zeros up to there: the part that filtering spreads into them belongs
     to the integral.
 
-    Views that do not cover the full turn weigh as `angular_weights` says, whatever the column. What a far column sees
-    from one side only would be missing from the other.
+    Views that do not cover the full turn have the weights of `angular_weights` in all columns. For a far column, the
+    view from the other side would be missing.
 
     Returns:
-        [view, col], and the columns of zeros wanted before and after these.
+        [view, col], and the columns of zeros to add before and after these.
     """
     cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
     both = np.repeat(angular_weights(geometry.angles)[:, None], cols, axis=1)
@@ -117,7 +117,7 @@ def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     another view of the circle. The axis of all views is taken to be their mean; near the detector's middle all is 1/2.
 
     Returns:
-        [col], and the columns of zeros wanted before and after these.
+        [col], and the columns of zeros to add before and after these.
     """
     cols = geometry.detector_shape[1]
     if not geometry.is_off_middle:

@@ -1,4 +1,4 @@
-"""VoxelProblem: what an iterative method on voxels works on, and the parts that several of them share."""
+"""VoxelProblem: the data of an iterative method on voxels, and parts that several methods share."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class VoxelProblem:
-    """What an iterative method works on, as lines along z; `recon.voxels.iterative.solve` makes it.
+    """The data of an iterative method, as lines along z; `recon.voxels.iterative.solve` makes it.
 
     Attributes:
         data: [view, col, row], finite.
@@ -32,7 +32,7 @@ class VoxelProblem:
         nonnegative: voxels below zero are clipped.
         rng: for the order of views and subsets.
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
-        decide: takes what follows from sums over the whole volume or all rays.
+        decide: keeps decisions that follow from sums over the whole volume or all rays.
         trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
     """
 
@@ -55,7 +55,7 @@ class VoxelProblem:
         return replace(self, data=self.data[views], weight=None if self.weight is None else self.weight[views])
 
     def filtered(self, filter: Filter) -> F32 | None:
-        """FBP or FDK [y, x, z] of the views with any weight, rays of weight 0 filled in; None: neither takes them."""
+        """FBP or FDK [y, x, z] of the views with some weight, rays of weight 0 filled in; None: neither takes them."""
         images, geometry = projection_images(self.data), self.projector.geometry
         if self.weight is not None:
             seen = np.flatnonzero(self.weight.any(axis=(1, 2)))
@@ -82,7 +82,7 @@ def density_unit(x: F32) -> float:
 
 
 class Momentum:
-    """Nesterov's extrapolation between the steps of a descent, which starts anew where it points uphill.
+    """Nesterov's extrapolation between the steps of a descent; it starts anew when it points uphill.
 
     O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes.
     """
@@ -92,7 +92,7 @@ class Momentum:
         self._last, self._from, self._t = start.copy(), start.copy(), 1.0
 
     def __call__(self, x: F32) -> None:
-        """From the point x that a step has reached to the one where the next step starts, in place."""
+        """Move x from the end of a step to the start of the next step, in place."""
         combine(1.0, self._from, -1.0, x, self._from)  # back along the step
         combine(1.0, x, -1.0, self._last, self._last)  # from the last point reached to this one
         if self._decide("restart", lambda: dot(self._from, self._last) > 0):
@@ -130,7 +130,7 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6
 def iterative_memory(
     geometry: Geometry, grid: Grid, volumes: float, rays: float, weights: float, *, filtered: bool = False
 ) -> int:
-    """Bytes of so many volumes, copies of the projections and, of those, of their weights.
+    """Bytes of so many volumes, copies of the projections, and copies of their weights.
 
     Args:
         filtered: the method makes a filtered back-projection, too.

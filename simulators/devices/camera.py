@@ -37,8 +37,8 @@ TOLERANCE = 1e-6
 class SimulatedOrcaQuest:
     """Implements drivers.base.protocols.Camera.
 
-    External triggers come from `line`. One that comes earlier than the least period after the last accepted one is
-    ignored without a word, as by the camera. An internally triggered camera runs at the least period and stops after
+    External triggers come from `line`. Like the camera, it silently ignores a trigger that comes earlier than the least
+    period after the last accepted one. An internally triggered camera runs at the least period and stops after
     the frames it was armed for.
 
     Args:
@@ -50,7 +50,7 @@ class SimulatedOrcaQuest:
         lost: frames (numbered over the camera's life) that are exposed and then lost: a gap in the framestamps.
         ignored: external or software triggers that the camera does not react to: no frame and no framestamp. They are
             numbered over the camera's life too, among the triggers that it was ready for (internal ones count).
-        unplug_at: frame at which the camera disappears.
+        unplug_at: frame at which the camera is unplugged.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class SimulatedOrcaQuest:
         self._armed_for = self._framestamp = 0  # frames asked for (0: not armed), next framestamp
         self._seen, self._accepted = 0.0, -np.inf  # time of the last trigger looked at, and of the last accepted
         self._gone = ""
-        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame, where there are any
+        self._labels: dict[float, tuple[Label, ...]] = {}  # by the time of the frame, if there are any
         self._lock = threading.Lock()
 
     @property
@@ -90,18 +90,18 @@ class SimulatedOrcaQuest:
 
     @property
     def detector(self) -> Detector:
-        """Where the pixels of the present frames are, in mm from the rotation axis: the truth that alignment seeks."""
+        """Places of the frame's pixels, in mm from the rotation axis: the truth for alignment."""
         return self._camera_view().detector
 
     def labels_at(self, time: float) -> tuple[Label, ...]:
-        """The anomalies in the frame, taken already, that was exposed at `time` (s since the Unix epoch)."""
+        """The anomalies in the frame exposed at `time` (s since the Unix epoch), which must have been taken."""
         return self._labels.get(time, ())
 
     def rehearse(self) -> None:
-        """Make a frame of the sample with the present settings, which nobody gets and no number counts.
+        """Compute a frame of the sample with the present settings and discard it; it does not count as a frame.
 
         Raises:
-            CannotExposeError: the scene cannot be exposed so; the message says what would help.
+            CannotExposeError: the scene cannot be exposed with them; the message says what would help.
         """
         now = self._clock.now()
         expose(self._scene, self._camera_view().shot(Exposed(0, 0, now, self._line.angle_at(now), now, True, True, 0)))
@@ -120,7 +120,7 @@ class SimulatedOrcaQuest:
             return self._settings
 
     def arm(self, n_frames: int) -> None:
-        """Framestamps start at 0; triggers that came before are forgotten."""
+        """Get ready for triggers. Framestamps start at 0; earlier triggers do not count."""
         with self._lock:
             self._answer()
             if n_frames < 1 or self._armed_for:
@@ -131,7 +131,7 @@ class SimulatedOrcaQuest:
             self._seen, self._accepted = self._clock.now(), -np.inf
 
     def software_trigger(self) -> None:
-        """Expose one frame now. Raises DeviceRefused where it is not armed for that, or not ready again."""
+        """Expose one frame now. Raises DeviceRefused if it is not armed for software triggers, or not ready."""
         with self._lock:
             self._answer(armed=True)
             now, source = self._clock.now(), self._settings.trigger
@@ -210,7 +210,7 @@ class SimulatedOrcaQuest:
         return CameraView(self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected)
 
     def _answer(self, armed: bool = False) -> None:
-        """Raises DeviceError where the camera is gone (once its last frame is taken) or not armed though it must be."""
+        """Raises DeviceError if the camera is gone (once its last frame is taken), or must be armed and is not."""
         if self._gone and not self._ring:
             raise DeviceError(self.name, self._gone, advice="Connect it anew", state="Frames already taken are good")
         if armed and not self._armed_for:
@@ -232,7 +232,7 @@ class SimulatedOrcaQuest:
         return max(self._seen, self._accepted + self._timing.min_period)
 
     def _due(self) -> float:
-        """When something will happen, as far as is known now."""
+        """Time of the next known event."""
         if self._ring:
             return self._ring[0].ready
         after = self._settings.exposure + self._timing.readout
@@ -242,7 +242,7 @@ class SimulatedOrcaQuest:
         return pulse.time + after if pulse else np.inf
 
     def _trigger(self, time: float, angle: float) -> None:
-        """A trigger that the camera is ready for, unless it is one of the faults."""
+        """Expose for a trigger, unless a fault suppresses it."""
         number, self._triggers = self._triggers, self._triggers + 1
         if self._gone or (number in self._ignored and self._settings.trigger is not TriggerSource.INTERNAL):
             return

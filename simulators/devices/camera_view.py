@@ -1,4 +1,4 @@
-"""CameraView: what the simulated camera sees of a scene with its present settings: its pixels, each frame's shot."""
+"""CameraView: a scene in front of the simulated camera with its present settings: its pixels, each frame's shot."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Exposed:
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """A scene behind a camera.
+    """A scene in front of a camera.
 
     Attributes:
         scene: what stands in the beam.
@@ -46,7 +46,7 @@ class CameraView:
         pitch: mm at the sample of an unbinned sensor pixel.
         seed: of all random numbers.
         angle_at: of the stage, radians at s since the Unix epoch.
-        connected: s since the Unix epoch, from which what ages with time is counted.
+        connected: s since the Unix epoch; the age of drifts counts from here.
     """
 
     scene: Scene
@@ -67,7 +67,7 @@ class CameraView:
         binning = self.settings.binning
         axis_row, axis_col = ((n - 1) / 2 for n in orca_quest.SENSOR_SHAPE)
         axis_col += self.scene.axis_offset_px
-        middle = (binning - 1) / 2  # of a binned pixel, in sensor pixels from the middle of its first
+        middle = (binning - 1) / 2  # middle of a binned pixel, in sensor pixels from the middle of its first
         return Detector(
             shape=orca_quest.timing(self.settings).shape,
             pitch=self.pitch * binning,

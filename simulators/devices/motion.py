@@ -1,6 +1,6 @@
 """Trapezoid move: speed up, cruise, slow down, in closed form: position at a time and time at a position.
 
-With distance D, speed v and acceleration a the move takes D/v + v/a; where D < v²/a it never reaches v and takes
+With distance D, speed v and acceleration a the move takes D/v + v/a. If D < v²/a it never reaches v and takes
 2√(D/a) (constant-acceleration kinematics). A stop on the way is another such move that shares the past of the first.
 """
 
@@ -50,8 +50,9 @@ class TrapezoidMove:
         begin: float,
         deceleration: float | None = None,
     ) -> TrapezoidMove:
-        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration, or
-        <= deceleration where it slows down (None: the same).
+        """The fastest move from standing to standing within |velocity| <= speed and |acceleration| <= acceleration.
+
+        While it slows down, `deceleration` is the limit; None: the same.
 
         Raises:
             ValueError: speed or acceleration is not positive.
@@ -81,7 +82,7 @@ class TrapezoidMove:
 
     @property
     def direction(self) -> int:
-        """+1, -1, or 0 for a move to where it stands."""
+        """+1, -1, or 0 for a move to the present place."""
         return (self.target > self.start) - (self.target < self.start)
 
     def position(self, time: float) -> float:
@@ -108,7 +109,7 @@ class TrapezoidMove:
         """When the move passes `position`.
 
         Raises:
-            ValueError: it never does.
+            ValueError: it never passes there.
         """
         low, high = sorted((self.start, self.target))
         if not low <= position <= high:
@@ -138,8 +139,9 @@ class TrapezoidMove:
         return TrapezoidMove(self.begin, self.start, position, self._until(self.time_at(position)))
 
     def slowed(self, time: float, deceleration: float) -> TrapezoidMove:
-        """The same move until `time`, then slowed down with `deceleration` (> 0) to the last whole position that still
-        comes on the way."""
+        """The same move until `time`, then slowed down with `deceleration` (> 0) to a whole position.
+
+        It is the last whole position before the move would stand."""
         position, velocity = self.position(time), self.velocity(time)
         stand = position + self.direction * velocity**2 / (2 * deceleration)
         last = math.floor(stand) if self.direction > 0 else math.ceil(stand)
@@ -149,7 +151,7 @@ class TrapezoidMove:
         return TrapezoidMove(braked.begin, braked.start, last, braked.phases)
 
     def _phase(self, time: float) -> MotionPhase | None:
-        """The phase at `time`; None while it stands: before, and from `end` on as that number is rounded."""
+        """The phase at `time`; None before the move and from the rounded `end` on."""
         if not self.begin <= time < self.end:
             return None
         return next((phase for phase in self.phases if time - self.begin < phase.end), None)

@@ -1,7 +1,7 @@
 """Pulse motor: one axis that counts commanded pulses, with limits, stops and a position-synchronised trigger output.
 
 Nothing runs in the background: a move is a closed form of time. So its trigger pulses are put on the line, with their
-exact times, the moment it starts. Those still to come are taken away when it is stopped.
+exact times, the moment it starts. A stop removes the pulses that are still to come.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
 
 MOVES_REMEMBERED = 4096
-"""A camera on a virtual clock may ask for angles long past; this many moves back they are still known."""
+"""A camera on a virtual clock may ask for past angles. They are known for this many moves."""
 
 
 class Ended(IntFlag):
@@ -29,7 +29,7 @@ class Ended(IntFlag):
 
 
 class Output(StrEnum):
-    """What the trigger output does between its start and its end."""
+    """Kind of the trigger output between its start and its end."""
 
     OFF = "off"
     GATE = "gate"
@@ -58,8 +58,8 @@ class TriggerSettings:
 class TriggerOutput:
     """The counter behind a trigger output: armed once, then each point fires once while the axis passes it forwards.
 
-    Stopping between points and going on fires the rest; going back over points that fired fires none. A pulse that
-    begins while the last one is still high gives no edge: with width >= interval time the output just stays high.
+    After a stop between points, going on fires the rest; going back over fired points does not fire them again. A
+    pulse that begins while the last one is still high gives no edge: with width >= interval time the output stays high.
 
     Args:
         lost: pulses, counted from 0 since power-on, that never reach the line.
@@ -76,7 +76,7 @@ class TriggerOutput:
         self._coming: list[float] = []
 
     def refusal(self, position: int) -> str:
-        """Why it cannot be armed with the axis standing at `position`; "" where it can."""
+        """Why it cannot be armed with the axis standing at `position`; "" if it can."""
         settings = self.settings
         if settings.output is Output.OFF:
             return "the output is off"
@@ -93,19 +93,19 @@ class TriggerOutput:
         self._fired, self._coming, self._armed = 0, [], False
 
     def ready(self, now: float) -> bool:
-        """A pulse output is ready until its start point is passed; a gate stays so."""
+        """Whether it waits for its start point: a pulse output until the axis passes it, a gate always."""
         self.settle(now)
         return self._armed and (self.settings.output is Output.GATE or self._fired == 0)
 
     def settle(self, now: float) -> None:
-        """Count as fired what has passed."""
+        """Count all passed points as fired."""
         fired = [time for time in self._coming if time <= now]
         self._fired += len(fired)
         self._last_fired = max(fired, default=self._last_fired)
         self._coming = self._coming[len(fired) :]
 
     def follow(self, move: TrapezoidMove, now: float) -> list[tuple[float, int]]:
-        """(time, count) of the edges that `move` gives from `now` on; what was foreseen for later is forgotten."""
+        """(time, count) of the edges that `move` gives from `now` on; they replace earlier predictions."""
         self.settle(now)
         self._coming = []
         if not self._armed:
@@ -130,13 +130,13 @@ class TriggerOutput:
 
 
 def _arrival(move: TrapezoidMove, position: int) -> float | None:
-    """When a move arrives at `position`, if it does; it does not arrive where it starts."""
+    """When a move arrives at `position`; None if it does not arrive, or starts there."""
     low, high = sorted((move.start, move.target))
     return move.time_at(position) if low <= position <= high and position != move.start else None
 
 
 class PulseMotor:
-    """One axis. `line()` is where its trigger output goes, or None where no cable is plugged in.
+    """One axis. `line()` is the cable in its trigger output, or None without a cable.
 
     Args:
         counts_per_turn: pulses for 2π of true angle.
@@ -145,7 +145,7 @@ class PulseMotor:
         switch_at: a move that would pass this count stops there at once (LIMIT), as by a limit switch.
         fires_at_start: a train's start point itself gives a pulse.
 
-    Places may be changed while it stands, as by a person who clears the way.
+    Places may be changed while it stands, as if a person clears the way.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class PulseMotor:
         return (move.position(time) - zero) * self._angle_of_count
 
     def preset(self, count: int) -> None:
-        """Call the place where it stands `count`; nothing turns."""
+        """Set the count of the present place to `count`; nothing turns."""
         now, here = self._clock.now(), self.position()
         self.zero += count - here
         self._moves.append((TrapezoidMove(now, count, count, ()), self.zero))
@@ -208,7 +208,7 @@ class PulseMotor:
         self._put_on_line(now)
 
     def stop(self, acceleration: float) -> None:
-        """Slow down with `acceleration` (counts/s²) to the last pulse that still comes on the way."""
+        """Slow down with `acceleration` (counts/s²) and stand at a whole pulse."""
         now, move = self._clock.now(), self.move
         self.ended = Ended.SLOW_STOP
         if not self.moving():
@@ -225,7 +225,7 @@ class PulseMotor:
         self.ended = Ended.EMERGENCY
 
     def _replace(self, move: TrapezoidMove) -> None:
-        """The move under way ends otherwise than it was to."""
+        """Replace the end of the move under way."""
         self._moves[-1] = (move, self.zero)
 
     def _put_on_line(self, now: float) -> None:

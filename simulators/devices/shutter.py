@@ -1,4 +1,4 @@
-"""Simulated shutter and sample mover: a state each, with no travel time; the simulated camera looks at both."""
+"""Simulated shutter and sample mover: one state each, no travel time; the simulated camera asks both."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class BeamGate(Protocol):
-    """What lets the beam through or not: all that a simulated camera asks of a shutter."""
+    """The part of a shutter that a simulated camera asks."""
 
     def is_open(self) -> bool: ...
 
@@ -32,7 +32,7 @@ class SimulatedShutter:
 
 
 class WiredShutter:
-    """A shutter that follows the level of a cable; the camera looks at it, the driver at the cable's other end."""
+    """A shutter that follows the level of a cable; the camera asks it, the driver sets the cable's other end."""
 
     def __init__(self, high: Callable[[], bool], open_high: bool = True) -> None:
         self._high, self._open_high = high, open_high
@@ -55,5 +55,5 @@ class SimulatedSampleMover:
         self._in = True
 
     def is_in(self) -> bool:
-        """The sample is in the beam: what the simulated camera asks."""
+        """Whether the sample is in the beam; the simulated camera asks it."""
         return self._in

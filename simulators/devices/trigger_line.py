@@ -1,7 +1,7 @@
 """Trigger line: the cable from the stage's trigger output to the camera; the stage schedules, the camera consumes.
 
 Pulses are put on the line with the time at which they will rise, often ahead of that time. The stage knows its motion
-when it starts. A consumer takes a pulse as sent only once the clock has passed its time, for a stop cancels the rest.
+when it starts. A consumer takes a pulse only once the clock has passed its time, because a stop cancels later ones.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Pulse:
 
 
 class TriggerLine:
-    """Pulses in the order of time, and the true angle of whatever turns the sample. Safe from several threads."""
+    """Pulses in the order of time, and the sample's true angle. Safe from several threads."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
@@ -46,7 +46,7 @@ class TriggerLine:
             self._pulses = sorted([*self._pulses, *new])
 
     def cancel_after(self, time: float) -> int:
-        """Take away the pulses later than `time`; the number of them."""
+        """Remove the pulses later than `time`; returns their number."""
         with self._lock:
             keep = bisect_right(self._pulses, time, key=attrgetter("time"))
             cancelled = len(self._pulses) - keep
@@ -54,18 +54,18 @@ class TriggerLine:
             return cancelled
 
     def next_after(self, time: float) -> Pulse | None:
-        """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
+        """The first pulse strictly later than `time`, even in the future; None without one."""
         with self._lock:
             at = bisect_right(self._pulses, time, key=attrgetter("time"))
             return self._pulses[at] if at < len(self._pulses) else None
 
     def attach_angle(self, angle: Callable[[float], float]) -> None:
-        """Say what turns the sample: `angle(time)` is its true angle in radians. A later one replaces it."""
+        """Set the function of the sample's true angle: radians at a time. A later call replaces it."""
         with self._lock:
             self._angle = angle
 
     def angle_at(self, time: float) -> float:
-        """The true angle in radians at `time`; 0 where nothing turns the sample."""
+        """The true angle in radians at `time`; 0 if nothing turns the sample."""
         with self._lock:
             angle = self._angle
         return 0.0 if angle is None else float(angle(time))

@@ -15,8 +15,8 @@ from simulators.frame.shot import CannotExposeError, Image, Shot
 @dataclass(frozen=True)
 class Adc(ImageEffect):
     """Counts in steps of 2^(16 - bits), from 0 to the last step. The codes are the upper bits of 16, so that conversion
-    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits. Photon numbers
-    can be resolved only then, since fewer bits have steps wider than an electron.
+    factor and offset hold at every depth. Without this effect the converter is linear and has 16 bits. The photon
+    number readout needs such a converter, since fewer bits have steps wider than an electron.
 
     Attributes:
         bits: of a code.

@@ -15,11 +15,11 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Afterglow(SamplingEffect):
-    """Light of time t is prompt by 1 - sum of shares; a share p comes from t - s, s exponential with its decay time.
+    """The prompt share of the light is 1 - sum of shares; a share p is delayed by an exponential time with its decay.
 
     The delays of all components and the moments of earlier effects (name it after motion_blur) form one distribution of
     times. A Gauss rule of `samples` moments replaces it, exact for its powers up to 2 x samples - 1 (Golub & Welsch
-    1969). So `samples` line integrals are added and no more. An edge that moves by many pixels within a decay time
+    1969). So only `samples` line integrals are added. An edge that moves by many pixels within a decay time
     appears as that many ghosts instead of a trail.
 
     Shutter, sample and beam are assumed unchanged over the delays. Not simulated are the light that is missing just
@@ -50,8 +50,8 @@ class Afterglow(SamplingEffect):
             raise ValueError(f"samples must lie in 1 ... 32, got {self.samples}")
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
-        """The given moments with smaller weights, and those of the past. The moments of all rows must differ by shifts
-        only, as blur and rolling shutter leave them."""
+        """The given moments with smaller weights, and moments of the past. The moments of the rows must differ only by
+        shifts, as after blur and rolling shutter."""
         share = sum(self.shares)
         middle = moments.weights @ moments.times  # [row]
         spread = moments.times[:, 0] - middle[0]
@@ -68,8 +68,9 @@ class Afterglow(SamplingEffect):
 
 
 def gauss_rule(points: Reals, weights: Reals, n: int) -> tuple[Reals, Reals]:
-    """n points and weights with the same moments up to order 2n - 1 as the given points and weights (fewer points where
-    fewer suffice). By Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
+    """n points and weights (or fewer, if these suffice) with the same moments up to order 2n - 1 as the given ones.
+
+    By Lanczos' recursion (Golub & Welsch 1969, Math. Comp. 23:221; Gautschi 2004)."""
     scale = float(np.abs(points).max()) or 1.0
     basis = [np.sqrt(weights / weights.sum())]
     diagonal, beside = [], []

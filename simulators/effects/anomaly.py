@@ -1,4 +1,4 @@
-"""Anomaly: what effects share whose frames carry labels: the label, a range of views, and the edge of a slit."""
+"""Anomaly: the shared parts of effects that label their frames: the label, a range of views, the edge of a slit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from simulators.frame.shot import Shot
 
 VISIBLE = 1e-3
-"""Share of the light from which on a change is labelled."""
+"""Least change of the light that is labelled, as a share."""
 NARROWEST = 1e-9
 """mm: an edge with a smaller penumbra is a step."""
 Views: TypeAlias = tuple[int, int]
@@ -20,7 +20,7 @@ Views: TypeAlias = tuple[int, int]
 
 @dataclass(frozen=True)
 class Label:
-    """What a monitor should find in a frame.
+    """An anomaly that a monitor should find in a frame.
 
     Attributes:
         kind: the anomaly's name.
@@ -40,13 +40,13 @@ class Label:
 
 
 def check_views(views: Views | None) -> None:
-    """Raises ValueError where the range is empty or begins before view 0."""
+    """Raises ValueError if the range is empty or begins before view 0."""
     if views is not None and not 0 <= views[0] < views[1]:
         raise ValueError(f"views must be [first, one after the last] with 0 <= first < last, got {list(views)}")
 
 
 def within(views: Views | None, shot: Shot) -> bool:
-    """Whether the shot lies in the range; always where there is none."""
+    """Whether the shot lies in the range; True without a range."""
     return views is None or views[0] <= shot.view < views[1]
 
 

@@ -15,7 +15,7 @@ from simulators.frame.shot import AngleAt, Shot
 STILL = 1e-9
 """Radians below which the stage does not move."""
 LOOK = 1e-3
-"""s: first step back in time, and the precision to which the end of the last move is found."""
+"""s: first step back in time; also the precision of the end of the last move."""
 HISTORY = 3600.0
 """s before the frame within which a move is searched."""
 
@@ -24,10 +24,10 @@ HISTORY = 3600.0
 class Backlash(PoseEffect):
     """Lost motion of a gear (ISO 230-2:2014, reversal value) between the encoder, on the motor's side, and the sample.
 
-    The stage's angles hold where it turns forwards (angles grow). Backwards the other flanks of the teeth push, and the
+    While the stage turns forwards (angles grow) its angles hold. Backwards the other flanks of the teeth push, and the
     sample is `lost_motion_deg` ahead of the stage's angle. For a standing stage its last move decides; without a move
-    within an hour it is taken to have come forwards. How the lost motion is taken up at the beginning of a move is not
-    simulated: a scan's first view is beyond it.
+    within an hour, forwards is assumed. The lost motion at the beginning of a move is not simulated: a scan's first
+    view comes after it.
     """
 
     lost_motion_deg: float

@@ -1,4 +1,4 @@
-"""Beam bend: the open beam of the views is not that of the flats; it bends, and drifts with time."""
+"""Beam bend: the open beam of the views differs from the flats: it bends, and drifts with time."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class BeamBend(ImageEffect):
-    """With the sample in the beam, a ray has -log of its light changed by level + drift t + Σ curvature x².
+    """With the sample in the beam, -log of each ray's light changes by level + drift t + Σ curvature x².
 
     x is the distance from the middle of the frame, horizontally and vertically, 1 at its edges; t in s since the camera
-    was connected. Flats and darks stay as they are. Negative: the views have more light than the flats let expect.
+    was connected. Flats and darks stay as they are. Negative: the views have more light than the flats predict.
 
     Attributes:
         curvature: (horizontal, vertical), at the edges of the frame.

@@ -23,9 +23,8 @@ class Entry:
     Attributes:
         domain: what it acts on.
         summary: what happens, in half a sentence.
-        follows: effects of the same domain that must come before it: those with which the frame would differ if they
-            came after it.
-        reason: why they must.
+        follows: effects of the same domain that must come before it, because another order changes the frame.
+        reason: why they come before it.
     """
 
     domain: Domain
@@ -59,7 +58,7 @@ _OURS: Mapping[str, Entry] = MappingProxyType(
         "harmonics": Entry(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
         "beam_hardening": Entry(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
         "beam_profile": Entry(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
-        "beam_bend": Entry(Domain.PHOTONS, "the open beam of the views is not that of the flats"),
+        "beam_bend": Entry(Domain.PHOTONS, "the open beam of the views differs from the flats"),
         "ring_current": Entry(Domain.PHOTONS, "the ring current decays and is topped up"),
         "ghost": Entry(Domain.PHOTONS, "a fog-like change of the light crosses the frame in a few views"),
         "black_band": Entry(Domain.PHOTONS, "a slit darkens a band at the left side"),
@@ -114,7 +113,7 @@ _OURS: Mapping[str, Entry] = MappingProxyType(
 
 
 def _fitting(name: str, effect: type[Any]) -> type[Any]:
-    """The class of another package's effect, which says itself what our entries say of ours."""
+    """The class of another package's effect, which states its own domain, summary and place."""
     if effect.name != name:
         raise ValueError(f"its class calls itself {effect.name!r}; expected the entry point's name")
     _entry_of(effect)
@@ -133,7 +132,7 @@ CATALOGUE: Mapping[str, Entry] = MappingProxyType(
 
 
 def order_error(earlier: str, later: str) -> str:
-    """Why two effects of one domain cannot come in this order; empty where they can."""
+    """Why two effects of one domain cannot come in this order; "" if they can."""
     entry = CATALOGUE.get(earlier)
     if entry is None or later not in entry.follows:
         return ""

@@ -23,9 +23,9 @@ StepHook: TypeAlias = Callable[[str], AbstractContextManager[object]]
 class Effect(Protocol):
     """An effect is a frozen dataclass of its parameters.
 
-    `name` is that of its module; with it the catalogue says `domain` and `final`, which marks the last effect of its
-    domain: photon noise for photons, read noise for electrons and the converter for counts. An effect that is not in
-    the catalogue states all three.
+    `name` is the name of its module. The catalogue gives its `domain`, and `final` for the last effect of a domain.
+    These are photon noise, read noise (of electrons) and the converter (of counts). An effect outside the catalogue
+    states all three.
     """
 
     name: ClassVar[str]
@@ -71,7 +71,7 @@ class ImageEffect(Effect, Protocol):
 @runtime_checkable
 class Anomaly(Effect, Protocol):
     def labels(self, shot: Shot) -> Sequence[Label]:
-        """Where the anomaly changes this frame, regardless of other effects; empty where it does not."""
+        """Where the anomaly changes this frame, regardless of other effects; empty without a change."""
         ...
 
 
@@ -86,11 +86,12 @@ class Chain:
 
     @classmethod
     def of(cls, effects: Sequence[AnyEffect]) -> Chain:
-        """Check the order: motion, optical depth, photons (noise last), electrons (the readout's noise last), counts,
-        and what the catalogue states within a domain; each effect once.
+        """Check the order: motion, optical depth, photons (noise last), electrons (the readout's noise last), counts.
+
+        Within a domain the catalogue's order holds. Each effect may occur once.
 
         Raises:
-            ValueError: in a sentence that names the two effects.
+            ValueError: a wrong order; the message names the two effects.
         """
         for i, effect in enumerate(effects):
             for earlier in effects[:i]:
@@ -143,7 +144,7 @@ class Chain:
         return image
 
     def labels(self, shot: Shot) -> tuple[Label, ...]:
-        """The anomalies of a frame; the region of one that turns with the sample covers the whole exposure."""
+        """The anomalies of a frame. The region of an anomaly that turns with the sample covers the whole exposure."""
         found: dict[tuple[str, int], Label] = {}
         for effect in self.effects:
             if isinstance(effect, Anomaly):

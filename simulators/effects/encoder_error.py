@@ -18,8 +18,8 @@ class EncoderError(PoseEffect):
     """Angular positioning error: the sample is at the angle of the trigger plus the error.
 
     Attributes:
-        harmonics: waves a turn, millidegrees, phase in degrees. An eccentric grating gives 1 wave, a gear as many as it
-            has teeth, and interpolation between an encoder's lines as many as it has lines.
+        harmonics: waves a turn, millidegrees, phase in degrees. An eccentric grating gives 1 wave, a gear one per
+        tooth, and interpolation between an encoder's lines one per line.
         random_mdeg: standard deviation of the random part, drawn for each frame.
     """
 

@@ -13,7 +13,7 @@ from simulators.frame.shot import Image, Shot, fixed_rng
 
 Reals = NDArray[np.float64]
 REACH = 4.0
-"""Sigmas of a Gaussian that are drawn; beyond lies less than 4e-4 of its depth."""
+"""A Gaussian is drawn up to so many sigmas; less than 4e-4 of its depth lies beyond."""
 
 
 @dataclass(frozen=True)

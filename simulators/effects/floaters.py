@@ -14,12 +14,12 @@ from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.shot import Image, Shot, fixed_rng
 
 MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
-"""Largest number of crumbs, length in mm and optical depth: above, a frame takes seconds or overflows."""
+"""Largest number of crumbs, length in mm and optical depth. With larger values a frame takes seconds or overflows."""
 
 
 @dataclass(frozen=True)
 class Crumb:
-    """A round Gaussian cloud as a frame shows it, cut off where it is thinner than VISIBLE.
+    """A round Gaussian cloud in a frame, cut off where it is thinner than VISIBLE.
 
     Attributes:
         row, col: of its middle.
@@ -35,7 +35,7 @@ class Crumb:
     which: int
 
     def box(self, shape: tuple[int, int]) -> tuple[int, int, int, int]:
-        """(first row, row after the last, first column, column after the last); empty where it is not in the frame."""
+        """(first row, row after the last, first column, column after the last); empty outside the frame."""
         middle, size = np.array([self.row, self.col]), np.array(shape)
         aside = np.abs(middle - np.clip(middle, 0, size - 1))[::-1]  # the frame may contain only a cap of the circle
         reach = np.sqrt(np.maximum(2 * math.log(self.depth / VISIBLE) * self.sigma**2 - aside**2, 0.0))
@@ -49,12 +49,12 @@ class Crumb:
 class Floaters(ImageEffect, Anomaly):
     """Crumbs on the outside of the can or elsewhere in the beam.
 
-    Turning crumbs turn with the stage. Where they are farther from the axis than the frame is wide, they cross it twice
-    a turn, in front of the axis and behind it: once within half a turn, for a range of views and on one side of the
-    rotation only. Loose crumbs drift across at a speed of their own. Both are at their places of the first row's time.
+    Turning crumbs turn with the stage. A crumb beyond the frame's width crosses the frame twice a turn, in front of the
+    axis and behind it. Within half a turn it crosses once, in a range of views, on one side. Loose crumbs drift
+    across at a speed of their own. All rows show a crumb at its place when the first row is exposed.
 
     Attributes:
-        distance: [least, most] mm from the rotation axis; a loose crumb is visible while it is no farther away.
+        distance: [least, most] mm from the rotation axis; a loose crumb is visible within the larger distance.
         count: number of crumbs.
         size: [least, most] mm, standard deviation of the cloud.
         depth: largest optical depth through the middle of a crumb; the smallest is half of it.

@@ -19,13 +19,13 @@ class Ghost(ImageEffect, Anomaly):
     """A smooth change of the light by a cos², as high as the frame. Flats do not have it.
 
     An early data set of a battery has it: "fog" that crosses the frame in a few views, with intensities that no other
-    view has; its cause is not recorded. It may brighten (light scattered into the detector) or darken.
+    view has. Its cause is unknown. It may brighten (light scattered into the detector) or darken.
 
     Attributes:
-        view: the first in which it is visible, at the right edge.
+        view: the first view that shows it, at the right edge.
         width: mm, full width at half height; it ends `width` from its middle.
         speed: mm to the left from one view to the next.
-        gain: relative change of the light in its middle; negative where it darkens.
+        gain: relative change of the light in its middle; negative for a dark ghost.
     """
 
     view: int
@@ -55,7 +55,7 @@ class Ghost(ImageEffect, Anomaly):
         return [Label(self.name, (0, shot.detector.shape[0], first + int(visible[0]), first + int(visible[-1]) + 1))]
 
     def _change(self, shot: Shot) -> tuple[int, NDArray[np.float64]]:
-        """The first column that it covers, and the relative change of the light there and further right."""
+        """The first column that it covers, and the relative change of the light from there to the right."""
         cols, pitch = shot.detector.shape[1], shot.detector.pitch
         if not shot.sample or shot.view < self.view:
             return 0, np.zeros(0)

@@ -1,4 +1,4 @@
-"""Hot pixels: a few sensor pixels whose dark current is far above the others'."""
+"""Hot pixels: a few sensor pixels with a far larger dark current than the others."""
 
 from __future__ import annotations
 

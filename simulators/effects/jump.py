@@ -22,8 +22,8 @@ SEEN_PX = 0.01
 class Jump(PoseEffect, Anomaly):
     """From view `view` on the sample is at another place on the stage: first turned, then shifted.
 
-    Every view from the jump on is labelled, since it differs from what it would have been. Errors of the stage precede
-    the jump in a scene: they depend on the stage's angle, not on the sample's.
+    All views from the jump on are labelled, because the jump changes them. Errors of the stage precede the jump in a
+    scene: they depend on the stage's angle, not on the sample's.
 
     Attributes:
         view: the first after the jump.

@@ -12,7 +12,7 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class LostBeam(ImageEffect, Anomaly):
-    """The beam is off for a range of views or of time; a frame that overlaps with it loses its part of the light.
+    """The beam is off for a range of views or of time; a frame loses the light of the overlap.
 
     Attributes:
         views: [first, one after the last]; flats taken just before one of them lose their light, too.
@@ -47,7 +47,7 @@ class LostBeam(ImageEffect, Anomaly):
         """Share of the frame's light that is lost."""
         if self.seconds is None:
             return 1 - self.share if within(self.views, shot) else 0.0
-        # In seconds of this exposure, so that rounding cannot remove more light than there is.
+        # In seconds of this exposure, so that rounding cannot remove more than all light.
         begin, end = (at - shot.elapsed for at in self.seconds)
         off = min(end, shot.exposure) - max(begin, 0.0)
         return (1 - self.share) * max(off, 0.0) / shot.exposure

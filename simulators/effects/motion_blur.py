@@ -17,16 +17,16 @@ LOOKS = 5
 
 @dataclass(frozen=True)
 class MotionBlur(SamplingEffect):
-    """Mean of the transmission over as many moments of the exposure as the blur needs: one where the stage stands.
+    """Mean of the transmission over the moments of the exposure. The blur sets their number; a standing stage has one.
 
-    The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are no better, since the
-    transmission jumps at edges: a battery with 1 px of blur. 1, 2, 4 and 8 moments have errors of 1.1, 0.38, 0.13 and
-    0.045 in 1000 of the beam (rms). Gauss-Legendre has 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to 1.6
-    times larger.
+    The moments are spread evenly (midpoint rule). Gauss-Legendre rules of as many points are not better, since the
+    transmission jumps at edges. A battery with 1 px of blur and 1, 2, 4, 8 moments has errors of 1.1, 0.38, 0.13,
+    0.045 in 1000 of the beam (rms). Gauss-Legendre has 1.1, 0.34, 0.14 and 0.066; for 8 px its errors are up to
+    1.6 times larger.
 
     Attributes:
-        tolerance_px: pixels that the sample's rim may travel from one moment to the next. The rim counts even where it
-            is outside of the frame: in front of the axis and behind it, it crosses the middle of the frame.
+        tolerance_px: pixels that the sample's rim may travel from one moment to the next. The rim counts even if it
+        lies outside the frame: in front of the axis and behind it, it crosses the middle of the frame.
         max_samples: largest number of moments; each costs a frame's line integrals.
     """
 
@@ -49,13 +49,13 @@ class MotionBlur(SamplingEffect):
         return Moments(times, np.tile(moments.weights / n, n))
 
     def samples(self, shot: Shot) -> int:
-        """Number of moments; 0 where the stage stands while the first row is exposed."""
+        """Number of moments; 0 if the stage stands while the first row is exposed."""
         angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
         turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
         return math.ceil(min(turned * _rim(shot) / self.tolerance_px, self.max_samples))
 
 
 def _rim(shot: Shot) -> float:
-    """Largest travel of the sample's rim in pixels a radian; in a cone that of the side towards the source."""
+    """Largest travel of the sample's rim in pixels a radian; in a cone on the side towards the source."""
     reach, sod = shot.radius / shot.detector.pitch, shot.detector.sod
     return reach if math.isinf(sod) else reach / max(1 - shot.radius / sod, 0.05)

@@ -17,7 +17,7 @@ from simulators.frame.shot import Image, Shot
 class NarrowField(ImageEffect, Anomaly):
     """An aperture before the sample lets a rectangle of light through, its edges soft by the penumbra of the source.
 
-    Flats are as narrow. The pixels without full light have a label for each side: left, right, above and below.
+    Flats are equally narrow. Pixels without full light get a label for each side: left, right, above and below.
 
     Attributes:
         width: mm of the rectangle across the beam, between the places with half of the light.
@@ -67,7 +67,7 @@ class NarrowField(ImageEffect, Anomaly):
         return self._between(detector.v() - self.centre[1], self.height), across
 
     def _between(self, place: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-        # The part of the source that neither edge covers: they cover it from opposite ends.
+        # The part of the source that neither edge covers. The edges cover it from opposite ends.
         one, other = (lit_share(edge, self.penumbra) for edge in (width / 2 - place, width / 2 + place))
         return np.maximum(one + other - 1, 0.0)
 

@@ -12,11 +12,11 @@ from simulators.pixels.pattern import binned, normals
 
 @dataclass(frozen=True)
 class Offset(ImageEffect):
-    """The same for any binning (to check on a camera); none in the photon number readout.
+    """The same for any binning (to check on a camera). The photon number readout has no offset.
 
     Attributes:
         spread: standard deviation between sensor pixels in counts (normal distribution), about 1 on an ORCA-Quest;
-            those of binned pixels add up.
+            the offsets of binned pixels add up.
         seed: of the pixels' offsets.
     """
 

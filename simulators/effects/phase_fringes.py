@@ -32,7 +32,7 @@ class PhaseFringes(ImageEffect):
 
     With the refractive index 1 - delta + i beta and mu = 4 pi beta / wavelength, the depth d = mu t gives amplitude and
     phase. The wave's cosine transform is multiplied by exp(-i pi wavelength z f²) (Paganin 2006, Coherent X-Ray Optics,
-    ch. 1.4; f cycles/mm). Its square is the intensity, never negative and of the same sum. The frame's edges are
+    ch. 1.4; f cycles/mm). Its square is the intensity: never negative, with the same sum. The frame's edges are
     mirrors. To first order in z it is T - (z delta / mu) laplace T (Paganin et al. 2002, J. Microsc.
     206:33). The transforms are single precision: intensities are right to 1e-5 of the open beam.
 
@@ -40,9 +40,9 @@ class PhaseFringes(ImageEffect):
     scaling theorem, Paganin 2006, appendix B). The detector's pitch refers to that scale here. For the blur of fringes
     by source and detector name scintillator_blur, too.
 
-    Edges of solids turn the phase by many radians a pixel, which a wave sampled on the pixels cannot represent. Where
-    the Fresnel number of a pixel is 1 or more, so that fringes are finer than pixels, use "transport". It moves the
-    light of the first order from pixel to pixel, and no pixel gives more than it has.
+    Edges of solids turn the phase by many radians a pixel, which a wave sampled on the pixels cannot represent. If the
+    Fresnel number of a pixel is 1 or more, fringes are finer than pixels: use "transport". It moves light between
+    neighbouring pixels, to first order in z, and no pixel gives more light than it has.
 
     Attributes:
         delta_beta: ratio of delta to beta of the material at the energy.
@@ -76,7 +76,7 @@ class PhaseFringes(ImageEffect):
         return HC / self.energy
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where the method does not hold, with what would help."""
+        """Raises CannotExposeError if the method does not hold; the message says what would help."""
         z = self.distance / (1 + self.distance / shot.detector.sod)
         area = self.wavelength * z / shot.detector.pitch**2
         if self.method == "transport":
@@ -157,8 +157,9 @@ def _propagated(depth: Image, delta_beta: float, area: float) -> NDArray[np.floa
 
 
 def _transported(light: Image, share: float) -> Image:
-    """light - share x its Laplacian (in pixels, edges are mirrors), as light moved from each pixel to its brighter
-    neighbours. A pixel that would give more than it has gives all of it, in the same proportions."""
+    """light - share x its Laplacian (in pixels, edges are mirrors): each pixel moves light to its brighter neighbours.
+
+    A pixel that would give more light than it has gives all of it, in the same proportions."""
     kept, out = np.empty_like(light), np.empty_like(light)
     share_rows(lambda first, end: _keep(first, end, light, share, kept), light.shape)
     share_rows(lambda first, end: _give(first, end, light, share, kept, out), light.shape)
@@ -199,6 +200,6 @@ def _give(begin: int, end: int, light: Image, share: float, kept: Image, out: Im
 
 @njit(cache=True, nogil=True)
 def _gain(light: Image, kept: Image, j: int, i: int, k: int, m: int) -> float:
-    """Light that pixel (j, i) gets from its neighbour (k, m), negative where it gives, for a share of 1."""
+    """Light that pixel (j, i) gets from its neighbour (k, m) for a share of 1; negative if it gives light."""
     more = light[j, i] - light[k, m]
     return more * (kept[k, m] if more > 0 else kept[j, i])

@@ -1,4 +1,4 @@
-"""Pixel area: a pixel counts the light on its whole area, not that of one ray through its middle."""
+"""Pixel area: a pixel counts the light on its whole area, instead of one ray through its middle."""
 
 from __future__ import annotations
 

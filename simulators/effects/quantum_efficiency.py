@@ -19,7 +19,7 @@ class QuantumEfficiency(ImageEffect):
     """Scales the expectation before the photon noise, which is exact: thinned Poisson is Poisson (Kingman 1993, ch. 5).
 
     A scene's beam.photons_per_s are then photons of the scintillator's light that arrive at the sensor; without this
-    effect they are those detected. LuAG:Ce emits at 535 nm, CsI:Tl at 550 nm (Crytur, scintillation materials).
+    effect they are detected photons. LuAG:Ce emits at 535 nm, CsI:Tl at 550 nm (Crytur, scintillation materials).
 
     Attributes:
         value: 0 ... 1, or

@@ -11,8 +11,8 @@ from simulators.frame.shot import Image, Shot
 
 @dataclass(frozen=True)
 class RingCurrent(ImageEffect):
-    """Exponential decay exp(-t/lifetime), as a beam lifetime is defined, and back to full at each top-up. The ring is
-    full when the camera is connected.
+    """The current decays as exp(-t/lifetime) and returns to full at each top-up. The ring is full when the camera is
+    connected.
 
     A frame gets the mean current over its exposure, in closed form: consecutive exposures collect the same light as one
     long exposure.

@@ -16,8 +16,8 @@ class RollingShutter(SamplingEffect):
 
     A line time is two row periods of the sensor: 7.2 us in the standard readout and 172.8 us in ultra quiet (property
     table of the C15550-20UP). A binned row begins with its first line. Every row is exposed for the same time from its
-    own start, as with an edge trigger that opens the rows one after the other. The modes in which all rows are exposed
-    together are not simulated: DELAYED, which waits for light until the last row is open, and GLOBALRESET, which opens
+    own start, as with an edge trigger that opens the rows one after the other. Modes that expose all rows together
+    are not simulated: DELAYED, which waits for light until the last row is open, and GLOBALRESET, which opens
     all rows together and closes them line by line.
     """
 

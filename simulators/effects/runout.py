@@ -19,8 +19,8 @@ class Runout(PoseEffect):
 
     Attributes:
         radial: waves a turn, micrometres, phase in degrees, of the axis' motion across the beam and along it. 1 wave is
-            equivalent to a sample beside the axis, 0 to an axis at another place. Others come from the bearing. A
-            negative number turns against the sample.
+        equivalent to a sample beside the axis, 0 waves to an axis at another place. Other numbers come from the
+        bearing. A negative number turns against the sample.
         axial: the same, vertically.
         radial_random_um: standard deviation of the random part across the beam, and along it.
         axial_random_um: of the random part, vertically.

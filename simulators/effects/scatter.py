@@ -13,14 +13,14 @@ from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 class Scatter(ImageEffect):
     """Adds ratio x the mean or a broad blur of the transmitted image, and a constant background.
 
-    The ratio is that of scattered to primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). A flat has no
-    scatter, but the background. Name it before the effects of the scintillator.
+    The ratio compares scattered with primary photons (Siewerdsen & Jaffray 2001, Med. Phys. 28:220). A flat has the
+    background, but no scatter. Name it before the effects of the scintillator.
 
     Attributes:
         ratio: scattered photons over transmitted ones, both as means over the frame.
         width_mm: standard deviation of the Gaussian by which the scattered image is blurred, mm at the sample; None:
             evenly spread. The frame's edges are mirrors.
-        background: photons/s and unbinned sensor pixel; p x photons_per_s is a share p of the open beam.
+        background: photons/s on an unbinned sensor pixel; p x photons_per_s is a share p of the open beam.
     """
 
     ratio: float = 0.0

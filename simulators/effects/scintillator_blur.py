@@ -52,7 +52,7 @@ class ScintillatorBlur(ImageEffect):
             raise ValueError(f"tail must be one of {', '.join(TAILS)}, got {self.tail!r}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where the core is wider than MAX_CORE pixels: wrong units, probably."""
+        """Raises CannotExposeError if the core is wider than MAX_CORE pixels: the units are probably wrong."""
         pixel_um = shot.detector.pitch * 1e3
         sigma = self.fwhm_um / pixel_um / math.sqrt(8 * math.log(2))
         if sigma > MAX_CORE:
@@ -69,7 +69,7 @@ class ScintillatorBlur(ImageEffect):
 
 
 def discrete_gaussian(variance: float) -> NDArray[np.float64]:
-    """Taps 0 ... r of the discrete normal law of a variance in pixels², float64 [tap]; both sides sum to 1."""
+    """Taps 0 ... r of the discrete normal law with this variance in pixels², float64 [tap]; both sides sum to 1."""
     if variance < NEGLIGIBLE:
         return np.ones(1)
     offsets = np.arange(2 + math.ceil(8 * math.sqrt(variance)), dtype=np.float64)
@@ -79,10 +79,10 @@ def discrete_gaussian(variance: float) -> NDArray[np.float64]:
         return unscaled / (2 * unscaled.sum() - 1)
 
     steepness = 0.5 / variance
-    if variance < 1:  # narrower than the sampling: steeper than the continuous law, which would lose variance
+    if variance < 1:  # narrower than the sampling: a steeper law, because the continuous one would lose variance
         steepness = brentq(lambda b: 2 * float(offsets**2 @ taps(b)) - variance, 0.4, 1 + math.log(2 / variance))
     kept = taps(steepness)
-    beyond = 2 * np.cumsum(kept[::-1])[::-1]  # light at this tap or beyond
+    beyond = 2 * np.cumsum(kept[::-1])[::-1]  # light at this tap and beyond
     kept = kept[beyond >= NEGLIGIBLE]
     return kept / (2 * kept.sum() - kept[0])
 

@@ -19,8 +19,8 @@ class StageWobble(PoseEffect):
 
     Attributes:
         harmonics: tilt of the axis: waves a turn, microradians, phase in degrees. 0 waves: a constant tilt, about u at
-            phase 0, about b at -90. 1 wave: the tilt turns with the sample, equivalent to a tilted sample. Others come
-            from the bearing; a negative number turns against the sample.
+            phase 0, about b at -90. 1 wave: the tilt turns with the sample, equivalent to a tilted sample. Other
+            numbers come from the bearing; a negative number turns against the sample.
         random_urad: standard deviation of the random part about u and about b, drawn for each frame.
     """
 

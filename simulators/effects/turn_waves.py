@@ -14,7 +14,7 @@ Wave: TypeAlias = tuple[int, float, float]
 
 
 def check(what: str, waves: Sequence[Wave]) -> None:
-    """Raises ValueError where an amplitude is negative or a number of waves occurs twice."""
+    """Raises ValueError if an amplitude is negative or a number of waves occurs twice."""
     orders = [order for order, _, _ in waves]
     if any(amplitude < 0 for _, amplitude, _ in waves) or len(set(orders)) < len(orders):
         raise ValueError(
@@ -26,8 +26,8 @@ def check(what: str, waves: Sequence[Wave]) -> None:
 def series(angle: NDArray[np.float64], waves: Sequence[Wave]) -> NDArray[np.complex128]:
     """Sum of amplitude x exp(i (waves x angle + phase)) at `angle` in radians, any shape.
 
-    A scalar is its real part. A direction in the laboratory is the real part along u and minus the imaginary part along
-    b: with one wave a turn it turns with the sample, with -1 against it.
+    A scalar effect takes the real part. A direction in the laboratory has the real part along u and minus the imaginary
+    part along b: with one wave a turn it turns with the sample, with -1 against it.
     """
     total = np.zeros(np.shape(angle), dtype=np.complex128)
     for order, amplitude, phase in waves:

@@ -40,7 +40,7 @@ class Zingers(ImageEffect):
             raise ValueError(f"tracks must lie in 0 ... 1, length be positive and radius >= 0, got {self}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        """Raises CannotExposeError where a frame has more than MOST: wrong units, probably."""
+        """Raises CannotExposeError if a frame has more than MOST: the units are probably wrong."""
         rng = frame_rng(self.name, shot)
         expected = self.rate * shot.exposure
         if expected > MOST:
@@ -59,7 +59,7 @@ class Zingers(ImageEffect):
         return image
 
     def _spread(self, where: Image, charge: Image, rng: np.random.Generator) -> tuple[Image, Image]:
-        """Each charge in DROPS parts along its track and around it; where [2, part] and charge [part]."""
+        """Each charge split into DROPS parts along and around its track: places [2, part] and charges [part]."""
         n = charge.size
         runs = rng.random(n) < self.tracks
         length, heading = rng.exponential(self.length, n) * runs, rng.uniform(0, 2 * np.pi, n)

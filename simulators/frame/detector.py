@@ -37,7 +37,7 @@ class Detector:
         return cls(shape, pitch, (shape[1] - 1) / 2, (shape[0] - 1) / 2, sod)
 
     def aimed(self, row: float, col: float) -> Detector:
-        """The rays that pass so many pixels beside those through the pixels' middles."""
+        """The rays at this offset, in pixels, from the rays through the pixels' middles."""
         return replace(self, axis_col=self.axis_col - col, axis_row=self.axis_row - row)
 
     def u(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Mapping: reads a scene's YAML mapping into frozen dataclasses; what is wrong is refused by the path of its key."""
+"""Mapping: reads a scene's YAML mapping into frozen dataclasses; an error names the path of its key."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ K, V = TypeVar("K"), TypeVar("V")
 
 
 class SceneError(ValueError):
-    """A scene's mapping is wrong; the message names the path of the key, its value and what is legal."""
+    """A scene's mapping is wrong; the message names the path of the key, its value and the legal values."""
 
 
 def build(cls: type[T], where: str, mapping: Any) -> T:
@@ -143,7 +143,7 @@ _EXPECTED = {
 
 
 def _sentence(where: str, error: ErrorDetails) -> str:
-    """The path, what is expected there, and the value."""
+    """A sentence from pydantic's error: the path, the expected kind of value, and the value."""
     kind, loc, value = error["type"], error["loc"], error["input"]
     path = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if part != "[key]")
     if kind == "value_error":

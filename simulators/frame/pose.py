@@ -17,7 +17,7 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Rotation and displacement of the sample for each row; None: none.
+    """Rotation and displacement of the sample for each row. None: no displacement.
 
     Attributes:
         angle: float64 [row], radians.

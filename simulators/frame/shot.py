@@ -87,14 +87,12 @@ class Moments:
 
 
 def frame_rng(effect: str, shot: Shot) -> np.random.Generator:
-    """The generator of (seed, effect, frame): any frame can be computed alone, and an added effect does not change the
-    others' numbers."""
+    """The generator of (seed, effect, frame): any frame can be computed alone, whatever the other effects."""
     return np.random.default_rng([shot.seed, zlib.crc32(effect.encode()), shot.frame])
 
 
 def fixed_rng(effect: str, seed: int) -> np.random.Generator:
     """The generator of (effect, its own seed), for all that is the same in every frame.
 
-    It has a spawn key: without one, numpy makes (seed, effect) equal to (seed, effect, frame 0), since it ignores
-    zeros at the end."""
+    It has a spawn key: numpy ignores zeros at the end, so (seed, effect) would equal (seed, effect, frame 0)."""
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(effect.encode())], spawn_key=(0,)))

@@ -13,7 +13,7 @@ NEAREST, FARTHEST = 1e-6, 1e9
 @dataclass(frozen=True)
 class Tube:
     """An X-ray tube: the bremsstrahlung of a thick target, (kv - E) / E photons an energy interval at E (Kramers, Phil.
-    Mag. 46, 836, 1923), behind filters. It has no characteristic lines; for these give the spectrum as a table.
+    Mag. 46, 836, 1923), behind filters. It has no characteristic lines; to include them give the spectrum as a table.
 
     Attributes:
         kv: the voltage, and the highest energy in keV.
@@ -44,8 +44,8 @@ class Beam:
         sdd: mm from the source to the detector.
         energy_kev: of a monochromatic beam, or the middle of its bandwidth.
         bandwidth: full width at half maximum over energy of a Gaussian line: 1e-4 behind Si 111, 0.01 to 0.05 for pink
-            beams. None: none.
-        harmonics: shares of the light at multiples of the energy: {3: 0.01}. None: none.
+        beams. None: a single energy.
+        harmonics: shares of the light at multiples of the energy: {3: 0.01}. None: no harmonics.
         spectrum: [keV, weight] pairs of any sum, instead of energy_kev.
         tube: instead of energy_kev.
     """

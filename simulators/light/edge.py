@@ -6,9 +6,9 @@ states above it. The usual form of both is
 
     f(E) = 1/2 + arctan((E - E_step) / (Γ/2)) / π + h / (1 + ((E - E_line) / (γ/2))²)        (Teo, EXAFS, 1986, ch. 2)
 
-and the attenuation is that of the other electrons plus f times the jump, both continued through the edge by power laws.
-Oxidation moves E_step and E_line up. From 60 to 150 eV from the edge this is blended into the table, which holds
-beyond: the jump of the edge is the table's.
+The attenuation is that of the other electrons plus f times the jump. Power laws continue both through the edge.
+Oxidation moves E_step and E_line up. Between 60 and 150 eV from the edge this form is blended into the table,
+which holds beyond. The jump of the edge is the table's.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ K_EDGES: Mapping[int, KEdge] = MappingProxyType(
 """By atomic number. The Ni line of the charged state is the peak in the battery thesis that this instrument
 follows (figure 2.1: 8348.5 eV). It is given for LiCoO2 there, but lies next to the K edge of nickel, 640 eV above that
 of cobalt. Co and Mn lie where spectra of LiCoO2 and of Mn(IV) oxides do. Nickel carries most of the charge and cobalt
-hardly moves (Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths are nominal: of the right
-order, not of one sample; and every monochromator has an offset of about an eV."""
+hardly moves (Nonaka et al., J. Power Sources 162, 1329, 2006). Shifts, heights and widths have the right
+order of magnitude, but belong to no particular sample. Every monochromator has an offset of about an eV."""
 
 
 def near_edge(

@@ -19,8 +19,8 @@ Reals = NDArray[np.float64]
 STEPS = 40
 """Number of thicknesses, from the full one down to a 8000th of it."""
 SHARES = (0.125, 0.5, 0.875)
-"""Shares of the first of each pair of materials. With halves alone the error for one sample in a thousand, with an edge
-in each of two materials, was ten times the tolerance."""
+"""Shares of the first of each pair of materials. Halves alone do not suffice: for one sample in 1000, with an edge
+in each of two materials, the error is ten times the tolerance."""
 
 
 def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float) -> tuple[NDArray[np.intp], Reals]:

@@ -2,7 +2,7 @@
 
 Cross sections, edges and level widths are those of xraylib (Schoonjans et al., Spectrochim. Acta B 66, 776, 2011): the
 total mass attenuation, photoelectric and both kinds of scattering, from 0.1 to 800 keV. This module is imported only
-where a scene names a material.
+if a scene names a material.
 """
 
 from __future__ import annotations

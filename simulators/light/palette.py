@@ -104,7 +104,7 @@ def palette_of(where: str, entry: Any) -> Palette:
 
 
 def known(name: str) -> Material | None:
-    """A known material by its name; None where there is none."""
+    """A known material by its name; None if the name is unknown."""
     return _KNOWN[name]() if name in _KNOWN else _nmc(name)
 
 

@@ -20,10 +20,10 @@ ENOUGH = 1e-5
 """Tolerance, as a share of the open beam: far below the noise of a pixel with 7000 electrons."""
 _FWHM = math.sqrt(8 * math.log(2))
 _LEAST_KEV = 1.0
-_NOTHING = 1e-7  # of the light: weights below are dropped, of the energies that a filter stops
+_NOTHING = 1e-7  # share of the light: smaller weights, of energies that a filter stops, are dropped
 _FEW = 9
 _A_FEW = 4
-_REACH = 4.5  # standard deviations; 7e-6 of a line are beyond
+_REACH = 4.5  # standard deviations; 7e-6 of a line lie beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Spectrum:
         return float(self.weights @ attenuation(self.energies))
 
     def transmission(self, attenuation: Attenuation, thickness: ArrayLike) -> Reals:
-        """Transmitted share of the light through `thickness` mm, of its shape."""
+        """Transmitted share of the light through `thickness` mm; same shape as `thickness`."""
         through = np.exp(-np.multiply.outer(np.asarray(thickness, dtype=np.float64), attenuation(self.energies)))
         return np.asarray(through @ self.weights)
 
@@ -61,7 +61,7 @@ def light(
 
     Nodes of a line or a tube are doubled until the transmission of up to `thickness` mm of each material changes by
     less than 1e-5. There are up to 513 nodes: with a bare step within a line half a node's weight is uncertain, 0.4 %
-    of the light. Of these, or of a table's energies, the few are kept that have the same transmission to about 1e-5.
+    of the light. A few of these, or of a table's energies, are kept: they have the same transmission to about 1e-5.
 
     Args:
         filters: the attenuation of a material by its name, for a tube.

@@ -1,7 +1,7 @@
-"""Broad blur: a wide, round blur computed on a smaller image, since its result has no fine detail.
+"""Broad blur: a wide, round blur, computed on a smaller image because its result has no fine detail.
 
 Edges are mirrors, so that the sum of the image is conserved to rounding. A blur is given by its transfer function of
-(ω width)², ω the angular frequency. There ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +
+(ω width)², with the angular frequency ω. There ω² is replaced by the discrete Laplacian's symbol, (2 - 2 cos ω_x) +
 (2 - 2 cos ω_y). Each transfer function of this module is a mixture of Gaussians, so that its kernel is a mixture of
 discrete Gaussians (Lindeberg 1990). These are nonnegative at any width, and so are the photons.
 """
@@ -37,7 +37,7 @@ def exponential(s: Image) -> Image:
 
 
 def lorentzian(s: Image) -> Image:
-    """Kernel w / 2π (r² + w²)^1.5, the Lorentzian of two dimensions; its line spread is w / π (x² + w²)."""
+    """Kernel w / 2π (r² + w²)^1.5, the two-dimensional Lorentzian; its line spread is w / π (x² + w²)."""
     return np.exp(-np.sqrt(s))
 
 

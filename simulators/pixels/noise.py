@@ -19,18 +19,19 @@ from simulators.pixels.bands import share_rows
 from simulators.pixels.streams import STEP, begin, mix, normal
 
 LEAST = 2.0
-"""Least expectation for the expansion; below, a uniform number is looked up in the distribution from 0 up."""
+"""Least expectation for the expansion. Below it, a uniform number is looked up in the distribution from 0 up."""
 EASY = 8
-"""Numbers up to this one are compared in a vectorised loop; of small expectations, 2 in 10 000 are larger."""
+"""Numbers up to this one are compared in a vectorised loop. For small expectations, 2 in 10 000 are larger."""
 LARGEST = 1e9
 """Largest expectation: rounding of the expansion is far below its error up to there."""
 
 
 @njit(cache=True, nogil=True, inline="always")
 def expansion(w, mean, root):  # type: ignore[no-untyped-def]
-    """x with Q(x, mean) = Φ(w), where Q is the regularised upper incomplete gamma function: the Poisson quantile is its
-    integer part; `root` is √mean. And a bound of its error: twice Giles's where |w| <= 3 (from an expectation of 30 on
-    where |w| <= 5), none elsewhere."""
+    """x with Q(x, mean) = Φ(w), and a bound of its error. Q is the regularised upper incomplete gamma function.
+
+    The integer part of x is the Poisson quantile; `root` is √mean. The bound is twice Giles's for |w| <= 3, and
+    for |w| <= 5 from an expectation of 30 on. Elsewhere there is no bound."""
     s = 1.0 / root
     ww = w * w
     x = mean + root * w + (1 / 3 + ww / 6) - s * w * (1 / 36 + ww / 72)

@@ -45,8 +45,8 @@ def places(
     """Random sensor pixels, a `fraction` of all, as far as they are in the frame.
 
     Returns:
-        Their (rows, columns) in the frame, and a number of each that is even in 0 ... 1. A binned pixel comes as often
-        as there are such pixels in it.
+        Their (rows, columns) in the frame, and for each a uniform number in 0 ... 1. A binned pixel occurs as often
+        as it contains such pixels.
     """
     rng = fixed_rng(effect, seed)
     n = round(fraction * SENSOR_SHAPE[0] * SENSOR_SHAPE[1])

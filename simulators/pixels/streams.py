@@ -2,7 +2,7 @@
 
 A stream is splitmix64 (Steele, Lea & Flood 2014): the state advances by a fixed step and each number is its hash. So a
 row of a frame or a pixel of the sensor gets its own stream by hashing its index. Streams that begin at random places of
-a period of 2^64 hardly ever overlap, and where two do they share only a few numbers.
+a period of 2^64 hardly ever overlap, and then share only a few numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ TAIL = 3.6541528853610088
 
 
 def layers() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Edges x (falling from the base's to 0) [257] and exp(-x²/2) [257] of layers of one area."""
+    """Edges x [257], falling from the base's to 0, and exp(-x²/2) [257], of layers of equal area."""
     area = TAIL * math.exp(-(TAIL**2) / 2) + math.sqrt(math.pi / 2) * math.erfc(TAIL / math.sqrt(2))
     edges = [area * math.exp(TAIL**2 / 2), TAIL]
     while len(edges) < 256:

@@ -1,7 +1,7 @@
 """Explain: the steps of one frame of a scene in order, with their cost, and the effects that are not computed.
 
-Steps are timed where they run. Effects that change the rays of a frame, such as motion, make the others run several
-times: the cost of such an effect is the time of a frame with it less that of a frame without it.
+Each step is timed where it runs. Effects that change the rays of a frame, such as motion, repeat the other steps.
+The cost of such an effect is the time of a frame with it, minus the time of a frame without it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCo
     Args:
         now: s, of a clock for short times.
     """
-    # What changes the rays of a frame is no step of its own: it costs what a frame takes longer with it.
+    # An effect that changes the rays is not a step: its cost is the additional time of a whole frame.
     ray_effects = [effect for effect in scene.chain.effects if not isinstance(effect, ImageEffect)]
     rest = [effect for effect in scene.chain.effects if isinstance(effect, ImageEffect)]
     variants = [replace(scene, chain=Chain.of([*ray_effects[:n], *rest])) for n in range(len(ray_effects) + 1)]

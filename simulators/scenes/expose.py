@@ -1,4 +1,4 @@
-"""Expose: computes one frame of a scene, from the turning sample to counts, with the effects that it names only.
+"""Expose: computes one frame of a scene, from the turning sample to counts, with only the effects that the scene names.
 
 Without effects a frame is photons x exposure x exp(-line integral) / conversion, rounded: Beer-Lambert.
 """

@@ -1,6 +1,7 @@
 """Scene: the sample, the beam and the simulated departures from Beer-Lambert, read from a YAML mapping.
 
-Only what a scene names is imported. Keys are the field names of the dataclasses; mm, s, 1/mm and electrons throughout:
+Only the parts that a scene names are imported. Keys are the field names of the dataclasses; units are mm, s, 1/mm,
+electrons:
 
     phantom: {kind: battery, field_of_view: [0.9, 0.9], n_particles: 150, seed: 7}
     # or:    {kind: solids, solids: [{kind: cylinder, radius: 0.3, height: 0.6, attenuation: 1.5}, ...]}
@@ -52,7 +53,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class _SceneKeys:
-    """The keys of a scene's mapping; what a phantom or an effect holds depends on its kind."""
+    """The keys of a scene's mapping. The keys of a phantom or an effect depend on its kind."""
 
     phantom: Any
     beam: Beam

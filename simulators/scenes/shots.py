@@ -29,8 +29,8 @@ class Scan:
     Attributes:
         seed: of all random numbers.
         start: s since the Unix epoch, of the first frame.
-        views: number of projections, spread over the scene's range. Where the stage flies, fewer views have longer
-            periods: the stage turns no faster, so that the blur of a view is that of the scene.
+        views: number of projections, spread over the scene's range. In a fly scan fewer views have longer periods:
+        the speed of the stage stays, so that each view has the scene's blur.
     """
 
     scene: Scene

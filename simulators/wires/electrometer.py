@@ -1,7 +1,7 @@
 """Simulated electrometer, the wire: `READ?` gives a current with its unit, a time and a status, as a picoammeter does.
 
-Form of answers as remembered of the Keithley 6485: `+1.042700E-12A,+2.345000E+00,+0.000000E+00`. An unknown command is
-met with silence.
+Form of answers, from memory of the Keithley 6485: `+1.042700E-12A,+2.345000E+00,+0.000000E+00`. An unknown command gets
+no answer.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class ElectrometerWire:
     """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
 
     Args:
-        current: A at a time in s since 1970.
+        current: A, as a function of the time in s since 1970.
         end: of lines, both ways.
         latency: s that a reading takes.
         silent: readings (from 0) that get no answer.
@@ -55,7 +55,7 @@ class ElectrometerWire:
                 self._do(line.decode("ascii", errors="replace").strip().upper())
 
     def transmit(self) -> bytes:
-        """Bytes for the host that are due and were not taken yet."""
+        """Bytes for the host that are due and not yet taken."""
         with self._lock:
             now = self.clock.now()
             due = b"".join(piece for time, piece in self._coming if time <= now)

@@ -1,4 +1,4 @@
-"""Serial URL: `sim://name` opens a simulated device through pyserial, by the code path that opens a real port.
+"""Serial URL: `sim://name` opens a simulated device through pyserial, by the same code path as a real port.
 
 pyserial finds the scheme in `simulators.wires.protocol_sim` once this module is imported. Names are process-wide, as
 the ports of a computer are.
@@ -15,14 +15,14 @@ from simulators.wires.wire import Wire
 
 SCHEME = "sim://"
 POLL = 1e-3
-"""s on the device's clock between looks for a reply that has not come yet."""
+"""s on the device's clock between two checks for a missing reply."""
 
 if "simulators.wires" not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append("simulators.wires")
 
 
 class _Ports:
-    """The simulated ports of this process: what is plugged in, and which are open."""
+    """The simulated ports of this process: the devices plugged in, and the open ports."""
 
     def __init__(self) -> None:
         self._wires: dict[str, Wire] = {}
@@ -50,11 +50,11 @@ class _Ports:
                 del self._open[name]
 
 
-_PORTS = _Ports()  # pyserial hands a URL to its handler and nothing else, so the names have to live beside it
+_PORTS = _Ports()  # pyserial gives its handler only the URL, so the names are kept here
 
 
 def register(name: str, wire: Wire) -> str:
-    """Plug a simulated device in; the URL that opens it. An older device of that name is unplugged."""
+    """Plug a simulated device in; returns the URL that opens it. It replaces a device of the same name."""
     _PORTS.plug(name, wire)
     return SCHEME + name
 
@@ -70,7 +70,7 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
             raise SerialException("port is already open")
         self._name = self.port[len(SCHEME) :]
         self._wire = _PORTS.open(self._name)
-        self._wire.transmit()  # a port that is opened forgets what had come before, as an operating system's does
+        self._wire.transmit()  # opening a port drops earlier bytes, as an operating system does
         self._received = bytearray()
         self.is_open = True
 
@@ -111,7 +111,7 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
         self._received += self._wire.transmit()
 
     def _reconfigure_port(self) -> None:
-        """pyserial calls it when a setting changes; this port has none that matter."""
+        """pyserial calls it when a setting changes; settings do not affect this port."""
 
     def _update_dtr_state(self) -> None:
         """No modem lines."""

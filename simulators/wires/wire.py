@@ -1,4 +1,4 @@
-"""Wire: the far end of a serial cable, as a simulated device shows it to whatever carries the bytes."""
+"""Wire: the far end of a serial cable: bytes in, bytes out."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Controller(Wire, Protocol):
     """A simulated controller of a stage."""
 
     def output_is_high(self, number: int) -> bool:
-        """The level of a digital output; False where no output has that number."""
+        """The level of a digital output; False if no output has that number."""
         ...
 
 
@@ -36,10 +36,10 @@ class Build(Protocol):
 
     @classmethod
     def matching(cls, settings: Any) -> Self:
-        """The one that a driver with these settings, of its own stage, expects.
+        """The controller that fits a driver with these settings.
 
         Raises:
-            ValueError: the name of a setting, and what the stand-in lacks for it.
+            ValueError: the simulated controller cannot have a setting; the message names it and the reason.
         """
         ...
 

@@ -75,7 +75,7 @@ def test_after_a_failure_nothing_is_believed() -> None:
     assert line.levels == [True, True]  # sent again: what the failed close did is not known
 
 
-def test_what_somebody_else_did_is_seen() -> None:
+def test_changes_by_another_program_are_noticed() -> None:
     line = Line()
     shutter = OutputShutter(line, VirtualClock(0.0))
     shutter.open()

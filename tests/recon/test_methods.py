@@ -66,7 +66,7 @@ def test_all_methods_but_the_direct_one_may_allow_negative_densities() -> None:
 
 
 @pytest.mark.parametrize("name", methods.names())
-def test_what_the_registry_says_is_what_the_class_is(name: str) -> None:
+def test_registry_entries_match_their_classes(name: str) -> None:
     method = methods.by_name(name)
     assert method.name == name and method.label
     assert is_dataclass(method) and getattr(recon, method.__name__) is method

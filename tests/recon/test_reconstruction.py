@@ -76,7 +76,7 @@ def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> Non
     assert second.settings["kernel"] is other and second.gaussians is not None and second.gaussians.kernel is other
 
 
-def test_a_small_box_holds_what_the_whole_volume_holds_there(noisy: np.ndarray) -> None:
+def test_a_small_box_equals_that_part_of_the_whole_volume(noisy: np.ndarray) -> None:
     # The matter outside the box is in the views, so it must be in the model.
     z, y, x = GRID.coordinates()
     box = recon.Grid((6, 12, 10), PITCH, centre=(float(z[9:15].mean()), float(y[20:32].mean()), float(x[5:15].mean())))
@@ -377,7 +377,7 @@ def test_one_view_is_refused(noisy: np.ndarray) -> None:
         recon.reconstruct(noisy[:1], VIEWS.select([0]))
 
 
-def test_degrees_and_counts_are_warned_of_with_what_to_give(noisy: np.ndarray) -> None:
+def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> None:
     degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, PITCH, axis_col=18.3)
     with pytest.warns(UserWarning, match=r"172\.5 rad and look like degrees.*np\.deg2rad"):
         recon.reconstruct(noisy, degrees, "fbp")

@@ -1,4 +1,4 @@
-"""Angles that come beside the frames: read from text or an array, and laid onto frames only where the counts fit."""
+"""Angles from outside the scan file: read from text or an array, and assigned to frames only if the counts fit."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def assign(image_key: NDArray[np.int32], angles: NDArray[np.float64], name: str)
 
 
 def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
-    """First and last row of the n neighbouring rows whose steps differ least, or None where there is no choice.
+    """First and last row of the n neighbouring rows with the most equal steps, or None without a choice.
 
     A scan's angle log often holds the darks and flats as well, at a standing stage.
     """

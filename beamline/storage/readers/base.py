@@ -1,4 +1,4 @@
-"""ScanSource: one view of a scan, whatever the file. BaseSource and ScanFormat: what a file format adds."""
+"""ScanSource: a scan of any file format. BaseSource and ScanFormat: the parts that a file format adds."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ WHOLE = slice(None)
 
 
 class ScanSource(Protocol):
-    """The frames of one scan and what is known about them. Nothing is guessed: unknown is None, NaN or "unknown".
+    """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
 
     Attributes:
-        path: what was opened.
+        path: of the opened scan.
         format: "nxtomo", "diamond_nexus", "data_exchange", "tiff_series", "tiff_stack", ...
         shape: (rows, cols) of a frame.
         dtype: of the pixels that read() returns.
-        quantity: what a pixel is. "unknown" where the file does not say and the caller did not.
+        quantity: of the pixels. "unknown" if neither the file nor the caller states it.
         image_key: int32 [frame], values of drivers.base.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
         exposures: float64 [frame] s, NaN where unknown.
@@ -39,19 +39,19 @@ class ScanSource(Protocol):
         pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        attributes: whatever else the file says, for the record.
+        attributes: other facts of the file, for the record.
         flags: of the monitor, by frame; None where no monitor looked at the frames.
-        replaces: int64 [frame], the row of the view that a frame was taken again for (an INVALID frame from then on),
-            -1 in others. None where no view was taken again.
+        replaces: int64 [frame], the row of the view that a frame repeats (the old row is then INVALID), -1 in others.
+        None if no view was repeated.
         part_starts: int64 [part], ascending, the first row of each part: between two parts the scan was interrupted,
             so that beam and camera may have changed. [0] where it was not.
         checksummed: the file holds a checksum of every frame.
-        altered: rows whose record in the file differs from the one that was written, by its checksum. They are INVALID,
-            for nothing is known of them.
+        altered: rows whose record differs from its checksum. They are INVALID, because their metadata cannot be
+        trusted.
         damaged: rows read so far whose pixels are not those that were written, by these checksums. Frames are compared
             only where half of them or more is read.
-        plan: what the operator asked for, as our files record it; empty where it is not known.
-        finished: no more frames will come. Ask before refresh(): then what refresh() finds is all there will be.
+        plan: the requested scan, as our files record it; empty if unknown.
+        finished: no more frames will come. Ask before refresh(): refresh() then finds all frames.
     """
 
     @property
@@ -147,7 +147,7 @@ def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
 
 
 class BaseSource(ABC):
-    """Base class of the readers: a format adds what it knows and `read`; the rest is here once.
+    """Base class of the readers: a format adds its fields and `read`; the rest is here.
 
     A subclass sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and `facts` (its attributes) where it
     opens the file. It also sets those of the other fields that its format states; see ScanSource for their meaning.
@@ -262,7 +262,7 @@ class Opening:
 
     Attributes:
         follow: the file may still be growing.
-        own_angles: the file's angles are wanted; False: the caller brings them, so the file may lack them.
+        own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
     """
 
     follow: bool = False

@@ -53,11 +53,11 @@ Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [fr
 
 @dataclass(frozen=True, eq=False)
 class SourceOptions:
-    """A scan, and what replaces what its file says.
+    """A scan, and replacements for facts in its file.
 
     Attributes:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
-        quantity: what the pixels are, where the file does not say.
+        quantity: of the pixels, if the file does not state it.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
             projection, or one for each frame.
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
@@ -91,7 +91,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     """Open a scan in any format of the registry.
 
     Args:
-        scan: its path, or the path with what replaces what the file says.
+        scan: its path, or a SourceOptions with replacements.
         follow: the file may still be growing; refresh() then finds new frames.
 
     Raises:
@@ -139,7 +139,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
 
 def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str) -> None:
-    """DataError for an angle for each frame, where the order in which darks and flats were taken is not known."""
+    """DataError for angles of all frames if the order of darks and flats is unknown."""
     n = int((base.image_key == FrameKind.PROJECTION).sum())
     if n < base.image_key.size == table.size:
         raise DataError(
@@ -175,7 +175,7 @@ def _open(path: Path, opening: Opening) -> BaseSource:
 
 
 def _refuse(options: SourceOptions, follow: bool) -> None:
-    """DataError for what does not go together."""
+    """DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
     if follow and replaced:

@@ -19,7 +19,7 @@ from drivers.base.frame import Frame, FrameKind
 class OverlaidSource(BaseSource):
     """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
 
-    Where darks (flats) are given, those of `base` become INVALID: they stay, and nobody uses them.
+    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class OverlaidSource(BaseSource):
         self._update()
 
     def _update(self) -> None:
-        """Take over what `base` knows now; references that are laid over come without angles and exposures."""
+        """Take over the present state of `base`; added references have no angles and exposures."""
         base = self._base
         unknown = np.full(len(self._front), np.nan)
         keys = base.image_key.copy()
@@ -92,7 +92,7 @@ class OverlaidSource(BaseSource):
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
-        """Those of `base`, the first with the references in front; flats that are laid over are those of all parts."""
+        """The parts of `base`, the first with the references in front; added flats hold for all parts."""
         if self._replaced[FrameKind.FLAT] is not None:
             return np.zeros(1, np.int64)
         starts = self._base.part_starts

@@ -16,7 +16,7 @@ from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, ScanSou
 class PartsSource(BaseSource):
     """A ScanSource of the frames of `earlier`, which have ended, and then of `last`, whose path and facts it has.
 
-    What is known of a frame by its row, such as the row that it replaces, counts from the first frame of all.
+    Row numbers, such as the row that a frame replaces, count from the first frame of all files.
     """
 
     def __init__(self, earlier: Sequence[ScanSource], last: ScanSource) -> None:

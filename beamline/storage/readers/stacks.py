@@ -33,7 +33,7 @@ class FrameStack:
 
 
 class Closable(Protocol):
-    """What is closed with the scan."""
+    """An object that is closed with the scan."""
 
     def close(self) -> None: ...
 
@@ -41,7 +41,7 @@ class Closable(Protocol):
 class StacksSource(BaseSource):
     """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
 
-    Quantity: "counts" where darks and flats are there to make something of them, else "unknown".
+    Quantity: "counts" if there are darks and flats, otherwise "unknown".
     """
 
     def __init__(
@@ -136,7 +136,7 @@ def angles_at(path: Path, where: str, unit: str | None) -> NDArray[np.float64]:
 
 
 def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
-    """The dataset at a path; DataError where there is none, with those that the file has."""
+    """The dataset at a path. Without one, DataError lists the datasets of the file."""
     item = hdf5.dataset(file, where)
     if item is None:
         raise DataError(f"{file.filename} has no dataset {where}. {datasets_text(file)}")

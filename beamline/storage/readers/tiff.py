@@ -34,7 +34,7 @@ UNREADABLE = (
 
 
 class Complaints(logging.Handler):
-    """What tifffile says about a damaged file: it logs that, and goes on with the pages that it finds."""
+    """Collects tifffile's messages on a damaged file: it only logs them, and goes on with the pages that it finds."""
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)

@@ -1,6 +1,6 @@
 """TIFF series: a folder (or .zip) with one image a file.
 
-Files tell what they are by name: `dark`, `flat`, `white` or `open_beam` at the start of a word of the name or of a
+The name of a file tells its kind: `dark`, `flat`, `white` or `open_beam` at the start of a word of the name or of a
 folder above it; the others must be one series. They are put in the order of the numbers in their names, never of a
 listing. Files are read one at a time, so that memory does not grow with the scan.
 """
@@ -28,7 +28,7 @@ from drivers.base.frame import FrameKind
 
 REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
 MOST_FILES = 100_000
-COUNTED = 100  # numbers between the first and the last file, over their number, from which they count no frames
+COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
@@ -117,7 +117,7 @@ class TiffSeriesSource(BaseSource):
 
 
 def kind_of(name: str) -> FrameKind:
-    """What a file shows, by its name relative to the scan's folder."""
+    """The kind of a file, by its name relative to the scan's folder."""
     match = REFERENCE.search(name.lower())
     if match is None:
         return FrameKind.PROJECTION

@@ -1,4 +1,4 @@
-"""Finding: one thing that a rule has to say about a scan."""
+"""Finding: one statement of a rule about a scan."""
 
 from __future__ import annotations
 

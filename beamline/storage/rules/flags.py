@@ -1,4 +1,4 @@
-"""What the monitor flagged in a scan, as a finding: alarms are a warning, and an error where too few views are left."""
+"""The flags of a scan as a finding: alarms are a warning, and an error if too few views are left."""
 
 from __future__ import annotations
 

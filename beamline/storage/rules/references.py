@@ -1,4 +1,4 @@
-"""Darks and flats of a file: which were taken together, which groups are good, and what is said about the others."""
+"""Darks and flats of a file: their groups, the good groups, and findings on the others."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ReferenceGroups:
 
     Attributes:
         darks, flats: rows of each group, in the order of the file.
-        judged: what was found of each of them, the darks first.
+        judged: the verdict on each group, the darks first.
     """
 
     darks: tuple[Frames, ...]
@@ -36,7 +36,7 @@ class ReferenceGroups:
     judged: tuple[JudgedGroup, ...]
 
     def good(self) -> ReferenceGroups:
-        """The groups without a fault; of a kind that has none, all groups."""
+        """The groups without a fault; for a kind without a good group, all groups."""
         ok = [not group.faults for group in self.judged]
         dark_ok, flat_ok = ok[: len(self.darks)], ok[len(self.darks) :]
         return ReferenceGroups(_kept(self.darks, dark_ok), _kept(self.flats, flat_ok), self.judged)

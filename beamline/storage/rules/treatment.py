@@ -1,4 +1,4 @@
-"""Treatment: what a reconstruction does with views by their flags; every command says it in these words."""
+"""Treatment: how a reconstruction uses views by their flags; every command states it in these words."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Treatment:
-    """What becomes of the views of a scan.
+    """The treatment of the views of a scan.
 
     Attributes:
         flags: of all frames, those that count.
@@ -55,8 +55,8 @@ class Treatment:
 def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Treatment:
     """What `beamline recon` does with these views, whose frames have this shape, unless it ignores flags.
 
-    A view in which the sample jumped is as good as those after it. What views from opposite sides show of the jump is
-    no fault of theirs then.
+    A view in which the sample jumped is as good as those after it. Flags of views from opposite sides for the same jump
+    then do not count.
     """
     jumps = [flags.rows(entry, Level.ALARM) for entry in flags.legend if entry.bit == MotionCheck.bit]
     jumped = np.concatenate([np.zeros(0, np.int64), *jumps])

@@ -1,4 +1,4 @@
-"""validate: what a scan must say to be trusted, one function a rule. Public validators pass NaN angles; these do not.
+"""validate: conditions for trust in a scan, one function a rule. Public validators accept NaN angles; these do not.
 
 The rules here look at a scan of any format through ScanSource; nexus_rules looks at how an NXtomo is written down.
 """
@@ -42,7 +42,7 @@ EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> list[Finding]:
     """Everything that the rules find in a file, worst first; [] for a scan without fault.
 
-    Never raises for what is wrong with the file: what cannot be opened is a finding. A volume is judged as one.
+    Never raises for faults of the file: a file that cannot be opened is a finding. Volumes have rules of their own.
 
     Args:
         deep: every frame is read and compared with its checksum; is told how many of how many.
@@ -82,7 +82,7 @@ def scan_findings(source: ScanSource) -> list[Finding]:
 
 
 def reconstruction_blockers(source: ScanSource) -> list[Finding]:
-    """Why this scan must not be reconstructed; [] where nothing stands against it."""
+    """Why this scan must not be reconstructed; [] if it may be."""
     return [finding for finding in source_findings(source) if finding.severity == "error"]
 
 
@@ -119,7 +119,7 @@ def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Fin
 
 
 def altered_said(source: ScanSource) -> str:
-    """Sentences on the rows of a scan whose record is not what was written."""
+    """Sentences on the rows of a scan whose record differs from its checksum."""
     rows = sorted(source.altered)
     return (
         f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger) differs from the "

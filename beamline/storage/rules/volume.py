@@ -1,4 +1,4 @@
-"""What a volume must say to be trusted."""
+"""Conditions for trust in a volume."""
 
 from __future__ import annotations
 

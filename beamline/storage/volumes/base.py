@@ -1,4 +1,4 @@
-"""What a format of volume files does, how voxels become grey values, and the facts that go with them."""
+"""The interface of a format of volume files, the conversion of voxels to grey values, and the facts beside them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recon.base.volume import Grid, Volume
 
 @dataclass(frozen=True)
 class Pixels:
-    """What a voxel is stored as.
+    """The stored form of a voxel.
 
     Attributes:
         bits: 32: float32, the value itself; 16 or 8: a grey value.
@@ -84,7 +84,7 @@ class VolumeFormat(Protocol):
     def name(self) -> str: ...
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """That a file's name ends in; "" for a folder."""
+        """Endings of a file's name; "" for a folder."""
         ...
 
     @property

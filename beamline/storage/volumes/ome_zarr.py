@@ -65,7 +65,7 @@ class OmeZarr:
 
 
 class _Scale:
-    """A scale that takes slices one after another, and hands on those that are half as fine."""
+    """A scale that takes slices one after another, and passes halved ones to the next scale."""
 
     def __init__(self, folder: Path, shape: tuple[int, int, int], dtype: np.dtype[Any]) -> None:
         self._folder, self._shape, self._dtype = folder, shape, dtype

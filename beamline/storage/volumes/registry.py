@@ -45,7 +45,7 @@ REGISTRY = {
 
 @cache
 def entries() -> dict[str, FormatEntry]:
-    """Ours, and those of other packages, by name."""
+    """The formats of this package and of other packages, by name."""
     taken = {suffix for entry in REGISTRY.values() for suffix in entry.suffixes}
 
     def made(name: str, kind: type[Any]) -> FormatEntry:

@@ -24,11 +24,11 @@ _FORMAT = "splatline checkpoint 1"
 
 @dataclass(frozen=True, eq=False)
 class Checkpoint:
-    """A fit as it was left.
+    """The state of an interrupted fit.
 
     Attributes:
         state: arrays by name, see recon.splatting.checkpoint.
-        made_from: data and settings that the fit goes on with, by name; they must be the same when it is taken up.
+        made_from: data and settings of the fit, by name; they must be the same when it resumes.
         steps: that were planned; 0 where a time was.
     """
 

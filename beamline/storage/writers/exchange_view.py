@@ -1,4 +1,4 @@
-"""The /exchange view: an NXtomo file's frames once more as Data Exchange, by virtual datasets and without a copy.
+"""The /exchange view: an NXtomo file's frames a second time as Data Exchange, by virtual datasets without a copy.
 
 Layout after De Carlo et al. (2014), "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed
 data", J. Synchrotron Rad. 21, 1224: data, data_white, data_dark [frame, row, col] and theta in degrees.
@@ -50,7 +50,7 @@ def add_exchange_view(file: h5py.File) -> None:
 
 
 def has_exchange_view(file: h5py.File) -> bool:
-    """Nothing is missing in /exchange."""
+    """Whether /exchange is complete."""
     return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
 
 

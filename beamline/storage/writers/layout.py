@@ -117,7 +117,7 @@ GROWING = (*COLUMNS, VALID, SCORES, REGIONS)
 RECORDED = (
     IMAGE_KEY, COUNT_TIME, ANGLE, KIND, TRIGGER, FRAMESTAMP, TIME, REPLACES,
 )  # fmt: skip
-"""What is said about a frame once and for all: RECORD_CHECKSUM is over these columns, in this order."""
+"""Metadata of a frame that never change: RECORD_CHECKSUM is over these columns, in this order."""
 _RECORD = np.dtype([(path, COLUMNS[path][0]) for path in RECORDED])  # 56 bytes, little-endian, without gaps
 
 Description = Mapping[str, str | int | float]
@@ -125,7 +125,7 @@ Description = Mapping[str, str | int | float]
 
 @dataclass(frozen=True)
 class ScanInfo:
-    """What is known about a scan before its first frame; None where it is not known.
+    """Facts about a scan before its first frame; None if unknown.
 
     Attributes:
         sample: name; title: one line for people.
@@ -135,7 +135,7 @@ class ScanInfo:
         source_distance_mm: source to sample; given only where the beam is a cone (then `pixel_size_mm` is that on the
             detector, as NXtomo has it).
         plan: JSON; config: YAML; both as text for the record.
-        devices: what each device says of itself, by its name.
+        devices: the description of each device, by its name.
         beam_unit: of the beam monitor's readings; None: there is none.
     """
 
@@ -156,7 +156,7 @@ class ScanInfo:
 
 @dataclass(frozen=True)
 class Record:
-    """What one row says about its frame beside the pixels; units as in drivers.base.frame.Frame (radians, s)."""
+    """Metadata of a frame in its row; units as in drivers.base.frame.Frame (radians, s)."""
 
     kind: FrameKind
     angle: float
@@ -169,9 +169,9 @@ class Record:
 
 
 def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
-    """CRC-32 [row] of what RECORDED columns [row], by their paths, say of each frame.
+    """CRC-32 [row] of the RECORDED columns [row], by their paths.
 
-    The row of a view that is taken again becomes that of an invalid frame: its checksum stays that of the view.
+    The row of a repeated view becomes an invalid frame, but its checksum is still computed for a view.
     """
     table = np.empty(len(columns[KIND]), _RECORD)
     for path in RECORDED:
@@ -191,7 +191,7 @@ def rows_as_written(columns: Mapping[str, NDArray[Any]], checksums: NDArray[Any]
 
 
 def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
-    """Rows from `first` on, counted from it, whose record is not what was written with its checksum.
+    """Rows whose record differs from its checksum; they are counted from `first`, where the search begins.
 
     Raises:
         ValueError: a column is not as `create` made it.
@@ -324,7 +324,7 @@ def create(
 class Rows:
     """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete.
 
-    Pixels are written at once, what is said about them at `flush`: the columns of several rows cost as much as of one.
+    Pixels are written at once, metadata at `flush`: the columns of several rows cost as much as those of one row.
     """
 
     def __init__(self, file: h5py.File) -> None:
@@ -335,7 +335,7 @@ class Rows:
         self._first, self._said = 0, list[dict[str, Any]]()
 
     def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Row `row`, which may exist or be the next: pixels first, then, at the next `flush`, what is said about them.
+        """Write row `row`, an existing one or the next: pixels now, metadata at the next `flush`.
 
         A view that it replaces becomes an invalid frame, so that no program takes both.
         """
@@ -367,7 +367,7 @@ class Rows:
                 self._columns[path][record.replaces] = int(FrameKind.INVALID)
 
     def flush(self) -> None:
-        """Write what is said about the rows since the last call. The file's own flush comes after it."""
+        """Write the metadata of the rows since the last call. The file's own flush comes after it."""
         if not self._said:
             return
         n, record = len(self._said), dict[str, NDArray[Any]]()
@@ -401,7 +401,7 @@ class Rows:
 
 
 def state_field_of_view(file: h5py.File) -> None:
-    """Say whether a full turn saw half of the sample at a time, as far as its views tell."""
+    """Write whether a full turn saw half of the sample at a time, as far as its views tell."""
     field = field_of_view(file)
     if field and FIELD_OF_VIEW in file:
         file[FIELD_OF_VIEW][()] = field.encode()

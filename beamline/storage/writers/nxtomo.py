@@ -40,7 +40,7 @@ LAST = (
     layout.STATUS, layout.FINISHED, layout.END_TIME, layout.FIELD_OF_VIEW, layout.MISSING, layout.BEAM_TIME,
     layout.BEAM_VALUE,
 )  # fmt: skip
-"""What is written when a scan ends."""
+"""Datasets that are written when a scan ends."""
 FAILURES = (OSError, RuntimeError, ValueError)  # what h5py makes of HDF5's errors
 
 
@@ -48,7 +48,7 @@ class NXtomoWriter:
     """Writes uint16 frames row by row; never overwrites a file.
 
     Every append leaves pixels, digest and record of the frame in the file before `frames_committed` counts it.
-    Attribute `remarks`: what close() could not do though the data are safe, one sentence each.
+    Attribute `remarks`: steps that close() could not do although the data are safe, one sentence each.
     """
 
     def __init__(
@@ -152,8 +152,8 @@ class NXtomoWriter:
 
     @property
     def safe(self) -> int:
-        """Of these, what the disk has, as far as is known: after a failed fsync it may have lost everything since the
-        last one that succeeded."""
+        """Committed frames that are known to be on the disk: after a failed fsync it may have lost all since the last
+        successful one."""
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
     def flush(self) -> None:

@@ -157,7 +157,7 @@ def read_reconstruction(path: Path) -> ReconRecord:
 
 @contextmanager
 def opened_reconstruction(path: Path) -> Iterator[ReconRecord]:
-    """The same without its voxels in memory: the volume's data are read where they are sliced along z.
+    """As `read_reconstruction`, without voxels in memory: the volume's data are read where they are sliced along z.
 
     Raises:
         DataError: if the file is missing or is not such a file.

@@ -1,7 +1,7 @@
-"""One axis of a PI GCS 2.0 controller and its trigger line: what can be asked of it. Counts here, degrees on the wire.
+"""One axis of a PI GCS 2.0 controller and its trigger line: its commands and queries. Counts here, degrees on the wire.
 
-Set commands are followed by ERR?, and what matters is read back. Protocol: the C-863's manual (MS249E), cross-checked
-with EPICS' and the vendor's host software. One axis, one parameter a line; no daisy chain.
+Set commands are followed by ERR?, and important values are read back. Protocol: the C-863's manual (MS249E),
+cross-checked with EPICS' and the vendor's host software. One axis, one parameter a line; no daisy chain.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from drivers.stages.pi_gcs.train import TriggerWindow
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
 ACCELERATION, DECELERATION, NUMERATOR, DENOMINATOR = "0xB", "0xC", "0xE", "0xF"
 RATE_AGREES = Fraction(1, 100)
-"""Controllers hold velocities and accelerations in steps of their own; more than this is another number."""
+"""Controllers round velocities and accelerations to steps of their own; a larger difference is an error."""
 
 
 @dataclass(frozen=True)
 class AxisStatus:
-    """What the axis says. `raw`: the replies, for errors."""
+    """State of the axis. `raw`: the replies, for errors."""
 
     counts: int
     moving: bool
@@ -33,7 +33,7 @@ class AxisStatus:
 
 
 class PiGcsAxis:
-    """Raises (in all methods) what `GcsLine` raises, and DeviceRefused where it must stand and does not."""
+    """Raises (in all methods) the errors of `GcsLine`, and DeviceRefused if the axis must stand and does not."""
 
     def __init__(self, line: GcsLine, settings: PiGcsSettings, name: str) -> None:
         self._line, self._name, self._axis, self._output = line, name, settings.axis, settings.trigger_line
@@ -44,14 +44,14 @@ class PiGcsAxis:
         self._identity = ""
 
     def degrees(self, counts: Fraction | int) -> str:
-        """The text for a place, distance or rate: exact to far less than a count over any train."""
+        """The text for a place, distance or rate: its rounding is far below a count over any train."""
         return plain(Fraction(counts) * 360 / self._counts_per_turn)
 
     def to_counts(self, degrees: str) -> int:
         return round(Fraction(degrees) * self._counts_per_turn / 360)
 
     def open(self, acceleration: Fraction) -> str:
-        """Make sure of the controller and take the axis: trigger off, servo on, acceleration (counts/s²); who it is."""
+        """Identify the controller, take the axis: trigger off, servo on, acceleration (counts/s²); returns its name."""
         self._line.wake()
         self._identity = self._line.ask("*IDN?", r".*Physik Instrumente.*", "the identity of a PI controller")[0]
         if self._line.ask("CSV?", r"(\d+)(?:\.\d+)?", "the version of the command language")[1] != "2":
@@ -83,7 +83,7 @@ class PiGcsAxis:
         return bool(int(self._line.ask(ARE_THEY_MOVING, form, "the axes that move, as bits")[1], 16) >> self._bit & 1)
 
     def searching(self) -> bool:
-        """It moves, or is between two parts of a reference move."""
+        """Whether it moves, or is between two parts of a reference move."""
         return self._line.ask(READY, r"\\x(b[01])", "the byte B1 (ready) or B0")[1] == "b0" or self.moving()
 
     def counts(self) -> int:
@@ -93,7 +93,7 @@ class PiGcsAxis:
         return self._line.flag("ONT?")
 
     def status(self) -> AxisStatus:
-        """Where it is and how; what the error register has becomes `fault`."""
+        """State and place of the axis; the error register becomes `fault`."""
         moving = self.moving()
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
@@ -102,14 +102,14 @@ class PiGcsAxis:
         return AxisStatus(counts, moving, homed, servo, said)
 
     def limit_switch(self) -> str:
-        """Which limit switch is on, in words; "" for none, or for a model whose register is not known."""
+        """Which limit switch is on, in words; "" without one, or for a model with an unknown register."""
         if "C-863" not in self._identity:
             return ""
         bits = int(self._line.ask(REGISTER, r"0[xX]([0-9A-Fa-f]{1,8})", "the status register")[1], 16)
         return {1: "negative limit switch", 4: "positive limit switch", 5: "both limit switches"}.get(bits & 5, "")
 
     def standing(self, purpose: str) -> None:
-        """Refuses `purpose` while the axis moves; what the error register had becomes `fault`."""
+        """Refuses `purpose` while the axis moves; the error register becomes `fault`."""
         if self.moving():
             raise DeviceRefused(
                 self._name,
@@ -136,7 +136,7 @@ class PiGcsAxis:
         self._begin(f"{command} {self._axis}")
 
     def brake(self) -> str:
-        """Send the stop command; what was sent."""
+        """Send the stop command; returns it."""
         self._line.stop(command := f"HLT {self._axis}")
         return command
 
@@ -180,7 +180,7 @@ class PiGcsAxis:
         return self._refused(f"{verb} ended with {meaning(5)}", advice(5), command)
 
     def _configure(self, parameter: int, value: str, tolerance: Fraction = Fraction(1, 2)) -> None:
-        """One CTO and its read-back, which may have fewer decimals than were sent; `tolerance` in counts."""
+        """Send one CTO and read it back; the reply may have fewer decimals. `tolerance` in counts."""
         command = f"CTO {self._output} {parameter} {value}"
         self._line.set(command)
         form = r"(\w+)" if parameter == 2 else NUMBER
@@ -202,7 +202,7 @@ class PiGcsAxis:
             raise self._line.not_followed(command, reply, f"{on:d}")
 
     def _compare_counts(self) -> None:
-        """Our counts must be whole counts of the controller's, where it tells (parameters 0xE and 0xF)."""
+        """Our counts must be multiples of the controller's, if it tells (parameters 0xE and 0xF)."""
         numerator, denominator = (self._line.parameter(number) for number in (NUMERATOR, DENOMINATOR))
         if numerator is None or denominator is None or not Fraction(denominator):
             return

@@ -1,6 +1,6 @@
-"""The codes of PI GCS 2.0's error register (ERR?): what each means, what to do, and whether it refuses a command.
+"""The codes of PI GCS 2.0's error register (ERR?): meaning, advice, and whether the code refuses a command.
 
-Numbers and meanings as the vendor's and EPICS' host software agree on them.
+The vendor's and EPICS' host software agree on numbers and meanings.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ REFUSALS = {
     203: ("the axis is not configured", "Check the stage's name in the controller (CST?)"),
     214: ("the position is unknown", HOME),
 }
-"""Code -> meaning and advice, where the command was refused and nothing else happened."""
+"""Code -> meaning and advice, for a refused command without other effects."""
 
 EVENTS = {
     STOPPED: ("stopped by command", "Find who stopped it before moving on"),
@@ -77,7 +77,7 @@ EVENTS = {
     1024: ("motion error: the position error grew too large and the servo switched itself off", OBSTACLE),
     1025: ("the motor output limit was reached", OBSTACLE),
 }
-"""Code -> meaning and advice, where something happened by itself."""
+"""Code -> meaning and advice, for an event without a command."""
 
 
 def meaning(code: int) -> str:

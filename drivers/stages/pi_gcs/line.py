@@ -1,6 +1,6 @@
 """The dialogue of PI GCS 2.0: set commands and the error register after each, queries, control bytes, numbers as text.
 
-Set commands are not answered: each is followed by ERR?, which tells what became of it and clears the register.
+Set commands are not answered: each is followed by ERR?, which returns its error code and clears the register.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ def plain(value: Fraction) -> str:
 
 
 def is_rounding_of(reply: str, sent: str) -> bool:
-    """Whether `reply` is the number sent, or that number in as many decimals as the reply has."""
+    """Whether `reply` is the sent number, rounded to the decimals of the reply."""
     decimals = len(reply.partition(".")[2]) if "e" not in reply.lower() else DECIMALS
     return abs(Fraction(sent) - Fraction(reply)) <= Fraction(1, 2 * 10**decimals)
 
 
 class GcsLine:
-    """A controller and its one axis that is of interest. `fault` keeps the last code that the register gave, until it
-    is set to 0. Safe from several threads.
+    """A controller and the used one of its axes. `fault` keeps the register's last code until it is set to 0. Safe from
+    several threads.
 
     Raises (here and in all methods):
         DeviceRefused: the controller refuses a command. DeviceError: another code, or a reply of another form.
@@ -50,7 +50,7 @@ class GcsLine:
     def __init__(self, url: str, axis: str, wiring: Wiring, clock: Clock, name: str) -> None:
         self.fault = 0
         self.commanded = False
-        """Whether a move has started; the text of an error depends on it."""
+        """Whether a move has started; error messages depend on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
         self._serial = SerialLine(
@@ -65,18 +65,20 @@ class GcsLine:
         )
 
     def set(self, command: str) -> None:
-        """Send a set command; raises where the register then has a code."""
+        """Send a set command; raises if the register then has a code."""
         self.judge(command, self.tell(command))
 
     def tell(self, command: str) -> int:
-        """Send a set command; the code that the register then has."""
+        """Send a set command; returns the register's code."""
         with self._register:
             self._serial.send(command)
             return self.read_error()
 
     def stop(self, command: str | bytes) -> None:
-        """Send a stop, as a command or a control byte, whoever else is asking; then see that it was understood. It sets
-        a code of its own, and what else went wrong before does not speak against it."""
+        """Send a stop, as a command or control byte, even while another thread asks; then check that it was understood.
+
+        A stop sets its own code; codes of earlier errors are accepted, too.
+        """
         if isinstance(command, str):
             self._serial.send(command)
         else:
@@ -87,14 +89,14 @@ class GcsLine:
             self.judge(command if isinstance(command, str) else f"#{command[0]}", code)
 
     def read_error(self) -> int:
-        """The error register, which is then clear; a code other than 0 becomes `fault`."""
+        """Read and clear the error register; a code other than 0 becomes `fault`."""
         code = int(self.ask("ERR?", r"\s*(-?\d{1,5})\s*", "an error code")[1])
         if code:
             self.fault = code
         return code
 
     def judge(self, command: str, code: int) -> None:
-        """Raises what a code after a command means."""
+        """Raises the error for a code after a command."""
         if code:
             refused = code in REFUSALS
             raise (DeviceRefused if refused else DeviceError)(
@@ -122,7 +124,7 @@ class GcsLine:
         return self.ask(f"{query} {self._axis}", self._key + form, f"{self._axis}=number")[1]
 
     def parameter(self, number: str) -> str | None:
-        """SPA?; None where the controller does not know it: then it does not answer, and the register says why."""
+        """SPA?; None for an unknown parameter: the controller then does not answer, and sets the error register."""
         request = f"SPA? {self._axis} {number}"
         try:
             return self.ask(request, rf"{re.escape(self._axis)} \w+ ?= ?{NUMBER}", f"{self._axis} {number}=number")[1]
@@ -133,7 +135,7 @@ class GcsLine:
             return None
 
     def not_followed(self, command: str, reply: str, wanted: str) -> DeviceError:
-        """The error for a read-back that is not what was set."""
+        """The error for a read-back that differs from the set value."""
         return DeviceError(
             self._name,
             "a setting was not taken",
@@ -145,7 +147,7 @@ class GcsLine:
         )
 
     def wake(self) -> None:
-        """End what another program may have left half said."""
+        """End an incomplete command that another program may have left."""
         self._serial.send("")
 
     def close(self) -> None:
@@ -157,9 +159,9 @@ class GcsLine:
 
 
 class GcsOutput:
-    """Implements `drivers.base.protocols.DigitalOutput` on the line of a stage that is open.
+    """Implements `drivers.base.protocols.DigitalOutput` on the line of an open stage.
 
-    `DIO?` tells the inputs [from memory: of GCS controllers in general], so that an output cannot be read back.
+    `DIO?` reads the inputs [from memory: of GCS controllers in general], so that an output cannot be read back.
     """
 
     def __init__(self, line: GcsLine, number: int, name: str) -> None:

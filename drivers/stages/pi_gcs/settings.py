@@ -1,4 +1,4 @@
-"""Settings of a PI GCS 2.0 stage, and what the controller makes of them: it takes them as they are, in degrees."""
+"""Settings of a PI GCS 2.0 stage; the controller takes them as they are, in degrees."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from drivers.stages.pi_gcs.train import FirstPulse
 from drivers.stages.settings import StageFigures, Wiring, key
 
 SLOWEST = 1e-6
-"""degrees/s that can still be written."""
+"""Least degrees/s that can be written."""
 AXIS_NAME = r"^\w{1,16}$"
 
 
 class Reference(StrEnum):
-    """What the search for the reference goes to."""
+    """The target of the search for the reference."""
 
     SWITCH = "switch"
     NEGATIVE_LIMIT = "negative_limit"
@@ -36,8 +36,8 @@ class PiGcsSettings:
         axis: identifier as SAI? lists it.
         trigger_line: digital output of the pulses, from 1.
         first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
-        firmware_pulse: s that the firmware holds a pulse, from memory; trains must leave as long between two.
-        tolerance: counts from the target within which a move has arrived (a servo holds to a few counts, never one).
+        firmware_pulse: s that the firmware holds a pulse, from memory; trains need equal pauses between pulses.
+        tolerance: largest distance in counts of an arrived move from its target (a servo holds to a few counts).
         settle: s after a move in which the controller may still bring the axis on target.
 
     Raises:
@@ -71,8 +71,9 @@ class PiGcsSettings:
         return self.trigger_line
 
     def limits(self) -> StageLimits:
-        """As `StageSettings` has it. Where the first pulse comes a step after the threshold, the stage must stand more
-        than a step before it. Pulses leave as long between them as the firmware holds them."""
+        """See `StageSettings`. If the first pulse comes a step after the threshold, the stage must stand more than a
+        step before it. The pause between pulses is as long as a pulse.
+        """
         figures = self.figures
         if min(math.degrees(figures.max_speed), math.degrees(figures.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")

@@ -1,6 +1,6 @@
 """PI controller with GCS 2.0 (C-863 class) as rotation stage, with position-synchronised trigger pulses.
 
-Positions are an encoder's and hold only from a reference move on (`start_home`): before it, moves are refused. Pulses
+Positions come from an encoder and hold only after a reference move (`start_home`): before it, moves are refused. Pulses
 come from a digital output in trigger mode 0; the controller does not count them.
 """
 
@@ -28,8 +28,8 @@ class PiGcsStage:
     """Implements `drivers.base.protocols.RotationStage`. Opening switches the servo on and the trigger line off.
     Closing leaves both, and a move under way, as they are.
 
-    `stop` returns when the stage stands, `abort` at once; it stands all axes of the controller. A train is ended by a
-    move that would emit it a second time or turn back inside it.
+    `stop` returns when the stage stands, `abort` at once; it stops all axes of the controller. A move that would emit a
+    train a second time, or turn back inside it, ends the train.
 
     Args:
         url: what pyserial opens.
@@ -61,7 +61,7 @@ class PiGcsStage:
 
     @staticmethod
     def halt(url: str, settings: PiGcsSettings, clock: Clock) -> None:
-        """As `drivers.stages.settings.StageDriver` has it."""
+        """See `drivers.stages.settings.StageDriver`."""
         with closing(GcsLine(url, settings.axis, settings.wiring, clock, "stage")) as line:
             line.stop(STOP_ALL)
 
@@ -96,12 +96,12 @@ class PiGcsStage:
             self._axis.standing("a move")
             if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
                 self.disarm()
-            self._target, self._homing = None, False  # what is left of an earlier move is not this one's if it fails
+            self._target, self._homing = None, False  # clear the earlier move: it is not the reason if this one fails
             self._axis.start(target, Fraction(speed) * self._per_radian)
             self._target = target
 
     def start_home(self) -> None:
-        """As `drivers.base.protocols.Motion` has it; soft limits do not hold on the way. An armed train is over."""
+        """See `drivers.base.protocols.Motion`; soft limits do not hold on the way. It ends an armed train."""
         with self._begin("the reference move"):
             self._axis.standing("a reference move")
             self._train, self._target, self._homing = None, None, False
@@ -178,7 +178,7 @@ class PiGcsStage:
         """Another output of the controller, such as one that opens a shutter.
 
         Raises:
-            DeviceRefused: it is the one of the trigger pulses.
+            DeviceRefused: this output gives the trigger pulses.
         """
         if number == self._settings.trigger_line:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
@@ -189,7 +189,7 @@ class PiGcsStage:
 
     @contextmanager
     def _begin(self, purpose: str) -> Iterator[None]:
-        """Around the commands that begin a move; a stop meanwhile wins."""
+        """Context around the commands that begin a move; a stop meanwhile wins."""
         self._stops_before = self._stops.count
         with self._stops.none_while(purpose):
             yield
@@ -201,11 +201,11 @@ class PiGcsStage:
             self._axis.brake()
 
     def _until_standing(self, timeout: float) -> bool:
-        """Whether it still moves when the time is over."""
+        """Wait until it stands; returns whether it still moves when the time is over."""
         return until_standing(self._clock, self.moving, bool, timeout)
 
     def _until_settled(self, target: int) -> None:
-        """Let the servo bring it on target, where it is near it."""
+        """Wait for the servo to reach the target, if the stage is near it."""
         deadline = self._clock.now() + self._settings.settle
         while self._clock.now() < deadline and not self._axis.on_target() and not self._away(self._axis.counts()):
             self._clock.sleep(POLL)
@@ -214,7 +214,7 @@ class PiGcsStage:
         return self._target is not None and abs(counts - self._target) > self._settings.tolerance
 
     def _fault(self, status: AxisStatus) -> str:
-        """Why the last move ended early, or what stands, in words; "" for nothing."""
+        """Why the last move ended early, or a standing fault, in words; "" without one."""
         code, words = self._line.fault, []
         early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
         if code and code != STOPPED:

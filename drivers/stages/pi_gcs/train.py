@@ -1,8 +1,8 @@
-"""Trigger trains by PI GCS 2.0's mode 0 (PositionDistance): step and window for a train, and when a train is spent.
+"""Trigger trains by PI GCS 2.0's mode 0 (PositionDistance): step and window of a train, and when a train ends.
 
 The controller gives a pulse at each step between the thresholds, if the stage entered through the start threshold. The
-stop threshold lies half an interval behind the last pulse, so that it does not matter whether the threshold itself
-fires. No manual says where the first pulse comes. We take it to come at the start threshold, from memory, see
+stop threshold lies half an interval behind the last pulse, so that a pulse at the threshold itself makes no
+difference. No manual says where the first pulse comes. We assume the start threshold, from memory, see
 `FirstPulse`.
 """
 
@@ -15,26 +15,29 @@ from fractions import Fraction
 from drivers.base.protocols import TriggerTrain
 
 PULLED_APART = Fraction(1, 10)
-"""Of an interval: what the last pulse may be off where a controller tells its step rounded. Whether it also keeps it
-rounded cannot be seen; less than this spoils no image."""
+"""Largest error of the last pulse, in intervals, by a step that a controller rounds in its reply. Whether it also uses
+the rounded step cannot be seen; a smaller error spoils no image.
+"""
 
 
 class FirstPulse(StrEnum):
-    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
+    """Behaviour of the firmware, to be found once: arm 3 pulses, pass them, and look at their number and places."""
 
     AT_THRESHOLD = "at_threshold"
     """At the start threshold: it is put on the first pulse."""
     STEP_AFTER = "step_after"
     """One step behind the start threshold: it is put one interval before the first pulse."""
     GRID = "grid"
-    """Where whole steps from position 0 lie inside the window: it begins half an interval before the first pulse, and
-    only trains that lie on whole intervals are possible."""
+    """At whole steps from position 0 inside the window: it begins half an interval before the first pulse, and trains
+    must lie on whole intervals.
+    """
 
 
 @dataclass(frozen=True)
 class TriggerWindow:
-    """In counts: the distance of pulses, where the window begins and ends. The stage must stand before it. Then how
-    much of a count a step may be wrong, as it adds up over the train."""
+    """In counts: the distance of pulses, begin and end of the window, and the allowed error of a step, which adds up
+    over the train. The stage must stand before the window.
+    """
 
     step: Fraction
     start: Fraction
@@ -63,8 +66,10 @@ def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
 
 
 def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
-    """Whether the train must be disarmed for a move from `here` to `target` (counts). It was emitted, and passing it
-    again would emit it again. Or it has begun, and pulses would come on the way back too."""
+    """Whether the train must be disarmed for a move from `here` to `target` (counts).
+
+    Either it was emitted, and passing it would emit it again. Or it has begun, and the way back would give pulses.
+    """
     sign = 1 if train.interval > 0 else -1
     started, passed = sign * (here - train.start) >= 0, sign * (here - train.end) >= 0
     return passed or (started and sign * (target - here) < 0)

@@ -1,7 +1,7 @@
 """One motor channel of a Tsuji PM16C-04XD(L) in the controller's own units: pulses, pulses/s, codes, and its replies.
 
 Protocol: the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Set commands have no reply,
-so each one that matters is read back.
+so each important one is read back.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 
 @dataclass(frozen=True)
 class ChannelStatus:
-    """What STSx? says. `ending` is why the last move ended early, in words; "" where it did not."""
+    """Reply to STSx?. `ending` is why the last move ended early, in words; "" if it did not."""
 
     remote: bool
     moving: bool
@@ -39,10 +39,10 @@ class ChannelStatus:
 
 
 class PM16CChannel:
-    """Talks to the controller about one channel; it is put on position controller A, whose trigger output is TP0.
+    """Controls one channel of the controller, on position controller A, which has the trigger output TP0.
 
     Raises (here and in all methods):
-        DeviceError: a reply or a read-back is not what it must be. DeviceTimeout: no reply.
+        DeviceError: a wrong reply or read-back. DeviceTimeout: no reply.
         DeviceRefused: the controller is in LOCAL, or its motors move.
     """
 
@@ -54,9 +54,9 @@ class PM16CChannel:
         self._line = PM16CLine(url, wiring, clock, name)
 
     def open(self, rate_code: int) -> str:
-        """Go to REMOTE, take position controller A without a train, set the acceleration; the firmware's version."""
+        """Go to REMOTE, take position controller A without a train, set the acceleration; returns the firmware."""
         c = self._digit
-        self._line.send("")  # an empty line ends what another program may have left half said
+        self._line.send("")  # an empty line ends an incomplete command of another program
         version = self._line.ask("VER?", r".*PM16C-04X.*", "the version of a PM16C-04XD(L)")[0]
         self._refuse_old(version)
         if not self.status().remote:
@@ -75,8 +75,9 @@ class PM16CChannel:
         return version
 
     def own_limits(self) -> tuple[int, int] | None:
-        """The controller's own soft limits (backward, forward) in counts; None where they are switched off, which the
-        first of the switch bits says [from memory]."""
+        """The controller's own soft limits (backward, forward) in counts; None if the first of the switch bits has them
+        switched off [from memory].
+        """
         c = self._digit
         if self._line.ask(f"SETLS?{c}", r"[01]{8}", "eight limit-switch bits")[0][0] == "0":
             return None
@@ -132,12 +133,12 @@ class PM16CChannel:
         self._begin(f"GTHP{self._digit}", home)
 
     def home(self) -> int | None:
-        """Where the home switch was found, in counts; None where no search has found it."""
+        """Where the home switch was found, in counts; None if no search has found it."""
         reply = self._line.ask(f"SHP?{self._digit}", rf"{COUNT}|NO H\.P", "a signed position or NO H.P")
         return None if reply[1] is None else int(reply[1])
 
     def preset(self, counts: int) -> None:
-        """Call the place where it stands `counts`."""
+        """Set the count of the present place to `counts`."""
         self.standing("a preset")
         self._line.set(f"PS{self._digit}{counts:+d}", f"PS?{self._digit}", counts)
 
@@ -156,7 +157,7 @@ class PM16CChannel:
         self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
 
     def slow_stop(self) -> str:
-        """Send the stop command; what was sent. It waits for nothing."""
+        """Send the stop command without waiting; returns it."""
         self._line.send(command := f"SSTP{self._digit}")
         return command
 
@@ -166,7 +167,7 @@ class PM16CChannel:
         return command
 
     def close(self) -> None:
-        """Give the panel back if it was in LOCAL, and free the port even where the line is dead."""
+        """Give the panel back if it was in LOCAL, and free the port even if the line is dead."""
         try:
             if self._restore_local:
                 self._line.send("LOC")
@@ -196,7 +197,7 @@ class PM16CChannel:
         self._line.make_sure(f"SPDH{c}", f"SPD?{c}", "[HML]SPD", "HSPD", str)
 
     def _begin(self, command: str, target: int | None) -> None:
-        """Send a command that moves and see that it does, or that it is at its target (None: no target) already."""
+        """Send a move command, and check that the motor moves or is already at its target (None: no target)."""
         self._line.commanded, self.last_move = True, command
         self._line.send(command)
 

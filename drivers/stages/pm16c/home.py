@@ -11,7 +11,7 @@ from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 
 
 class HomeSearch:
-    """One search, in steps: `begin`, then `go_on` each time the motor has come to rest until it says that all is done.
+    """One search, in steps: `begin`, then `go_on` each time the motor has come to rest, until it returns False.
 
     Args:
         home: the count that the reference gets.
@@ -27,11 +27,11 @@ class HomeSearch:
         self._channel.find_home(speed)
 
     def cancel(self) -> None:
-        """Take no further step. Call it before the stop is sent, from any thread."""
+        """End the search: no further step. Call it before the stop is sent, from any thread."""
         self._cancelled = True
 
     def go_on(self, status: ChannelStatus) -> bool:
-        """The motor stands: take the next step. False where that was the last one.
+        """Take the next step after the motor has come to rest. False if there is no further step.
 
         Raises:
             DeviceError: the search ended without the switch, or was stopped.

@@ -1,7 +1,7 @@
 """The PM16C's dialogue: queries are answered, settings are not, so each setting that matters is read back.
 
-A controller that writes its memory takes its time: KEK's driver waits 40 ms after settings. So a read-back that is not
-as set is repeated for a while, and the setting then sent once more, before it is taken for refused.
+A controller that writes its memory takes its time: KEK's driver waits 40 ms after settings. So a wrong
+read-back is repeated for a while, and the setting then sent once more, before it counts as refused.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from drivers.stages.settings import Wiring
 PROBE = Probe("STQ?", r"[RL][0-4]")
 STOPPED_NOTE = r"STOP[0-9A-F]"
 MEMORY = 0.12
-"""s in which a setting has taken effect."""
+"""Longest time, s, until a setting takes effect."""
 LOOK = 0.02
-"""s between looks whether it has."""
+"""s between two checks of this."""
 T = TypeVar("T")
 
 
 class PM16CLine:
     """Raises (in all methods):
-    DeviceError: a reply or a read-back is not what it must be. DeviceTimeout: no reply.
+    DeviceError: a wrong reply or read-back. DeviceTimeout: no reply.
     """
 
     def __init__(self, url: str, wiring: Wiring, clock: Clock, name: str) -> None:
@@ -45,7 +45,7 @@ class PM16CLine:
         )
 
     def send(self, command: str) -> None:
-        """It waits for nothing."""
+        """Send a command without waiting."""
         self._serial.send(command)
 
     def ask(self, request: str, form: str, meaning: str) -> re.Match[str]:
@@ -53,15 +53,15 @@ class PM16CLine:
         return self._serial.query(request, form, meaning, state)
 
     def set(self, command: str, query: str, value: int) -> None:
-        """Send a setting that is a number and read it back."""
+        """Send a numeric setting and read it back."""
         self.make_sure(command, query, r"[+-]?\d+", value, int)
 
     def make_ready(self, command: str, query: str, wanted: str) -> None:
-        """Arm or disarm the trigger output and see that it is so."""
+        """Arm or disarm the trigger output and check it."""
         self.make_sure(command, query, "YES|NO", wanted, str)
 
     def make_sure(self, command: str, query: str, form: str, wanted: T, read: Callable[[str], T]) -> None:
-        """Send a setting, whose reply to `query` has `form` and is then read as `wanted`."""
+        """Send a setting and check that the reply to `query`, of the form `form`, reads `wanted`."""
         for _ in range(2):
             self.send(command)
             found = self.until(lambda: read(self.ask(query, form, f"{wanted}, as just set")[0]), wanted.__eq__)
@@ -70,7 +70,7 @@ class PM16CLine:
         raise self.not_followed(command, str(found), str(wanted))
 
     def until(self, look: Callable[[], T], good: Callable[[T], bool]) -> T:
-        """The first look that is good, or the last one while a setting may still take effect."""
+        """The first good reply, or the last one within the time for a setting to take effect."""
         deadline = self._clock.now() + MEMORY
         while not good(seen := look()) and self._clock.now() < deadline:
             self._clock.sleep(LOOK)
@@ -89,7 +89,7 @@ class PM16CLine:
         )
 
     def complaint(self) -> str:
-        """The controller's own error text, then cleared."""
+        """Read and clear the controller's own error text."""
         text = self.ask("ERR?", r".*", "an error text")[0]
         self.send("ERRC")
         return f"the controller says {text}"

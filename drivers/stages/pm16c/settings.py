@@ -1,4 +1,4 @@
-"""Settings of a PM16C stage, and what the controller makes of them: whole pulses/s, and the accelerations it has."""
+"""Settings of a PM16C stage, and their values in the controller: whole pulses/s, and its accelerations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RATES = sorted((ms for ms in _TRIED if 0.0155 < ms < 1005), reverse=True)
 
 
 def steepest_code(acceleration: float) -> int:
-    """The code of the steepest acceleration that is not above `acceleration` (pulses/s²).
+    """The code of the steepest acceleration up to `acceleration` (pulses/s²).
 
     Raises:
         ValueError: even the gentlest is above it.
@@ -39,7 +39,7 @@ class PM16CSettings:
     Attributes:
         channel: motor channel.
         first_pulse: where the firmware puts the first pulse; that it is the start point is from memory.
-        home: angle of the home switch in rad; None where the stage has none: then a search is refused.
+        home: angle of the home switch in rad; None without a switch: a search is then refused.
         home_speed: rad/s for the search; None is a tenth of the full speed.
 
     Raises:
@@ -48,7 +48,7 @@ class PM16CSettings:
     """
 
     pulse_output: ClassVar[None] = None
-    """Pulses come from TP0; there is no output that can be set."""
+    """Pulses come from TP0; no output can be set."""
     figures: StageFigures
     wiring: Wiring = field(default=Wiring(baudrate=9600))
     channel: int = key(0, ge=0, le=15)
@@ -93,9 +93,10 @@ class PM16CSettings:
         return steepest_code(self.figures.acceleration / (2 * math.pi / self.figures.counts_per_turn))
 
     def limits(self) -> StageLimits:
-        """As `StageSettings` has it: the acceleration is the steepest one that the controller has and that is not
-        above the configured one. Where the first pulse comes an interval after the start point, the stage must stand
-        more than that before it. Pulses leave their width between them."""
+        """See `StageSettings`. The acceleration is the controller's steepest one up to the configured one. If the first
+        pulse comes an interval after the start point, the stage must stand more than that before it. The pause between
+        pulses is as long as a pulse.
+        """
         figures = self.figures
         radians = 2 * math.pi / figures.counts_per_turn
         if max(abs(figures.low), abs(figures.high)) > MAX_COUNT * radians:

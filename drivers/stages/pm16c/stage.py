@@ -24,8 +24,8 @@ from drivers.stages.travel import Travel
 class PM16CStage:
     """Implements `drivers.base.protocols.RotationStage`. Closing it leaves a move under way to end by itself.
 
-    `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped raises, whoever
-    stopped it: no thread takes it for arrived. Arming and disarming need a standing stage.
+    `stop` returns when the stage stands, `abort` at once. A `wait` for a stopped move raises, whoever stopped it: no
+    thread takes the move as complete. Arming and disarming need a standing stage.
 
     Args:
         url: what pyserial opens; the controller's LAN port is "socket://host:7777".
@@ -57,7 +57,7 @@ class PM16CStage:
 
     @staticmethod
     def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
-        """As `drivers.stages.settings.StageDriver` has it."""
+        """See `drivers.stages.settings.StageDriver`."""
         with contextlib.closing(PM16CChannel(url, settings.channel, settings.wiring, clock, "stage")) as channel:
             channel.slow_stop()
 
@@ -81,7 +81,7 @@ class PM16CStage:
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """As `drivers.base.protocols.Motion` has it; `wait` takes the later steps, and an armed train is disarmed."""
+        """See `drivers.base.protocols.Motion`; `wait` does the later steps. An armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,
@@ -95,7 +95,7 @@ class PM16CStage:
         self._target, self._search = self._home, search
 
     def status(self) -> StageStatus:
-        """As `drivers.base.protocols.Motion` has it; `homed` is None where the stage has no home switch."""
+        """See `drivers.base.protocols.Motion`; `homed` is None without a home switch."""
         status = self._channel.status()
         homed = None if self._home is None else self._channel.home() is not None
         return StageStatus(status.counts, status.moving, homed, status.ending)
@@ -166,17 +166,17 @@ class PM16CStage:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            with contextlib.suppress(DeviceError):  # a line that no longer answers is closed all the same
+            with contextlib.suppress(DeviceError):  # a dead line is closed, too
                 self._channel.close()
 
     def _send_stop(self, hard: bool) -> str:
-        """What was sent."""
+        """Send a stop; returns the command."""
         if (search := self._search) is not None:
             search.cancel()
         return self._channel.emergency_stop() if hard else self._channel.slow_stop()
 
     def digital_output(self, number: int) -> DigitalOutput:
-        """As `drivers.base.protocols.RotationStage` has it: the controller has none that can be set."""
+        """See `drivers.base.protocols.RotationStage`: no output of the controller can be set."""
         raise DeviceRefused(
             self.name,
             f"the controller has no digital output {number} to set",

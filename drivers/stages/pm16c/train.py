@@ -1,4 +1,4 @@
-"""The PM16C's trigger output: which of its pulse widths fits a train, and the points that it is set to."""
+"""The PM16C's trigger output: the pulse width that fits a train, and its trigger points."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}
 
 @dataclass(frozen=True)
 class PulseWidths:
-    """The widths that a train may take, the widest first; `chosen` by the configuration, or all that there are.
+    """The widths that a train may take, the widest first: the `chosen` one, or all.
 
     Raises:
         ValueError: the output has no such width.
@@ -40,17 +40,17 @@ class PulseWidths:
 
     @property
     def spacing(self) -> float:
-        """s that pulses must be apart. Nearer ones would run together: the controller leaves the output high then."""
+        """Least s between pulses. Closer pulses would merge: the controller then leaves the output high."""
         return 2 * self.narrowest
 
     def widest_for(self, train: TriggerTrain, limits: StageLimits) -> float:
-        """The widest that leaves the output low as long as high at full speed, for a train that keeps the spacing."""
+        """The widest pulse that leaves the output low as long as high at full speed, for a train with this spacing."""
         fits = (w for w in self.allowed if train.n == 1 or abs(train.interval) >= counts_in(2 * w, limits))
         return next(fits, self.narrowest)
 
 
 class FirstPulse(StrEnum):
-    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
+    """Behaviour of the firmware, to be found once: arm 3 pulses, pass them, and look at their number and places."""
 
     AT_START = "at_start"
     """The start point itself fires."""
@@ -70,8 +70,8 @@ class TriggerPoints:
 def points_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerPoints:
     """The points for a train of at least one pulse and an interval that is not 0.
 
-    The end point lies half an interval behind the last pulse, so that it does not matter whether it fires itself. At an
-    interval of one count there is no room for that: there it is the last pulse.
+    The end point lies half an interval behind the last pulse, so that a pulse at the end point itself makes no
+    difference. At an interval of one count the end point is the last pulse.
     """
     sign = 1 if train.interval > 0 else -1
     interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)

@@ -1,6 +1,6 @@
 """One axis of a Zaber device in the device's own units: microsteps, native speeds, settings, flags, and its replies.
 
-Every command but a stop has its own message id and waits for its reply, which says whether it was taken.
+Every command except a stop has its own message id and waits for its reply, which accepts or rejects it.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from drivers.stages.zaber.settings import ZaberSettings
 PROBE_ID, STOP_ID, IDS = 98, 99, 98
 """Ordinary commands count their ids from 0 to 97."""
 REPEATS = 3
-"""Times that a command is sent again where the device says AGAIN."""
+"""How often a command is sent again if the device answers AGAIN."""
 PAUSE = 0.05
 """s before that."""
 TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
-"""A number with more digits is no position that an axis can have, and none that a float holds."""
+"""Most digits of a position; a longer number is impossible for an axis and for a float."""
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
-"""Settings of the axis that survive a power cycle: as they were found they are left."""
+"""Settings of the axis that survive a power cycle; the driver restores them at the end."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What the device says of itself."""
+    """Identity of the device."""
 
     number: str
     serial: str
@@ -47,7 +47,7 @@ class Identity:
 
     @property
     def has_triggers(self) -> bool:
-        """They came with firmware 7.06."""
+        """Whether the firmware has triggers: 7.06 or later."""
         return tuple(int(part) for part in self.firmware.split(".")[:2]) >= (7, 6)
 
 
@@ -66,15 +66,15 @@ class AxisStatus:
 
     @property
     def faulty(self) -> bool:
-        """A fault stands, whatever the last move did."""
+        """Whether a fault stands, whatever the last move did."""
         return any(flag.startswith("F") for flag in self.flags)
 
 
 class ZaberAxis:
-    """Talks to one axis of one device, and to the device itself.
+    """Controls one axis of one device, and the device itself.
 
     Raises (here and in all methods):
-        DeviceRefused: the device rejects a command. DeviceError: a reply is not what it must be or is damaged.
+        DeviceRefused: the device rejects a command. DeviceError: a wrong or damaged reply.
         DeviceTimeout: no reply.
     """
 
@@ -102,8 +102,8 @@ class ZaberAxis:
         )
 
     def open(self) -> Identity:
-        """Demand checksums, ask who is there, remember the settings that will change."""
-        self._line.send("")  # an empty line ends what half a command may be waiting in the device
+        """Switch checksums on, identify the device, remember the settings that will change."""
+        self._line.send("")  # an empty line ends an incomplete command in the device
         if (found := self._get_if_known("comm.checksum")) is not None:
             self._checksums_found = found
             self.ask("set comm.checksum 1")
@@ -115,7 +115,7 @@ class ZaberAxis:
         return identity
 
     def cycle(self) -> str | None:
-        """Microsteps of a full turn as the device has them; None where it has no such setting."""
+        """Microsteps of a full turn in the device; None if it has no such setting."""
         return self._get_if_known("limit.cycle.dist", axis=True)
 
     def travel(self) -> tuple[int, int]:
@@ -136,7 +136,7 @@ class ZaberAxis:
         return AxisStatus(int(reply.data), reply.busy, flags, reply.raw)
 
     def forget_flags(self) -> None:
-        """Clear the flags that only remember."""
+        """Clear the flags of past events."""
         self.ask_axis("warnings clear", TEXT)
 
     def standing(self, purpose: str) -> AxisStatus:
@@ -159,7 +159,7 @@ class ZaberAxis:
         self._begin("home")
 
     def stop(self, words: str) -> str:
-        """Send `stop` or `estop`; what was sent. It waits for nothing: the reply is passed over when it comes."""
+        """Send `stop` or `estop` without waiting, and return it; its reply is skipped when it comes."""
         self._line.send(packet := encode(self._device, self._axis, STOP_ID, words))
         return packet
 
@@ -171,7 +171,7 @@ class ZaberAxis:
         return self._ask(self._axis, words, form)
 
     def close(self) -> None:
-        """Leave the settings as they were found, and free the port even where the line is dead."""
+        """Restore the settings, and free the port even if the line is dead."""
         try:
             for setting, value in self._found.items():
                 self.set(setting, value)

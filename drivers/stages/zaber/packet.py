@@ -1,4 +1,4 @@
-"""Zaber ASCII packets from the host's side: commands with checksum and message id, replies, and what their words mean.
+"""Zaber ASCII packets from the host's side: commands with checksum and message id, replies, and the meaning of words.
 
 Protocol: Zaber's ASCII protocol version 2 as the vendor's library zaber-motion sends and accepts it. Meanings of flags
 and reasons in our words, after zaber-motion and ArduinoZaberMaster.
@@ -15,7 +15,7 @@ LONGEST_PACKET = 80
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a flag or reason says, and what to do."""
+    """Meaning of a flag or reason, and advice."""
 
     text: str
     advice: str
@@ -43,7 +43,7 @@ FAULTS = {
     "FE": Meaning("limit error", "Find why the stage ran into a limit, then search the reference"),
     "FT": Meaning("twisted too far", "Turn the cables back"),
 }
-"""Flags that a fault has happened; the driver may be off."""
+"""Flags of a fault; the driver may be off."""
 ENDINGS = {
     "WL": Meaning(
         "a limit switch came where none was expected", "Check travel limits and cables, search the reference"
@@ -55,7 +55,7 @@ ENDINGS = {
     "NC": Meaning("moved by its knob", "Leave the knob alone while a scan runs"),
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
-"""Flags that can say why a move ended early, beside those of faults."""
+"""Flags that can explain why a move ended early, beside those of faults."""
 UNREFERENCED = frozenset({"WR", "WH"})
 """Flags of an axis that does not know its reference."""
 REASONS = {
@@ -80,7 +80,7 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Reply:
-    """A reply to one command. `flag` is the gravest warning, "" for none; `data` is "0" where nothing is to be said."""
+    """A reply to one command. `flag` is the gravest warning, "" without one; `data` is "0" if there are no data."""
 
     accepted: bool
     busy: bool
@@ -98,7 +98,7 @@ def encode(device: int, axis: int, identity: int, words: str) -> str:
     """A command packet without its line end.
 
     Raises:
-        ValueError: it is longer than devices take, or has a character that would end or split it.
+        ValueError: it is too long for devices, or has a character that would end or split it.
     """
     body = f"{device} {axis} {identity:02d} {words}".rstrip()
     packet = f"/{body}:{lrc(body)}"
@@ -108,8 +108,10 @@ def encode(device: int, axis: int, identity: int, words: str) -> str:
 
 
 def damage(line: str, *, must_have_checksum: bool) -> str:
-    """What is wrong with a received line by its checksum, "" where nothing is. Only replies, alerts and information
-    carry one; anything else is not judged here."""
+    """The fault of a received line by its checksum, "" if it is good.
+
+    Only replies, alerts and information carry a checksum; other lines pass.
+    """
     if line[:1] not in ("@", "!", "#"):
         return ""
     body, colon, checksum = line[1:].partition(":")
@@ -123,14 +125,15 @@ def damage(line: str, *, must_have_checksum: bool) -> str:
 
 
 def reply_form(device: int, axis: int, identity: int, data: str) -> str:
-    """Regular expression of the reply to a command; `data` is that of its data if it is accepted."""
+    """Regular expression of the reply to a command; `data` is the expression for the data of an accepted command."""
     head = rf"@0?{device} {axis} {identity:02d} (?:(OK)|RJ) (BUSY|IDLE) ([A-Z-]{{2}})"
     return rf"{head} ((?(1)(?:{data})|\w+))(?::[0-9A-F]{{2}})?"
 
 
 def passed_over_form(identity: int) -> str:
-    """Regular expression of lines that no command waits for: alerts, information, an echo of what was sent, empty ones,
-    and replies to commands with this id."""
+    """Regular expression of lines that no command waits for: alerts, information, echoes, empty lines, and replies to
+    commands with this id.
+    """
     return rf"|[!#/].*|@\d\d \d {identity:02d} .*"
 
 
@@ -140,7 +143,7 @@ def reply_of(match: re.Match[str]) -> Reply:
 
 
 def meaning_of(flags: tuple[str, ...]) -> Meaning | None:
-    """The first of the flags, the gravest first, that is a fault or ends moves; None where none does."""
+    """The gravest of the flags that is a fault or ends moves; None without one."""
     known = FAULTS | ENDINGS
     found = [flag for flag in flags if flag in known or flag.startswith("F")]
     if not found:

@@ -33,7 +33,7 @@ class ZaberPulses:
 
         Args:
             counts: where the stage stands.
-            stand_at: brings it to another place.
+            stand_at: turns the stage to another place.
         """
         setup = set_up(self.settings, train, self._axis.number, counts)
         self._train, self._touched = None, True
@@ -55,7 +55,7 @@ class ZaberPulses:
         self._train = train
 
     def disarm(self) -> None:
-        """Disable the triggers and put the output at rest, where that was not done yet."""
+        """Disable the triggers and put the output at rest, unless this was done already."""
         if self._touched:
             for command in (*self.settings.disable, self.settings.rest):
                 self._axis.ask(command)
@@ -68,8 +68,10 @@ class ZaberPulses:
         return remaining(self.settings, self._train, self._shown())
 
     def before_move(self, counts: int, target: int) -> None:
-        """Keep a train right when a move from `counts` goes against it: distance counts both ways. One that is under
-        way ends; one whose first pulse is still to come is set up anew, or ends where that takes standing elsewhere."""
+        """Keep a train correct before a move from `counts` against it, because distance counts both ways.
+
+        A train under way ends. A train before its first pulse is set up anew, or ends if the stage had to move for it.
+        """
         train = self._train
         if train is None or train.interval * (target - counts) >= 0 or not has_started(self.settings, self._shown()):
             return
@@ -79,17 +81,17 @@ class ZaberPulses:
             self.disarm()
 
     def _shown(self) -> str:
-        """What `trigger show` tells, for this many triggers at least."""
+        """The reply to `trigger show`, for at least this many triggers."""
         needed = max(self.settings.triggers.starter, self.settings.triggers.repeater)
         return self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").data
 
 
 def _nowhere(counts: int) -> None:
-    """A chained train is set up wherever the stage stands."""
+    """Does nothing: a chained train may be set up at any place of the stage."""
 
 
 class ZaberOutput:
-    """A digital output of a device whose stage is open. Implements `drivers.base.protocols.DigitalOutput`."""
+    """A digital output of an open stage's device. Implements `drivers.base.protocols.DigitalOutput`."""
 
     def __init__(self, axis: ZaberAxis, number: int, name: str) -> None:
         self.name = name

@@ -1,4 +1,4 @@
-"""Settings of a Zaber stage, and what the controller makes of them: whole native speeds and accelerations."""
+"""Settings of a Zaber stage, and their values in the controller: whole native speeds and accelerations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ZaberSettings:
 
     Attributes:
         figures: counts_per_turn must be the device's own limit.cycle.dist.
-        wiring: pulse_width is whole milliseconds; None is 1 ms, or half an interval where `toggle`.
+        wiring: pulse_width is whole milliseconds; None is 1 ms, or half an interval with `toggle`.
         device, axis: address in the chain, axis of the device.
         output: digital output of the pulses, from 1.
         toggle: fires toggle the output (for firmware without `schedule`); intervals must then be even.
@@ -53,7 +53,7 @@ class ZaberSettings:
 
     @property
     def pulses(self) -> PulseSettings:
-        """How the driver makes them: 1 ms wide unless a width is chosen, or half an interval where fires toggle."""
+        """Settings of the pulses: 1 ms wide unless a width is chosen, or half an interval if fires toggle."""
         width = self.wiring.pulse_width
         if self.toggle and width is not None:
             raise ValueError("a toggled output has no pulse width of its own; choose a width or toggle, not both")
@@ -62,8 +62,7 @@ class ZaberSettings:
 
     @property
     def native_limits(self) -> tuple[int, int]:
-        """Native speed nearest to the full speed, and the steepest native acceleration that is not above the configured
-        one.
+        """Native speed nearest to the full speed, and the steepest native acceleration up to the configured one.
 
         Raises:
             ValueError: less than one native unit.
@@ -81,8 +80,9 @@ class ZaberSettings:
         return speed, steepest
 
     def limits(self) -> StageLimits:
-        """As `StageSettings` has it, with firmware that has triggers: the acceleration is the steepest one that the
-        controller has and that is not above the configured one."""
+        """See `StageSettings`, with firmware that has triggers. The acceleration is the controller's steepest one up to
+        the configured one.
+        """
         pulses, figures = self.pulses, self.figures
         _, steepest = self.native_limits
         acceleration = steepest * 1e4 / self.speed_unit * 2 * math.pi / figures.counts_per_turn

@@ -1,6 +1,6 @@
 """Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
 
-Positions are commanded microsteps unless `measured`. What is known of the firmware from memory only is a setting:
+Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings:
 `speed_unit` and `drivers.stages.zaber.train.TriggerUse`.
 """
 
@@ -26,11 +26,11 @@ STANDING_IN_PLACE = 10.0
 
 
 class ZaberStage:
-    """Implements `drivers.base.protocols.RotationStage`. Closing it leaves a move under way to end by itself, takes an
-    armed train away and leaves speed, acceleration and checksums as they were found.
+    """Implements `drivers.base.protocols.RotationStage`. Closing it lets a move under way end by itself, disarms a
+    train, and restores speed, acceleration and checksums.
 
-    `stop` returns when the stage stands, `abort` at once; a `wait` for a move that was stopped, by whomever, raises. A
-    move against a train under way ends the train: the controller counts distance both ways. Where triggers are not
+    `stop` returns when the stage stands, `abort` at once; a `wait` for a stopped move raises, whoever stopped it. A
+    move against a train under way ends the train: the controller counts distance both ways. If triggers are not
     `chained`, `arm` itself turns the stage to one step before the first pulse and waits. It then speeds up over the
     first pulses.
 
@@ -67,7 +67,7 @@ class ZaberStage:
 
     @staticmethod
     def halt(url: str, settings: ZaberSettings, clock: Clock) -> None:
-        """As `drivers.stages.settings.StageDriver` has it."""
+        """See `drivers.stages.settings.StageDriver`."""
         with contextlib.closing(ZaberAxis(url, settings, clock, "stage")) as axis:
             axis.stop("stop")
 
@@ -93,7 +93,7 @@ class ZaberStage:
         self._start_move(angle, speed, self._stops.count)
 
     def _start_move(self, angle: float, speed: float, stops: int) -> None:
-        """`stops`: their number before; one that comes from then on wins."""
+        """`stops`: number of stops before; a later one wins."""
         target = self._travel.target(angle)
         per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._settings.speed_unit
         native = round(speed * per_radian) if 0 < speed < 2 * self.limits.max_speed else 0
@@ -122,7 +122,7 @@ class ZaberStage:
         self._target, self._homing = target, False
 
     def start_home(self) -> None:
-        """Begin the search at the speed and acceleration that the controller has for it."""
+        """Begin the search, at the controller's own speed and acceleration for it."""
         with self._stops.none_while("the search for the reference"):
             status = self._axis.standing("a search for the reference")
             self.disarm()
@@ -212,7 +212,7 @@ class ZaberStage:
         """Another output of the device, such as one that opens a shutter.
 
         Raises:
-            DeviceRefused: it is the one of the trigger pulses.
+            DeviceRefused: this output gives the trigger pulses.
         """
         if number == self._pulses.settings.output:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
@@ -221,17 +221,17 @@ class ZaberStage:
     def close(self) -> None:
         if not self._closed:
             self._closed = True
-            with contextlib.suppress(DeviceError):  # a line that no longer answers is closed all the same
+            with contextlib.suppress(DeviceError):  # a dead line is closed, too
                 self.disarm()
             with contextlib.suppress(DeviceError):
                 self._axis.close()
 
     def _send_stop(self, hard: bool) -> str:
-        """What was sent."""
+        """Send a stop; returns the command."""
         return self._axis.stop("estop" if hard else "stop")
 
     def _stand_at(self, counts: int, stops: int) -> None:
-        """Turn there and wait, unless there are more stops by now."""
+        """Turn there and wait, unless a stop came meanwhile."""
         way = abs(self.to_angle(counts - self._axis.standing("arming").counts))
         self._start_move(self.to_angle(counts), self.limits.max_speed, stops)
         self.wait(2 * way / self.limits.max_speed + STANDING_IN_PLACE)

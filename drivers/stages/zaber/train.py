@@ -1,8 +1,8 @@
-"""A pulse train as Zaber triggers: one fires once, at the right place, and enables another that counts distance there.
+"""A pulse train as Zaber triggers: one fires once, at the right place, and enables a second that counts distance.
 
 The starter fires one step before the first pulse, the repeater then each step. So the stage may stand anywhere before
-the train. The time that firmware needs to act (0.1 to 1 ms, undocumented) delays all pulses alike. Where the stage
-stands within that step already, the starter gives the first pulse itself. Where an action cannot enable a trigger
+the train. The time that firmware needs to act (0.1 to 1 ms, undocumented) delays all pulses alike. If the stage
+already stands within that step, the starter gives the first pulse itself. If an action cannot enable a trigger
 (`chained` false), the repeater alone gives the train; then the stage must stand one step before the first pulse.
 """
 
@@ -14,20 +14,20 @@ from drivers.base.protocols import TriggerTrain
 from drivers.stages.settings import key
 
 SHORTEST = 1e-3
-"""s between two fires of a trigger that firmware is trusted to keep up with [memory: it looks about this often]."""
+"""Least s between two fires of a trigger [from memory: firmware checks about this often]."""
 
 
 @dataclass(frozen=True)
 class TriggerUse:
-    """How the device's triggers are used; what its firmware does is from memory.
+    """Use of the device's triggers; the behaviour of its firmware is from memory.
 
     Attributes:
         measured: distance and position by the encoder, not as commanded [its unit from memory: microsteps, too].
         chained: an action may enable another trigger [from memory].
-        fires_when_enabled: a distance trigger fires at the very point of enabling, not first one distance on [memory
-            has it not].
+        fires_when_enabled: a distance trigger fires at the place of enabling, too, not only one distance further. From
+        memory it does not.
         starter, repeater: numbers of the two triggers used.
-        shortest: s that two fires must be apart at full speed.
+        shortest: least s between two fires at full speed.
 
     Raises:
         ValueError: triggers that cannot work together.
@@ -78,7 +78,7 @@ class PulseSettings:
 
     @property
     def spacing(self) -> float:
-        """s that pulses must be apart at full speed; the output then rests as long as it is set."""
+        """Least s between pulses at full speed; the output then rests as long as it is set."""
         return 2 * self.triggers.shortest if self.width is None else max(self.triggers.shortest, 2 * self.width)
 
     @property
@@ -88,7 +88,7 @@ class PulseSettings:
 
     @property
     def disable(self) -> tuple[str, str]:
-        """The starter first, for it enables the repeater."""
+        """Commands that disable both triggers: the starter first, because it enables the repeater."""
         return f"trigger {self.triggers.starter} disable", f"trigger {self.triggers.repeater} disable"
 
     @property
@@ -102,12 +102,12 @@ class PulseSettings:
 
 @dataclass(frozen=True)
 class TriggerSetup:
-    """What to send for a train.
+    """The commands for a train.
 
     Attributes:
         commands: set both triggers up, with the output at rest; nothing is enabled.
         enable: the last command; from then on the train is armed.
-        stand: count where the stage must stand when that is sent; None where any before the first pulse does.
+        stand: count at which the stage must stand for it; None: any count before the first pulse.
     """
 
     commands: tuple[str, ...]
@@ -116,7 +116,7 @@ class TriggerSetup:
 
 
 def step_of(settings: PulseSettings, train: TriggerTrain) -> int:
-    """Microsteps between two fires. A single pulse may have any interval: its step is then of no matter, but not 0."""
+    """Microsteps between two fires. A single pulse may have any interval, so its step does not matter, but is not 0."""
     interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)
     return interval if settings.width is not None else interval // 2
 
@@ -154,15 +154,15 @@ def set_up(settings: PulseSettings, train: TriggerTrain, axis: int, counts: int)
 
 
 def has_started(settings: PulseSettings, shown: str) -> bool:
-    """Distance is being counted, as `trigger show` tells."""
+    """Whether distance is being counted, by the reply to `trigger show`."""
     return not settings.triggers.chained or _state(shown, settings.triggers.starter) == "d"
 
 
 def remaining(settings: PulseSettings, train: TriggerTrain, shown: str) -> int:
-    """Pulses still to come by what `trigger show` tells: for each trigger `d` (disabled), `e` or the fires left.
+    """Pulses still to come, by the reply to `trigger show`: for each trigger `d` (disabled), `e` or the fires left.
 
     Raises:
-        ValueError: it does not tell of these triggers.
+        ValueError: it does not contain these triggers.
     """
     if not has_started(settings, shown):
         return train.n

@@ -1,4 +1,4 @@
-"""StageConformance: what every stage does, real or simulated: the suite that each stage's tests subclass."""
+"""StageConformance: laws for every stage, real or simulated: the suite that each stage's tests subclass."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class StageConformance(Moves, Stops, Trains, Pulses, Reference):
 
     @pytest.fixture
     def kind(self) -> StageKind:
-        """What the suite has to know of the stage."""
+        """The facts about the stage that the suite needs."""
         raise NotImplementedError
 
     @pytest.fixture

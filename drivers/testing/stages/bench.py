@@ -1,4 +1,4 @@
-"""A stage and its trigger cable on a bench, for tests that know no protocol: moves, trains, pulses in degrees."""
+"""A stage and its trigger cable on a bench, for tests without a protocol: moves, trains, pulses in degrees."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FARTHEST = 1e9
 
 
 class Pulse(Protocol):
-    """A pulse on the cable: when it rose, s, and where the stage was in fact, rad."""
+    """A pulse on the cable: the time of its rising edge, s, and the stage's true angle, rad."""
 
     @property
     def time(self) -> float: ...
@@ -27,10 +27,10 @@ class Pulse(Protocol):
 
 
 class Cable(Protocol):
-    """The trigger cable, and what measures where the stage is in fact: a simulated line, or a counter card."""
+    """The trigger cable, with a measurement of the true angle: a simulated line, or a counter card."""
 
     def next_after(self, time: float) -> Pulse | None:
-        """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
+        """The first pulse strictly later than `time`, even in the future; None without one."""
         ...
 
     def angle_at(self, time: float) -> float:
@@ -40,17 +40,17 @@ class Cable(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class StageKind:
-    """What the suite has to know of a stage.
+    """Facts about a stage that the suite needs.
 
     Attributes:
-        width: a pulse width (s) that the output has, at most 1 ms; None where it has no choice.
-        no_width: one that it has not, or has not beside others.
+        width: a pulse width (s) that the output has, at most 1 ms; None without a choice.
+        no_width: a width that it lacks, or that excludes other settings.
         inverts: its pulses may be active low.
         homes: it has a reference, within its limits.
         stops_are_told: `status` tells that the last move was stopped.
-        turning_back_ends: a train ends where the stage turns back inside it; elsewhere its rest comes later.
+        turning_back_ends: a train ends if the stage turns back inside it; otherwise its rest comes later.
         disarms_moving: a train can be ended while the stage moves.
-        relative_moves: how many of them make the long way; fewer where bytes cost time and the law is tested elsewhere.
+        relative_moves: number of moves in the long test; fewer if bytes cost time and the law is tested elsewhere.
     """
 
     width: float | None = 100e-6
@@ -72,11 +72,11 @@ class StageBench:
     line: Cable
 
     def pulses(self) -> list[Pulse]:
-        """Those that have been emitted by now."""
+        """The pulses emitted so far."""
         return emitted(self.line, self.clock)
 
     def go(self, degrees: float) -> float:
-        """Move and wait; where it stands, in degrees."""
+        """Move and wait; returns its place in degrees."""
         self.stage.start_move(math.radians(degrees), SPEED)
         return math.degrees(self.stage.wait(LONG))
 
@@ -98,7 +98,7 @@ Build = Callable[..., StageBench]
 
 
 def emitted(line: Cable, clock: Clock) -> list[Pulse]:
-    """The pulses that have come out of a cable by now, in their order."""
+    """The pulses that a cable has carried so far, in order."""
     found: list[Pulse] = []
     after = -math.inf
     while (pulse := line.next_after(after)) is not None and pulse.time <= clock.now():
@@ -111,8 +111,8 @@ def start_move_by(stage: Motion, angle: float, speed: float) -> None:
     """Begin a move by `angle` (rad, rounded once to whole counts) from the count where the stage stands, or is held by
     its servo. Deviations of the servo do not add up.
 
-    n such moves make exactly n times these counts, however long the sum. Where an angle is no whole number of counts,
-    its multiples are not n times them: for equally spaced views give `start_move` the multiples.
+    n such moves make exactly n times these counts. If the angle is not a whole number of counts, its multiples differ
+    from this: for equally spaced views give `start_move` the multiples.
 
     Raises:
         DeviceRefused, DeviceError: as `start_move`.

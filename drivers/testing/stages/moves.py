@@ -1,4 +1,4 @@
-"""Every stage: who it is, where it stands, absolute and relative moves, status, and the end."""
+"""Every stage: identity, position, absolute and relative moves, status, closing."""
 
 from __future__ import annotations
 

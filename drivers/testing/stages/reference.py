@@ -1,4 +1,4 @@
-"""Every stage: the search for the reference ends at one place, can be stopped, and is refused where there is none."""
+"""Every stage: the search for the reference ends at one place, can be stopped, and is refused without a reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every stage: a stop or an abort on the way, while it stands, and what comes after it."""
+"""Every stage: a stop or an abort during a move and while it stands, and moves afterwards."""
 
 from __future__ import annotations
 

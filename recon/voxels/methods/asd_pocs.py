@@ -27,14 +27,14 @@ F32 = NDArray[np.float32]
 class AsdPocs:
     """Adaptive steepest descent of TV between projections onto the data (Sidky & Pan 2008, Phys. Med. Biol. 53, 4777).
 
-    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep was.
-    Steps shrink by `alpha_decay` where they undo more than `ratio` of the sweep while the data are not yet explained to
-    `goal`. Memory: 5 volumes, 3 x the projections.
+    A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep. Steps
+    shrink by `alpha_decay` if they undo more than `ratio` of the sweep and the residual is still above `goal`.
+     Memory: 5 volumes, 3 x the projections.
 
     Attributes:
         goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
-            cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. That has about the
-            same: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
+        cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. It has about the same
+        residual: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
         allow_negative: voxels below zero are kept.
     """
 
@@ -74,7 +74,7 @@ class AsdPocs:
             if k == 0:
                 step = self.alpha * swept
             if not problem.go_on(k + 1, error) or k + 1 == self.iterations:
-                break  # the last thing done to the volume is to fit the data, as published
+                break  # the last step fits the data, as published
             before[...] = x
             smoothing = 1e-4 * decide("unit", partial(density_unit, x))
             for _ in range(self.tv_steps if smoothing > 0 else 0):
@@ -101,7 +101,7 @@ def _share(step: float, norm: float) -> float:
 
 
 def _baseline(problem: VoxelProblem) -> float:
-    """Relative residual of filtered back-projection, or of a sweep where there is none."""
+    """Relative residual of filtered back-projection, or of a sweep if FBP and FDK do not apply."""
     projector, volume = problem.projector, problem.filtered("ram-lak")
     if volume is None:
         nz, ny, nx = projector.grid.shape

@@ -27,8 +27,8 @@ F32 = NDArray[np.float32]
 class Cgls:
     """Conjugate gradients on the normal equations (Hestenes & Stiefel 1952); its early end is its regularisation.
 
-    Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations: from
-    there the residual is that of one iteration less. Memory: 3 volumes, 3 x the projections.
+    Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations. From
+    there on the residual lags one iteration behind. Memory: 3 volumes, 3 x the projections.
 
     Attributes:
         allow_negative: voxels below zero are kept.
@@ -47,7 +47,7 @@ class Cgls:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
-        # The directions of other rays with other weights would not do.
+        # The directions would not be conjugate for other rays or weights.
         decide = problem.decide if problem.weight is None else Decisions()
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)

@@ -34,7 +34,7 @@ class FistaTv:
 
     Attributes:
         iterations: passes over all views.
-        tv_weight: None chooses μ by the noise of the data and goes on doing so, see `NoiseBalance`; a number is the
+        tv_weight: None adapts μ to the noise of the data in each sweep, see `NoiseBalance`; a number is the
             threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
         subsets: of the views, a step each; 1 is FISTA without subsets, which needs about ten times the iterations.
         tv_steps: dual steps of total variation in each step.
@@ -64,7 +64,7 @@ class FistaTv:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         if not x.any():
-            # A sweep of OS-SIRT: a better start than nothing, and the density unit comes from it.
+            # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
             problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
         weight: NoiseBalance | float
         if self.tv_weight is None:

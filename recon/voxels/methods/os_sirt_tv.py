@@ -72,7 +72,7 @@ class OsSirtTv:
                 mu = weight.value if isinstance(weight, NoiseBalance) else weight
                 prox(x, float(mu * problem.decide("pace", lambda: sweeps.pace)))
             else:
-                # The unit follows the volume: the first sweeps are blurred, and fainter than what comes.
+                # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
             go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
             if not go_on or k + 1 == self.iterations:

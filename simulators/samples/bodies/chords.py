@@ -5,8 +5,8 @@ t = 1 being the plane of the rotation axis. Seen from a body's middle, the ray o
 
     R + t D,    R = w V + near d U,    D = D0 + turn d U,
 
-where U, B and V are the laboratory's axes in the sample's (x, y, z), R is the point next to the middle, so that no
-digits cancel where the source is far, and turn is 0 in a parallel beam and 1 in a cone. A chord is a difference of t;
+where U, B and V are the laboratory's axes in the sample's (x, y, z), and turn is 0 in a parallel beam and 1 in a cone.
+R is the point next to the middle, so that no digits cancel if the source is far. A chord is a difference of t;
 in a cone it is multiplied by the length of (u, sod, v) at the end.
 """
 
@@ -26,17 +26,17 @@ from simulators.samples.bodies.view import View
 Reals = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
-EDGE_ON = 1e-12  # normal · ray below which a ray runs along a face or along an axis
+EDGE_ON = 1e-12  # a ray with a smaller normal · ray counts as parallel to a face or an axis
 _KERNEL = {"nogil": True, "error_model": "numpy", "_nrt": False}
-"""Without reference counts (_nrt): arrays are allocated outside, and counting references to slices takes longer than a
-short chord."""
+"""Without reference counts (_nrt): counting references to slices takes longer than a short chord. Arrays are allocated
+outside."""
 
 
 class Rays(NamedTuple):
     """The rays of one row through the neighbourhood of one body; see the module's docstring.
 
     Attributes:
-        offset: float64 [col], d, of the columns that the body may shadow, mm.
+        offset: float64 [col], mm, the d of each column that the body may shadow.
         R0, D0, U: R and D at d = 0, and U, in the sample's axes.
         near, turn: factors of d U in R and in D.
         scale: length of D, to its order of magnitude.
@@ -75,7 +75,7 @@ def _add_upright(p: Packed, view: View, out: Reals) -> None:
 
 @njit(cache=True, **_KERNEL)
 def _add_rows(p: Packed, view: View, begin: int, end: int, spare: Reals, out: Reals) -> None:
-    """Add the line integrals of the rows from `begin` to before `end`, but for what `_add_upright` has added.
+    """Add the line integrals of rows begin ... end - 1, without the bodies that `_add_upright` has added.
 
     Args:
         spare: float64 [3, col].
@@ -107,7 +107,7 @@ def _add_body(row: Reals, view: View, j: int, p: Packed, b: int, axes: Reals, or
         front, back = view.sod + deep - _along(extent, B), view.sod + deep + _along(extent, B)
         if front > 0.0:
             low, high = min(low / front, low / back) * view.sod, max(high / front, high / back) * view.sod
-        else:  # the box reaches behind the source, the body does not
+        else:  # the box reaches behind the source, but not the body
             low, high = -np.inf, np.inf
         near, turn, scale = (view.sod + deep) / view.sod, 1.0, view.sod
         across /= near
@@ -166,7 +166,7 @@ def _add_cylinder(part: Reals, rays: Rays, radius: float, half: float, attenuati
 
 @njit(**_KERNEL)
 def _add_ellipsoid(part: Reals, rays: Rays, matrix: Reals, attenuation: float) -> None:
-    """In the space where the ellipsoid is the unit ball half a chord squared is |D|² - |R x D|² over |D|⁴."""
+    """With the ellipsoid scaled to the unit ball, half a chord squared is (|D|² - |R x D|²) / |D|⁴."""
     R, M, U = _times(matrix, rays.R0), _times(matrix, rays.D0), _times(matrix, rays.U)
     x0 = _cross(R, M)
     x1 = _sum(rays.near, _cross(U, M), rays.turn, _cross(R, U), 0.0, U)
@@ -180,8 +180,8 @@ def _add_ellipsoid(part: Reals, rays: Rays, matrix: Reals, attenuation: float) -
 
 @njit(**_KERNEL)
 def _add_polyhedron(part: Reals, rays: Rays, faces: Reals, attenuation: float, enter: Reals, leave: Reals) -> None:
-    """Behind all faces at which a ray enters and before those at which it leaves (Cyrus & Beck, Computers & Graphics
-    3, 23, 1978); face by face, for the processor's vector lanes."""
+    """The chord lies behind all faces that the ray enters, and before all that it leaves (Cyrus & Beck, Computers &
+    Graphics 3, 23, 1978). The loop goes face by face, for the processor's vector lanes."""
     enter[:], leave[:] = -np.inf, np.inf
     least = EDGE_ON * rays.scale
     for f in range(faces.shape[0]):
@@ -209,7 +209,7 @@ def _add_polyhedron(part: Reals, rays: Rays, faces: Reals, attenuation: float, e
 
 @njit(**_KERNEL)
 def columns(u: Reals, per_mm: float, low: float, high: float) -> tuple[int, int]:
-    """First column whose centre lies in low..high, and the one after the last; none where these are not numbers."""
+    """First column whose centre lies in low..high, and the one after the last. The range is empty if these are NaN."""
     cols = float(u.size)
     left, right = (low - u[0]) * per_mm, (high - u[0]) * per_mm
     if not left <= right:

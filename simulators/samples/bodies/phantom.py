@@ -47,15 +47,16 @@ class Phantom:
         """
         called = tuple(kind_of(solid) for solid in solids) if names is None else tuple(names)
         if len(called) != len(solids):
-            raise ValueError(f"{len(solids)} solids have {len(called)} names; give one name a solid, or none at all")
+            raise ValueError(f"{len(solids)} solids have {len(called)} names; give each solid a name, or none")
         if len(set(called)) > MOST_NAMES:
             raise ValueError(f"labels are bytes: at most {MOST_NAMES} names, got {len(set(called))}; let solids share")
         return cls(tuple(solids), called, pack(solids))
 
     @cached_property
     def radius(self) -> float:
-        """mm from the rotation axis to the farthest matter; an ellipsoid is bounded by the upright elliptic cylinder
-        around it, turned with its longer axis outwards."""
+        """mm from the rotation axis to the farthest matter.
+
+        An ellipsoid is bounded by the upright elliptic cylinder around it, turned with its longer axis outwards."""
         p = self.packed
         out = np.hypot(p.centre[:, 0], p.centre[:, 1])
         round_ = p.kind == ELLIPSOID

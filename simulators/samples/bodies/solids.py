@@ -2,7 +2,7 @@
 
 Where solids overlap their attenuations add up: a particle in a matrix is given by its contrast to the matrix, a hole
 by a negative attenuation. Lengths are in mm, attenuation in 1/mm, positions (x, y, z) in the sample's frame (z is the
-rotation axis), orientations quaternions (w, x, y, z) of any length that turn the body's own axes into the sample's.
+rotation axis). Orientations are quaternions (w, x, y, z) of any length that turn the body's axes into the sample's.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Quaternion = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 LEAST, MOST = 1e-9, 1e9
-"""mm: with lengths far beyond, squares and quotients in the kernels overflow."""
+"""mm: with far larger lengths, squares and quotients in the kernels overflow."""
 DENSEST = 1e12
 """1/mm: with far larger ones, sums over chords overflow."""
 FLAT = 1e-9
-"""Of a body's size: corners closer than this to a plane count as in it."""
+"""Share of a body's size: corners closer than this to a plane count as in it."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Polyhedron:
         self.hull()
 
     def hull(self) -> Hull:
-        """Raises ValueError where all corners lie in a plane, or one is no corner of the hull of all."""
+        """Raises ValueError if all corners lie in a plane, or a corner lies inside the hull of the others."""
         points = np.array(self.vertices, dtype=np.float64)
         size = float(np.ptp(points, axis=0).max())
         try:

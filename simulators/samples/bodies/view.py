@@ -50,7 +50,7 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
         names: of the solids, for messages.
 
     Raises:
-        ValueError: the pose has not one angle a row.
+        ValueError: the number of the pose's angles differs from the number of rows.
         CannotExposeError: a body at or behind the source of a cone.
     """
     rows = detector.shape[0]
@@ -89,8 +89,9 @@ def _of_row(pose: Pose, j: int) -> Pose:
 
 
 def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]:
-    """Bounds of each body along the laboratory's k-th axis in all poses, mm: its box in the first pose, widened
-    by the difference of the poses."""
+    """Bounds of each body along the laboratory's k-th axis in all poses, mm.
+
+    They are its box in the first pose, widened by the difference of the poses."""
     axis, at = axes[:, :, k], np.einsum("ri,ri->r", axes[:, :, k], origin)
     drift = np.linalg.norm(axis - axis[0], axis=1).max(initial=0.0)
     far = np.linalg.norm(p.centre, axis=1) + np.linalg.norm(p.extent, axis=1)
@@ -100,7 +101,7 @@ def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]
 
 
 def _check_ahead(p: Packed, names: Sequence[str], axes: Reals, origin: Reals, sod: float, doubtful: Wholes) -> None:
-    """Raises CannotExposeError where the exact shape of a doubtful body is not wholly in front of the source."""
+    """Raises CannotExposeError if the exact shape of a doubtful body does not lie wholly in front of the source."""
     for i in doubtful:
         axis = axes[:, :, 1]
         if p.kind[i] == CYLINDER:

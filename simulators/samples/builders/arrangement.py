@@ -1,7 +1,7 @@
 """Arrangement: places convex bodies at random in a cylinder and moves them apart until no two overlap.
 
 A force-biased packing (Mościński, Bargieł, Rycerz and Jacobs, Mol. Simul. 3, 1989): all bodies have their full size
-from the beginning, and each pair that overlaps is pushed apart along the direction in which it overlaps least. It
+from the beginning. Each overlapping pair is pushed apart along the direction in which it overlaps least. It
 reaches beyond 0.5 of the volume, where random sequential addition stalls at 0.38. Bodies keep their orientation. Two
 bodies count as apart only where a separating plane is known, so that no overlap is missed.
 """
@@ -28,7 +28,7 @@ SPARE = 0.03
 SKIN = 0.3
 """Margin within which a body's neighbours are listed, over the median reach, so that the list serves several sweeps."""
 TRIALS, DECAY = 12, 0.8
-"""Directions tried for a separating plane before two bodies count as overlapping, and the ratio of successive turns."""
+"""Directions tried for a separating plane until two bodies count as overlapping, and the ratio of successive turns."""
 
 
 class Bodies(NamedTuple):
@@ -38,7 +38,7 @@ class Bodies(NamedTuple):
         reach: float64 [n], mm, of the sphere around each.
         across, up: float64 [n], mm, largest distance from its own vertical axis, and half its height.
         spread: float64 [n, 3, 3], mm: an ellipsoid is this matrix times the unit ball; not used for others.
-        first: int64 [n + 1]; corners of body i are first[i] to first[i + 1] of `corners`, none of an ellipsoid.
+        first: int64 [n + 1]; body i has corners first[i] to first[i + 1] of `corners`; an ellipsoid has no corners.
         corners: float64 [corner, 3], mm from the centre.
     """
 
@@ -91,8 +91,8 @@ def arrange(
             "(diameter x height); make the cell larger or the particles smaller"
         )
     n = room.size
-    # Balls of the gap's width around the centres do not overlap either. Checked first: with each a neighbour of all
-    # others the search would take hours.
+    # Balls of the gap's width around the centres must not overlap, either. This is checked first: if all bodies
+    # were neighbours, the search would take hours.
     if n * gap**3 / 6 > (radius + gap / 2) ** 2 * (height + gap):
         raise ValueError(
             f"a gap of {1e3 * gap:.3g} um between {n} particles is more than {2 * radius:.3g} x {height:.3g} mm "
@@ -115,8 +115,9 @@ def arrange(
 def _part(
     centres: Reals, bodies: Bodies, room: Reals, tall: Reals, gap: float, wanted: float, skin: float, sweeps: int
 ) -> int:
-    """Moves the bodies apart, in place; returns how many are still closer than `gap`. Pairs are moved to a distance of
-    `wanted`, so that the gap need not be met exactly."""
+    """Moves the bodies apart, in place; returns how many are still closer than `gap`.
+
+    Pairs are moved to a distance of `wanted`, so that rounding leaves the gap."""
     n = centres.shape[0]
     room_for = wanted + skin
     pairs = _near(centres, bodies.reach, room_for)
@@ -205,7 +206,7 @@ def _near(centres: Reals, reach: Reals, room: float) -> Wholes:
 
 @njit(cache=True, nogil=True)
 def _keep_in(centres: Reals, bodies: Bodies, i: int, room: Reals, tall: Reals) -> None:
-    """Moves a body back into the cylinder by its corners; by its largest radius where that does not succeed."""
+    """Moves a body back into the cylinder by its corners, or else by its largest radius."""
     c = centres[i]
     c[2] = min(max(c[2], -tall[i]), tall[i])
     first, last = bodies.first[i], bodies.first[i + 1]
@@ -229,8 +230,9 @@ def _keep_in(centres: Reals, bodies: Bodies, i: int, room: Reals, tall: Reals) -
 
 @njit(cache=True, nogil=True)
 def _apart(centres: Reals, bodies: Bodies, i: int, j: int, enough: float, way: Reals, work: Reals) -> float:
-    """Largest known gap in mm between i and j along a direction, negative where they overlap; the search ends at
-    `enough`. It begins at `way` (unit, from i to j, or zero), which becomes the best direction found.
+    """Largest known gap in mm between i and j along a direction, negative if they overlap.
+
+    The search ends at `enough`. It begins at `way` (unit, from i to j, or zero), which becomes the best direction.
 
     The gap along a direction n is n · w, where w joins the support points of the two bodies along n; it grows where n
     turns towards w. This is subgradient ascent on the sphere with decreasing steps.

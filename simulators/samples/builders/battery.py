@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
 from simulators.samples.builders.grains import octahedron
 
-# Attenuation times the can's radius: for any size of the can the largest line integral is between 1.5 and 3, so that at
-# least 5 % of the beam is transmitted.
+# Attenuation times the can's radius: for any size of the can the largest line integral is between 1.5 and 3. At least
+# 5 % of the beam is then transmitted.
 WALL, ELECTROLYTE, PARTICLE = 0.9, 0.15, 1.9
 
 CANDIDATES, ROUNDS = 256, 40
 MOST_PARTICLES = 5000
-"""The work grows as their square: this many take a minute."""
+"""Largest number of particles: this many take a minute, and the work grows as their square."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def battery(
     """Solids of a cylindrical cell that fits into the field of view, with air on all sides.
 
     Half of the particles are ellipsoids, a third octahedra and the rest boxes (the habits of LiCoO2 crystals), in any
-    orientation, their sizes spread log-normally. A particle's attenuation is its contrast to the electrolyte. The wall
+    orientation. Their sizes are log-normal. A particle's attenuation is its contrast to the electrolyte. The wall
     is a cylinder and, with its negative attenuation, its bore.
 
     Args:
@@ -57,8 +57,8 @@ def battery(
         fill: share of the electrolyte's volume that spheres of the particles' median radius would take.
 
     Raises:
-        ValueError: a field of view that is not positive or out of range, too many particles, or no room for
-            them without overlap.
+        ValueError: a field of view that is not positive or out of range, too many particles, or too little room for
+        them.
     """
     width, height = field_of_view
     if not (width > 0 and height > 0):
@@ -84,7 +84,7 @@ def battery(
 
 
 def _particle(rng: np.random.Generator, size: float, attenuation: float) -> tuple[Ellipsoid | Polyhedron | Box, float]:
-    """A particle at the origin and the radius of the sphere around it; `size` is about its own radius in mm."""
+    """A particle at the origin and the radius of the sphere around it; `size` is about the particle's radius in mm."""
     kind = rng.choice(3, p=(1 / 2, 1 / 3, 1 / 6))
     a, b, c = (size * rng.uniform(0.8, 1.2, 3)).tolist()
     w, x, y, z = rng.normal(size=4).tolist()

@@ -34,8 +34,8 @@ MADE_OF: Mapping[str, str] = MappingProxyType(
 GREY: Mapping[str, float] = MappingProxyType(
     {"wall": 0.9, "electrolyte": 0.15, "collector": 0.9, "separator": 0.1, "particle": 2.2, "pore": 0.15, "crack": 0.15}
 )
-"""Attenuation times the can's radius, in a beam without energies: for any size of the can about 5 % are transmitted
-where a cathode with a fill of 0.45 is thickest."""
+"""Attenuation times the can's radius, in a beam without energies. A cathode of any size with a fill of 0.45 then
+transmits about 5 % at its thickest part."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Cathode:
         loose = grains(rng, wanted, sizes, self.habits, self.irregularity, self.aspect)
         if not loose and self.fill:
             raise ValueError(
-                f"a grain of {self.size_um:g} um is more than the fill of {self.fill:g} asks for; make the cell larger "
+                f"a grain of {self.size_um:g} um is larger than the whole fill of {self.fill:g}; make the cell larger "
                 "or the grains smaller"
             )
         if not loose:

@@ -1,7 +1,7 @@
 """Foam: a cylinder or box of matter with many round holes that do not touch, from large to small ones.
 
-Each hole is placed at that of many random points where the largest hole fits (idea of Pelt, Hendriksen and Batenburg,
-"Foam-like phantoms for comparing tomography algorithms", J. Synchrotron Rad. 29, 2022).
+Of many random points, each hole takes the one with most room. The idea is by Pelt, Hendriksen and Batenburg
+("Foam-like phantoms for comparing tomography algorithms", J. Synchrotron Rad. 29, 2022).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Foam:
     Attributes:
         diameter, height: mm, of a cylinder.
         edges: mm (x, y, z), of a box instead.
-        n_holes: at most; fewer where no further hole of `smallest_um` fits.
+        n_holes: largest number; fewer if no further hole of `smallest_um` fits.
         largest_um, smallest_um: diameters of holes.
         gap_um: least thickness of matter between holes and to the outside.
         candidates: number of random points; more of them make a denser foam.
@@ -145,7 +145,7 @@ class Cells(NamedTuple):
 
     Attributes:
         low, size: float64 [3], mm, corner of the first cell and edges of a cell.
-        number: int64 [3], of cells along each axis.
+        number: int64 [3], number of cells along each axis.
         first: int64 [cell + 1], index of each cell's first point.
     """
 

@@ -14,7 +14,7 @@ class Piece:
     """Attributes:
     solid: its attenuation is the share of its volume that the role fills: 1, or -1 for a hole in the same role.
     role: "wall", "particle", ...; also its label.
-    instead_of: the role of the piece that it displaces.
+    instead_of: the role of the displaced piece.
     """
 
     solid: Solid
@@ -35,7 +35,7 @@ class PieceBuilder(Protocol):
 
     @property
     def attenuation(self) -> Mapping[str, float]:
-        """1/mm by role, in place of defaults; where there are any, no role has a material."""
+        """1/mm by role, in place of defaults. If the scene gives any, no role has a material."""
         ...
 
     @property
@@ -49,7 +49,7 @@ class PieceBuilder(Protocol):
 
 
 def check_roles(settings: PieceBuilder) -> None:
-    """Raises ValueError where the scene names a role that the phantom does not have."""
+    """Raises ValueError if the scene names a role that the phantom lacks."""
     roles = settings.default_materials
     for key, named in (("made_of", settings.made_of), ("attenuation", settings.attenuation)):
         if unknown := [role for role in named if role not in roles]:

@@ -1,7 +1,7 @@
 """Resolution pattern: bars of given widths, a Siemens star and balls of decreasing size, in another material.
 
-From below: balls in a row along x; the star across the rotation axis; and groups of bars, vertical ones (side by side
-along x) at y > 0 and horizontal ones (above each other) at y < 0. Bars and the gaps between them are equally wide: a
+From below: balls in a row along x, the star across the rotation axis, and groups of bars. Vertical bars (side by side
+along x) lie at y > 0, horizontal ones (above each other) at y < 0. Bars and the gaps between them are equally wide: a
 line pair is twice a width. All places follow from the sizes; nothing is random.
 """
 
@@ -92,7 +92,7 @@ class Resolution:
         return MARGIN * reach, MARGIN * sum(tall for _, _, tall in layers)
 
     def _layers(self) -> list[tuple[list[Box | Ellipsoid | Polyhedron], str, float]]:
-        """Solids about the middle of their layer, their role, and the layer's height with the space around, mm."""
+        """For each layer: its solids, centred at its middle; their role; its height with the space around, mm."""
         layers: list[tuple[list[Box | Ellipsoid | Polyhedron], str, float]] = []
         if self.balls_um:
             sizes = [um * 1e-3 for um in self.balls_um]

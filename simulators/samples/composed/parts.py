@@ -23,7 +23,7 @@ from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Solid, kind_of
 from simulators.samples.sample import Sample
 
-if TYPE_CHECKING:  # the tables are loaded where a scene names a material
+if TYPE_CHECKING:  # the tables are loaded only if a scene names a material
     from simulators.light.materials import Material
 
 Reals = NDArray[np.float64]
@@ -60,7 +60,7 @@ class Constituent:
     """One kind of matter in a sample.
 
     Attributes:
-        chords: its thickness along a ray, mm (the optical depth, where it is grey).
+        chords: its thickness along a ray, mm; the optical depth if it is grey.
         material: None: grey.
         instead_of: the material that it displaces.
     """
@@ -70,7 +70,7 @@ class Constituent:
     instead_of: Material | None = None
 
     def attenuation(self, energies: ArrayLike) -> Reals:
-        """1/mm at energies in keV, of their shape; less that of the displaced material."""
+        """1/mm, minus that of the displaced material, at energies in keV; same shape as the energies."""
         if self.material is None:
             return np.ones(np.shape(energies))
         own = self.material.attenuation(energies)

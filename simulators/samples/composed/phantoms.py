@@ -59,8 +59,7 @@ def _volume(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume
 
 
 def _pieces(cls: str) -> _Builder:
-    """The builder of a phantom of pieces: they are materials in a beam with energies, unless the scene states their
-    attenuation."""
+    """The builder of a phantom of pieces, which are materials if the beam has energies and the scene no attenuation."""
 
     def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
         kind = getattr(import_module(f"simulators.samples.builders.{cls.lower()}"), cls)

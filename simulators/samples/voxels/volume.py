@@ -60,7 +60,7 @@ class VolumeSettings:
         attenuation_max: 1/mm of the window's upper end, or of the largest value.
         largest_line_integral: dimensionless, over all rays of 8 views, a voxel apart.
         thresholds: file's values, ascending, at which labels 1, 2, ... begin.
-        labels: a file of labels 0 ... 255 instead, of the same shape; `labels_dataset` in it.
+        labels: a file of labels 0 ... 255 of the same shape, instead of thresholds; `labels_dataset` in it.
         names: of the labels.
     """
 
@@ -102,7 +102,7 @@ def voxels_of(settings: VolumeSettings, read: ReadVolume) -> Voxels:
     """The sample of the settings.
 
     Raises:
-        ValueError: the file does not hold a volume, or not one that fits the settings.
+        ValueError: the file holds no volume, or a volume that does not fit the settings.
     """
     stored = read(settings.file, settings.dataset)
     values = _turned(stored.values, settings)
@@ -133,7 +133,7 @@ def _spacing(stored: Stored, settings: VolumeSettings) -> tuple[float, float, fl
         raise ValueError("voxel_mm is missing, and the file does not state the size of its voxels")
     own = stored.spacing or (1.0, 1.0, 1.0)
     z, y, x = (own[settings.axes.index(axis)] for axis in "zyx")
-    # voxel_mm is the voxel's width; the file's ratio of width to height is kept.
+    # voxel_mm is the voxel's width; the ratio of width to height is that in the file.
     factor = 1.0 if settings.voxel_mm is None else settings.voxel_mm / x
     return z * factor, y * factor, x * factor
 
@@ -157,7 +157,7 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
                 "attenuation_max"
             )
         detector = Detector.centred((planes, across), pitch)
-        # Each row projects one plane of voxels, at any distance between planes; in between no sum is larger.
+        # Each row projects one plane of voxels, at any distance between planes. Sums between planes are not larger.
         shift = np.zeros((planes, 3))
         shift[:, 2] = detector.v() * (1 - spacing[0] / pitch)
         poses = (Pose.turned(k * math.pi / VIEWS, planes).shifted_by(shift) for k in range(VIEWS))

@@ -58,8 +58,8 @@ class Voxels:
         Args:
             attenuation: [z, y, x] in 1/mm; the rotation axis goes up through the middle.
             spacing: mm from voxel to voxel, one for all or along (z, y, x).
-            thresholds: 1/mm, ascending: a label begins at each. Without them and `labels`, all that attenuates is
-                matter.
+            thresholds: 1/mm, ascending: a label begins at each. Without them and `labels`, every voxel above 0 is
+            matter.
             labels: [z, y, x], 0 ... 255; 0 is air.
             names: of the labels from 1 on; empty: numbers.
 
@@ -109,8 +109,8 @@ class Voxels:
         """See Sample.line_integrals.
 
         Raises:
-            ValueError: a pose of another number of rows.
-            CannotExposeError: a cone's source inside the volume.
+            ValueError: the pose has another number of rows.
+            CannotExposeError: a cone's source lies inside the volume.
         """
         pose = angle if isinstance(angle, Pose) else Pose.turned(angle, detector.shape[0])
         if pose.angle.size != detector.shape[0]:
@@ -133,8 +133,8 @@ class Voxels:
             )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
-        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume. For voxels larger than its own
-        it is averaged over as many points a side as it has voxels (`supersample` is for surfaces)."""
+        """True attenuation in 1/mm, float32 [z, y, x]: the interpolated volume. In larger voxels than its own it is
+        averaged, with as many points a side as it has voxels there. `supersample` is for surfaces."""
         points = [
             max(1, math.ceil(wanted / own - 1e-6)) for wanted, own in zip(grid.spacing, self.spacing, strict=True)
         ]
@@ -165,7 +165,7 @@ class Voxels:
                 centres, grid.spacing[axis], points[axis], self.first[axis], self.spacing[axis], values.shape[0]
             )
             rest = values.shape[1:]
-            # The first axis is replaced and moved to the end: after three steps all are in their places again.
+            # The first axis is replaced and moved to the end: after three steps all axes are in their places again.
             values = np.moveaxis((weights @ values.reshape(values.shape[0], -1)).reshape(-1, *rest), 0, 2)
         return np.ascontiguousarray(values)
 
@@ -174,7 +174,7 @@ def _weights(centres: NDArray[np.float64], edge: float, points: int, first: floa
     """Matrix [target, padded voxel] that interpolates along one axis and takes the mean over each target voxel."""
     within = (np.arange(points) + 0.5) / points - 0.5
     place = (centres[:, None] + within * edge - first) / step + 1.0
-    # On a voxel's centre exactly the voxel's value: a rounded share of its neighbour would count as matter.
+    # Exactly the voxel's value at its centre: a rounded share of its neighbour would count as matter.
     place = np.where(np.abs(place - np.rint(place)) < ON, np.rint(place), place)
     below = np.floor(place)
     rows = np.repeat(np.arange(centres.size), points)

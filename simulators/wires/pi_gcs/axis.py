@@ -1,8 +1,8 @@
 """Simulated PI GCS 2.0 (C-863 class), the axis behind the wire: servo, reference, moves, stops, limits, trigger line.
 
 Inside, positions are encoder counts from the reference switch ("true"). On the wire they are degrees from the axis'
-own zero, which before a reference move is wherever it was switched on. Nothing runs in the background: what a move
-will do at its end is done when somebody next looks. Strict where a manual is silent: a move during a move is refused.
+own zero, which before a reference move is wherever it was switched on. Nothing runs in the background: the effects of
+a move's end happen at the next call. Where a manual is silent the axis is strict: it refuses a move during a move.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MOVES_REMEMBERED = 4096
 
 
 class GcsError(Exception):
-    """A command that does nothing but set the error register."""
+    """A refused command, which only sets the error register."""
 
     def __init__(self, code: int) -> None:
         super().__init__(code)
@@ -31,7 +31,7 @@ class GcsError(Exception):
 
 @dataclass(frozen=True)
 class AxisBuild:
-    """How this specimen is built, and its faults.
+    """How this axis is built, and its faults.
 
     Attributes:
         low, high: travel range and limit switches, degrees.
@@ -196,7 +196,7 @@ class GcsAxis:
         output.on = on
 
     def catch_up(self) -> None:
-        """Do what was due when the last move ended."""
+        """Apply the effects of the last move's end."""
         if self._at_end is not None and self._clock.now() >= self.move.end:
             act, self._at_end = self._at_end, None
             act()

@@ -1,7 +1,7 @@
 """Simulated PI GCS 2.0 controller (C-863 class), its commands: what each does to the axis and the output lines.
 
-A setting returns None, a query the lines of its reply; what is wrong with either raises the code for the error
-register. One command takes one item (one axis, one parameter), as the C-863 does.
+A setting returns None, a query the lines of its reply. A wrong command raises the code for the
+error register. One command takes one item (one axis, one parameter), as the C-863 does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class PiGcsBox:
         """As DIO has put the output lines."""
 
     def axis_of(self, arguments: list[str], more: int = 0) -> list[str]:
-        """The arguments after the axis' name; it may be left out where nothing else follows."""
+        """The arguments after the axis' name. A command without other arguments may leave the name out."""
         if not arguments and not more:
             return []
         if len(arguments) != more + 1:
@@ -162,7 +162,7 @@ def _set_parameter(box: PiGcsBox, arguments: list[str]) -> None:
 def _set_trigger(box: PiGcsBox, arguments: list[str]) -> None:
     output, (parameter, value) = box.output_of(arguments, 2)
     if output.on:
-        box.axis.switch_trigger(output, False)  # a line that is on starts over with its new setting
+        box.axis.switch_trigger(output, False)  # a line that is on starts again with its new setting
         _set_trigger(box, arguments)
         box.axis.switch_trigger(output, True)
         return

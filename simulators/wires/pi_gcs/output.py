@@ -1,7 +1,7 @@
 """Simulated PI GCS 2.0, an output line with a cable in it: its CTO settings, and the pulses of the move under way.
 
-A move is a closed form of time. So its pulses go on the cable with their exact times the moment it begins. Those still
-to come are taken away when it is cut short.
+A move is a closed form of time. So its pulses go on the cable with their exact times the moment it begins. A stop
+removes the pulses that are still to come.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Firmware:
-    """What no command changes.
+    """Properties that no command changes.
 
     Attributes:
         first_pulse: see `FirstPulse`.
@@ -50,7 +50,7 @@ class Firmware:
 
 @dataclass(frozen=True)
 class _Coming:
-    """Something that the line will do at `time` if nobody stops the move; the edge that it gives the camera, if any."""
+    """A change of the line at `time` if nobody stops the move, and the edge that the camera gets, if any."""
 
     time: float
     crossing: Crossing
@@ -95,7 +95,7 @@ class WiredOutput:
         return Window(at.step * scale, start, stop, self._zero, self._firmware.first_pulse)
 
     def _settle(self, now: float) -> list[Pulse]:
-        """Take for done what has passed and forget the rest; edges that are still to come of pulses begun."""
+        """Keep past changes and drop future ones; returns the edges to come of pulses that have begun."""
         done = [coming for coming in self._coming if coming.time <= now]
         self._coming = []
         for coming in done:
@@ -114,7 +114,7 @@ class WiredOutput:
     def _foresee(self, move: TrapezoidMove, now: float) -> None:
         """A pulse that begins while the last is held gives no edge.
 
-        Where pulses are the other way round than the camera takes them, its edge is a pulse's end.
+        If the pulses have the opposite polarity of the camera's, its edge is the end of a pulse.
         """
         number, high_until, firmware = self._pulses, self._high_until, self._firmware
         for crossing in crossings(self._window(), self._progress, self._done_until, float(move.target)):
@@ -127,6 +127,6 @@ class WiredOutput:
             self._coming.append(_Coming(time, crossing, edge))
 
     def _noticed(self, time: float, now: float) -> float:
-        """When the servo sees a crossing: not before now, for it has not happened yet."""
+        """When the servo sees a crossing; never before the present time."""
         period = self._firmware.period
         return max(math.ceil(time / period) * period if period else time, math.nextafter(now, math.inf))

@@ -1,8 +1,8 @@
-"""Simulated PI GCS 2.0, trigger output: where on a way of the axis an output line in mode 0 (PositionDistance) fires.
+"""Simulated PI GCS 2.0, trigger output: the positions at which an output line in mode 0 (PositionDistance) fires.
 
-One pulse each step travelled. A start threshold below the stop threshold lets pulses begin on a positive way only, one
-above on a negative way only; equal thresholds switch the window off. A way that turns round inside the window goes on
-giving pulses, each a step from the one before. It ends beyond either threshold (C-863 and E-727 manuals).
+One pulse for each step of travel. If the start threshold lies below the stop threshold, pulses begin only in the
+positive direction; if it lies above, only in the negative one. Equal thresholds switch the window off. A move that
+reverses inside the window goes on giving pulses at every step. They end beyond either threshold (C-863, E-727 manuals).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 SLACK = 1e-6
-"""counts by which decimals on the wire may miss a position."""
+"""counts: largest error of a position by the decimals on the wire."""
 
 
 class FirstPulse(StrEnum):
-    """Where the first pulse comes; the manuals do not say, so a stand-in can be built each way."""
+    """Where the first pulse comes. The manuals do not say, so the simulation offers each possibility."""
 
     AT_THRESHOLD = "at_threshold"
     STEP_AFTER = "step_after"
     GRID = "grid"
-    """At whole steps from position 0; the window only lets through."""
+    """At whole steps from position 0; the window only selects."""
 
 
 @dataclass(frozen=True)
@@ -37,14 +37,13 @@ class Window:
 
     @property
     def sign(self) -> int:
-        """The way on which pulses begin: +1, -1, or 0 where the window is off."""
+        """The direction in which pulses begin: +1, -1, or 0 if the window is off."""
         return (self.stop > self.start) - (self.stop < self.start)
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a line is: inside its window or not, and the last pulse (or where it would have been): anchor + index
-    steps."""
+    """State of a line: inside its window or not, and the place of its last (or virtual) pulse: anchor + index steps."""
 
     inside: bool = False
     anchor: float = 0.0
@@ -53,7 +52,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Crossing:
-    """A position on the way where something happens to the line, and how far it is then."""
+    """A position at which the line changes, and its state after the change."""
 
     position: float
     pulse: bool
@@ -61,12 +60,12 @@ class Crossing:
 
 
 def switched_on(window: Window, position: float) -> Progress:
-    """What a line knows when TRO switches it on with the axis at `position` (counts)."""
+    """State of a line that TRO switches on with the axis at `position` (counts)."""
     return Progress() if window.sign else Progress(True, position, 0)
 
 
 def crossings(window: Window, progress: Progress, begin: float, end: float) -> Iterator[Crossing]:
-    """What happens on the straight way from `begin` (not included) to `end` (included), in order."""
+    """The crossings between `begin` (not included) and `end` (included), in order."""
     if begin == end:
         return
     sign, reach = (1 if end > begin else -1), abs(end - begin)

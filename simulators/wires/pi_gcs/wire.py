@@ -1,8 +1,8 @@
 """Simulated PI GCS 2.0 controller (C-863 class), the wire: bytes to commands of its one axis, and its replies back.
 
 A command line ends with LF (CR is ignored, case does not matter) and is one item; single control bytes act at once.
-Settings are not answered: what is wrong with a line, the error register says (ERR?, which clears it; the last error
-wins). An unknown query is not answered either. In a reply of several lines all but the last end with SPACE LF.
+Settings are not answered. The error register keeps the last error; ERR? reads and clears it. An unknown query is not
+answered, either. In a reply of several lines all but the last end with SPACE LF.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class PiGcsBuild:
     Attributes:
         axis: its identifier.
         output: the digital output that the trigger cable is in, from 1.
-        latency: s until a reply is there.
+        latency: s until a reply can be read.
         unknown: commands (like "ACC" or "TMN?") that this model does not know.
-        spoil: what becomes of a reply on its way: its number since power-on and its bytes -> the bytes that arrive.
+        spoil: damages replies: (number since power-on, bytes) -> the bytes that arrive.
         specimen: the axis, and its faults.
 
     Raises:
@@ -119,7 +119,7 @@ class PiGcsController:
                     self._in.append(byte)
 
     def transmit(self) -> bytes:
-        """Bytes for the host that are there by now and were not taken yet."""
+        """Bytes for the host that are due and not yet taken."""
         with self._lock:
             taken = bytearray()
             while self._out and self._out[0][0] <= self.clock.now():

@@ -1,8 +1,8 @@
 """Simulated Tsuji PM16C-04XD, the box behind the wire: sixteen motors, four position controllers, error flags.
 
 Behaviour as in the vendor's remote manual, revision 17 (2017), cross-checked with KEK's drivers. Where the manual is
-silent this box is strict: a setting sent in LOCAL, to a moving motor, or (TMG*) while armed sets the command-error flag
-and does nothing more.
+silent this box is strict: a setting sent in LOCAL, to a moving motor, or (TMG*) while armed only sets the command-error
+flag.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
 MAX_PULSES = 200_000
-"""Most pulses of a train; a limit of this stand-in, which works all of them out when a move begins."""
+"""Most pulses of a train: a limit of this simulation, which computes all of them when a move begins."""
 MODES = (
     (Output.OFF, 0.0),
     (Output.GATE, 0.0),
@@ -35,7 +35,7 @@ _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 
 
 
 def ms_per_1000_pps(code: int) -> float:
-    """What the acceleration code 0..115 means: the E24 preferred numbers (IEC 60063) downwards from 1000 to 0.016."""
+    """ms per 1000 pps of an acceleration code 0..115: the E24 preferred numbers (IEC 60063) from 1000 to 0.016."""
     decade, step = divmod(code + 23, 24)
     return float(f"{_E24[23 - step]}e{2 - decade}")
 
@@ -49,7 +49,7 @@ class Error(IntFlag):
 
 
 class Refused(Exception):  # noqa: N818 - not an error of this program
-    """A command that does nothing but set an error flag."""
+    """A refused command, which only sets an error flag."""
 
     def __init__(self, flag: Error) -> None:
         super().__init__(flag)
@@ -57,7 +57,7 @@ class Refused(Exception):  # noqa: N818 - not an error of this program
 
 
 class Channel:
-    """A motor and what the box keeps for it."""
+    """A motor and its settings in the box."""
 
     def __init__(self, motor: PulseMotor, home_at: int | None = None) -> None:
         self.motor = motor
@@ -94,7 +94,7 @@ class BoxBuild:
         channel: the motor that turns the sample; the others turn nothing.
         counts_per_turn: its pulses for 2π.
         home_at: where its home switch is, in pulses since power-on; None plugs none in.
-        version: what it says of its firmware.
+        version: of its firmware.
         lost: trigger pulses (from 0, since power-on) that never reach the line.
         stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
             interlock or a limit switch.
@@ -122,7 +122,7 @@ class PM16CBox:
     """State and actions; methods take the channel as the hex digit of the protocol. Not safe from several threads.
 
     Args:
-        line: what the TP0 connector, the output of position controller A, is wired to.
+        line: the cable in the TP0 connector, the output of position controller A.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: BoxBuild) -> None:
@@ -154,7 +154,7 @@ class PM16CBox:
         return sum(channel.motor.moving() for channel in self.channels.values())
 
     def standing(self, c: str) -> Channel:
-        """The channel, which must not move."""
+        """The channel; raises Refused if it moves."""
         if self.channels[c].motor.moving():
             raise Refused(Error.COMMAND)
         return self.channels[c]
@@ -200,7 +200,7 @@ class PM16CBox:
         return "NO H.P" if found is None else f"{found:+08d}"
 
     def preset(self, c: str, count: int) -> None:
-        """Call the place where it stands `count`."""
+        """Set the count of the present position to `count`."""
         motor = self.standing(c).motor
         if abs(count) > MAX_COUNT or motor.trigger.ready(self.clock.now()):
             raise Refused(Error.COMMAND)
@@ -226,7 +226,7 @@ class PM16CBox:
                 stop(c)
 
     def set_speed(self, level: str, c: str, value: str) -> None:
-        """Without a value: select that speed for the next moves."""
+        """Set a speed; without a value select it for the next moves."""
         channel = self.standing(c)
         if not value:
             channel.selected = level
@@ -280,4 +280,4 @@ class PM16CBox:
 
 
 def _unplugged() -> None:
-    """The trigger output of a motor that no cable is plugged into."""
+    """The trigger output of a motor without a cable."""

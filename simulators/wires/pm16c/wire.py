@@ -1,7 +1,7 @@
 """Simulated Tsuji PM16C-04XD, the wire: bytes to lines to commands of the box, and its replies back to bytes.
 
-ASCII lines end with CR LF both ways. Queries are answered, settings are not. A line that is no command, or a setting
-that the box refuses, sets an error flag (ERRF?, ERR?) and nothing else.
+ASCII lines end with CR LF both ways. Queries are answered, settings are not. An unknown command, or a setting
+that the box refuses, only sets an error flag (ERRF?, ERR?).
 """
 
 from __future__ import annotations
@@ -112,8 +112,8 @@ class PM16CBuild:
     """How the controller is built, and its faults.
 
     Attributes:
-        box: what stands behind the wire.
-        silent, garbled: queries (from 0, since power-on) that get no reply, or a spoilt one.
+        box: the controller behind the wire.
+        silent, garbled: queries (from 0, since power-on) that get no reply, or a damaged one.
     """
 
     box: BoxBuild = field(default=BoxBuild())
@@ -133,7 +133,7 @@ class PM16CController:
     """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
 
     Args:
-        line: what the TP0 connector (position controller A) is wired to; it also learns the sample's true angle.
+        line: the cable in the TP0 connector (position controller A); it also learns the sample's true angle.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: PM16CBuild) -> None:
@@ -158,14 +158,14 @@ class PM16CController:
                 self.box.errors |= Error.COMMAND
 
     def transmit(self) -> bytes:
-        """Bytes for the host that were not taken yet."""
+        """Bytes for the host that are not yet taken."""
         with self._lock:
             out = bytes(self._out)
             self._out.clear()
             return out
 
     def output_is_high(self, number: int) -> bool:
-        """It has no outputs that can be set."""
+        """False: no output of this controller can be set."""
         return False
 
     def _do(self, line: bytes) -> None:

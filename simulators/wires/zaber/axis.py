@@ -36,8 +36,8 @@ class AxisBuild:
     Attributes:
         counts_per_turn: microsteps for 2π of true angle.
         low, high: its own travel limits in microsteps.
-        homed: it knows its reference since power-on; without it stands WR.
-        stall_at: a move that would pass this count stops there (FS), as when something blocks it.
+        homed: it knows its reference since power-on; otherwise the flag WR stands.
+        stall_at: a move that would pass this count stops there (FS), as if blocked.
         switch_at: a move that would pass this count runs into a limit there (WL, FE).
     """
 
@@ -52,7 +52,7 @@ class AxisBuild:
 class ZaberAxis:
     """One axis. Times are s on the device's clock, positions whole microsteps.
 
-    `stall_at` and `switch_at` may be changed while it stands, as by a person who clears the way.
+    `stall_at` and `switch_at` may be changed while it stands, as if a person clears the way.
     """
 
     def __init__(self, now: float, build: AxisBuild) -> None:
@@ -87,7 +87,7 @@ class ZaberAxis:
         return move.position(time) * self._angle_of_count
 
     def settle(self, now: float) -> bool:
-        """Let a move that has ended leave its flags; whether one has ended since the last look."""
+        """Set the flags of a move that has ended; returns whether one has ended since the last call."""
         if self._at_end is None or self.moving(now):
             return False
         ending, self._at_end = self._at_end, None
@@ -100,7 +100,7 @@ class ZaberAxis:
         return sorted(standing, key=PRIORITY.index)
 
     def start(self, now: float, target: int) -> None:
-        """Move to `target`, or to where it is blocked on the way."""
+        """Move to `target`, or to the place where it is blocked."""
         self._ready(now)
         if not self.settings["limit.min"] <= target <= self.settings["limit.max"]:
             raise Rejected("BADDATA")
@@ -111,21 +111,21 @@ class ZaberAxis:
         self._begin(move, ending)
 
     def home(self, now: float) -> None:
-        """Turn to the reference, count 0, from which on the position is known."""
+        """Turn to the reference, count 0; from then on the position is known."""
         self._ready(now)
         self._begin(self._planned(now, 0), self._found_home)
 
     def stop(self, now: float) -> None:
-        """Slow down to the last microstep that still comes on the way."""
+        """Slow down and stand at a whole microstep."""
         if not self.moving(now):
             return
         slowed = self.move.slowed(now, self.settings["motion.decelonly"] / ACCELERATION_UNIT)
-        if self.move.direction * (self.move.target - slowed.target) > 0:  # otherwise it stands by itself before that
+        if self.move.direction * (self.move.target - slowed.target) > 0:  # otherwise the move ends earlier by itself
             self._moves[-1] = slowed
         self._interrupt()
 
     def halt(self, now: float) -> None:
-        """Stand at once, at the last microstep done."""
+        """Stand at once, at the last whole microstep."""
         if self.moving(now):
             self._moves[-1] = self.move.halted(self.position(now))
             self._interrupt()
@@ -152,6 +152,6 @@ class ZaberAxis:
         self.homed = True
 
     def _interrupt(self) -> None:
-        """The flag stands at once, also in the reply to what interrupts: the vendor's library clears it there."""
+        """The flag stands at once, also in the interrupting command's reply: the vendor's library clears it there."""
         self._at_end = self._nothing
         self.flags.add("NI")

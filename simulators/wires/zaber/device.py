@@ -1,6 +1,6 @@
 """Simulated Zaber device behind its wire: settings, commands, and the trigger cable from one digital output.
 
-A controller with one rotary axis, X-RSW style. What it does not know it rejects with BADCOMMAND, as a device does.
+A controller with one rotary axis, X-RSW style. It rejects unknown commands with BADCOMMAND, as a device does.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class DeviceBuild:
 
     Attributes:
         output: digital output (from 1) that is wired to the line.
-        active_high: which edge of that output the camera takes for a pulse.
+        active_high: whether the camera triggers on that output's rising edge.
         firmware: version; triggers came with 7.06.
-        can_schedule: it knows `io set do N V schedule MS W`; can_chain: an action may enable another trigger.
+        can_schedule: it has `io set do N V schedule MS W`; can_chain: an action may enable another trigger.
         identity: the name of the setting with the device's identity number: "device.id" or "deviceid".
         latency: s from a trigger's condition to its actions.
         fires_when_enabled: a distance trigger fires where it is enabled, too.
@@ -69,7 +69,7 @@ class ZaberDevice:
         self._has_triggers = tuple(map(int, build.firmware.split("."))) >= (7, 6)
         self._angle_of_count = 2 * math.pi / counts_per_turn
         self._sent: set[Pulse] = set()
-        self._looked, self._counted = 0, 0  # edges that happened and were looked at; pulses among them
+        self._looked, self._counted = 0, 0  # past edges that were processed, and the pulses among them
         self._fixed: dict[str, str] = {
             build.identity: "50952",
             "system.serial": "123456",
@@ -94,7 +94,7 @@ class ZaberDevice:
         }
 
     def settle(self) -> bool:
-        """Let happen what has happened by now; whether a move has ended since the last look."""
+        """Process all events up to now; returns whether a move has ended since the last call."""
         now = self._clock.now()
         self.triggers.advance(now)
         self._emit(now, self._happened())
@@ -123,7 +123,7 @@ class ZaberDevice:
         return NOTHING
 
     def information(self, words: Sequence[str]) -> list[str]:
-        """The info lines of a command that has some."""
+        """The info lines of a command, if it has any."""
         match words:
             case ["trigger", number, "print"] if self._has_triggers and number_in(number, TRIGGERS):
                 trigger = self.triggers.triggers[int(number) - 1]
@@ -219,7 +219,7 @@ class ZaberDevice:
             raise Rejected("BADDATA")
 
     def _predict(self) -> None:
-        """Put the pulses on the line that are still to come as things stand now, in place of those predicted before."""
+        """Put the future pulses, as now predicted, on the line, in place of those predicted earlier."""
         now = self._clock.now()
         happened = self._happened()
         coming = self.triggers.predicted(max(now, self.axis.move.end) + LOOK_AHEAD)
@@ -227,20 +227,20 @@ class ZaberDevice:
         self._emit(now, happened + self._pulses(coming, self._counted))
 
     def _happened(self) -> list[Pulse]:
-        """Pulses since the last look."""
+        """Pulses since the last call."""
         new = self.triggers.edges[self._looked :]
         pulses, self._looked = self._pulses(new, self._counted), self._looked + len(new)
         self._counted += sum(map(self._is_pulse, new))
         return pulses
 
     def _emit(self, now: float, pulses: list[Pulse]) -> None:
-        """Put pulses on the line but for those of the past that it has already."""
+        """Put pulses on the line, without the past ones that it already has."""
         if new := [pulse for pulse in pulses if pulse.time > now or pulse not in self._sent]:
             self._line.schedule(new)
             self._sent.update(new)
 
     def _pulses(self, edges: Sequence[Edge], first: int) -> list[Pulse]:
-        """The pulses that do not get lost, the first one having the number `first` since power-on."""
+        """The pulses that are not lost; the first pulse has the number `first` since power-on."""
         active = enumerate(filter(self._is_pulse, edges), first)
         return [
             Pulse(edge.time, edge.position * self._angle_of_count) for index, edge in active if index not in self._lost

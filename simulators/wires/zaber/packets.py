@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 
 LONGEST_PACKET = 80
-"""Bytes; a longer one is passed over."""
+"""Bytes of a packet; a longer one is ignored."""
 LONGEST_WORD = 50
 LINE_ENDS = re.compile(rb"[\r\n]+")
 
@@ -27,7 +27,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Malformed:
-    """A packet that reached this device but is refused for its form."""
+    """A packet that reached this device but has a wrong form and is refused."""
 
     command: Command
     reason: str
@@ -48,8 +48,8 @@ def frame(text: str, checksum: bool) -> bytes:
 
 
 class PacketReader:
-    """Bytes from the host, in pieces of any size, to commands. A packet with a wrong checksum, without `/`, with bytes
-    that are no ASCII or too many of them is passed over in silence."""
+    """Bytes from the host, in pieces of any size, to commands. A packet with a wrong checksum, without `/`, too long or
+    not ASCII is silently ignored."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
@@ -63,7 +63,7 @@ class PacketReader:
             if (packet := self._packet(line)) is not None:
                 found.append(packet)
         if len(self._bytes) > LONGEST_PACKET:
-            del self._bytes[: -LONGEST_PACKET - 1]  # too long whatever follows, and no more of it is kept
+            del self._bytes[: -LONGEST_PACKET - 1]  # too long already: the rest is dropped
         return found
 
     def _packet(self, line: bytes) -> Command | Malformed | None:
@@ -83,7 +83,7 @@ class PacketReader:
 
 def _command(text: str) -> Command:
     """Numbers at the start are address, axis and id, as many as there are. The first other word begins the command.
-    "--" in the third place is no id."""
+    "--" in the third place means: no id."""
     words = text.split()
     numbers: list[str] = []
     while words and len(numbers) < 3 and (words[0].isdigit() or (len(numbers) == 2 and words[0] == "--")):

@@ -2,8 +2,8 @@
 
 Nothing runs in the background: `advance` goes from event to event up to a time, and a copy that is advanced beyond it
 predicts the edges still to come. A trigger fires when its condition turns true, as in the vendor's library. It fires at
-once if the condition is true when it is enabled; COUNT fires disable it. From memory, not confirmed: a distance is
-counted, in both directions, from where the trigger was enabled or last fired. A new value of an output cancels its
+once if the condition is true when it is enabled; COUNT fires disable it. From memory, not confirmed: a distance
+counts in both directions from the place of enabling or of the last fire. A new value of an output cancels its
 schedule.
 """
 
@@ -20,7 +20,7 @@ from simulators.wires.zaber.axis import Rejected
 OUTPUTS, TRIGGERS, ACTIONS = 4, 6, 2
 UNLIMITED = -1
 DEEPEST = 2 * TRIGGERS
-"""Triggers that set each other off at one moment, before it is taken for a circle."""
+"""Triggers may set each other off so often at one moment; more count as a circle."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ Condition = Distance | Compare
 
 @dataclass(frozen=True)
 class Edge:
-    """A digital output takes a new value; where the axis was then, in microsteps."""
+    """A digital output takes a new value, with the axis at `position` microsteps."""
 
     time: float
     channel: int
@@ -56,7 +56,7 @@ class Edge:
 
 @dataclass
 class Trigger:
-    """What is set up, and how it stands. `left` fires remain; `origin` is the position counted from."""
+    """Set-up and state of a trigger. `left` fires remain; distances count from `origin`."""
 
     text: str = "none"
     condition: Condition | None = None
@@ -84,14 +84,14 @@ class Triggers:
     outputs: list[int] = field(default_factory=lambda: [0] * OUTPUTS)
     edges: list[Edge] = field(default_factory=list)
     queue: list[tuple[float, int, str]] = field(default_factory=list)
-    """Commands for later, the next one first."""
+    """Scheduled commands, the next one first."""
     serial: int = 0
     depth: int = 0
 
-    # what a host sets up
+    # set by the host
 
     def configure(self, number: int, words: Sequence[str]) -> None:
-        """`when` with its condition; the trigger is disabled by it."""
+        """Set the condition of `when`; this disables the trigger."""
         condition = condition_of(words)
         trigger = self.triggers[number]
         trigger.condition, trigger.text, trigger.left, trigger.total = condition, " ".join(words), 0, 0
@@ -103,7 +103,7 @@ class Triggers:
         self.triggers[number].actions["ab".index(letter)] = text
 
     def enable(self, number: int, count: int, position: float) -> None:
-        """Begin; `count` 0 is without end."""
+        """Enable the trigger; `count` 0 is without end."""
         trigger = self.triggers[number]
         if trigger.condition is None:
             raise Rejected("BADDATA")
@@ -119,7 +119,7 @@ class Triggers:
     # time
 
     def advance(self, to: float) -> None:
-        """Let everything happen that happens by the time `to`."""
+        """Process all events up to the time `to`."""
         while (event := self._next()) is not None and event[0] <= to:
             time, position, trigger = event
             self.now = max(self.now, time)
@@ -165,7 +165,7 @@ class Triggers:
                 self.disable(int(number) - 1)
 
     def _known(self, words: list[str]) -> bool:
-        """An action that this stand-in can do: outputs and other triggers."""
+        """An action that this simulation knows: outputs and other triggers."""
         match words:
             case ["0", *rest] if rest and not rest[0].isdigit():
                 return self._known(rest)
@@ -196,7 +196,7 @@ class Triggers:
         self.depth -= 1
 
     def _next(self) -> tuple[float, float, Trigger | None] | None:
-        """(time, position, trigger) of the next event; no trigger where it is a command for later."""
+        """(time, position, trigger) of the next event; without a trigger for a scheduled command."""
         found: list[tuple[float, float, Trigger | None]] = []
         if self.queue:
             found.append((self.queue[0][0], self.move.position(self.queue[0][0]), None))
@@ -242,7 +242,7 @@ def is_output(channel: str, value: str, schedule: Sequence[str]) -> bool:
 
 
 def condition_of(words: Sequence[str]) -> Condition:
-    """What `when` says: a distance, or >= or <= of the position, as commanded or by the encoder, which are the same."""
+    """The condition of `when`: a distance, or >= or <= of the position; commanded and encoder position are equal."""
     try:
         match list(words):
             case [("0" | "1"), "dist", step] | [("0" | "1"), "encoder", "dist", step] if int(step) > 0:

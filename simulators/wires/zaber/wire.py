@@ -1,7 +1,7 @@
 """Simulated Zaber rotary stage on its wire: ASCII packets in, replies and alerts out, and faults on request.
 
 One device with one rotary axis that turns the sample; one of its digital outputs is cabled to the camera. Behaviour
-from what the vendor's own library sends and accepts; where that tells nothing, as said in the modules behind.
+follows the vendor's own library. Other modules of this folder say where it is from memory.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from simulators.wires.zaber.triggers import OUTPUTS
 
 
 class Fault(StrEnum):
-    """What can happen to a reply on its way."""
+    """A fault of a reply on its way."""
 
     SILENT = "silent"
     WRONG_CHECKSUM = "wrong checksum"
@@ -41,7 +41,7 @@ class ZaberBuild:
         address: of the device in the chain.
         faults: reply (from 0, since power-on) -> what happens to it.
         echo: the line sends the host its own bytes back.
-        device: what stands behind the wire.
+        device: the device behind the wire.
     """
 
     address: int = 1
@@ -73,7 +73,7 @@ class ZaberController:
     """Bytes in by `receive`, bytes out by `transmit`. Safe from several threads.
 
     Args:
-        line: what the build's digital output is wired to; it also learns the sample's true angle.
+        line: the cable in the build's digital output; it also learns the sample's true angle.
     """
 
     def __init__(self, clock: Clock, line: TriggerLine, build: ZaberBuild) -> None:
@@ -98,7 +98,7 @@ class ZaberController:
                     self._answer(command, packet.reason if isinstance(packet, Malformed) else "")
 
     def transmit(self) -> bytes:
-        """Bytes for the host that were not taken yet."""
+        """Bytes for the host that are not yet taken."""
         with self._lock:
             self._settle()
             out = bytes(self._out)
@@ -110,7 +110,7 @@ class ZaberController:
         return 1 <= number <= len(outputs) and bool(outputs[number - 1])
 
     def alert(self) -> None:
-        """Send an alert that nobody asked for."""
+        """Send an alert without a command."""
         self._out += frame(f"!{self._address:02d} 1 {self._state()}", self.device.checksums)
 
     def _settle(self) -> None:

@@ -102,7 +102,7 @@ def test_a_frame_comes_as_numbers(page: Served) -> None:
 
 
 @pytest.mark.parametrize("query", ["region=x", "region=1,2", "region=-1,2,3,4", "region=9999999999,1,1,1"])
-def test_a_region_that_is_none_is_the_whole_frame(page: Served, query: str) -> None:
+def test_an_invalid_region_means_the_whole_frame(page: Served, query: str) -> None:
     assert tile(page.ask(f"/api/frame/10?{query}")[2])[0]["region"] == [0, 4, 0, 40]
 
 
@@ -148,6 +148,6 @@ def test_a_taken_port_gives_way_to_the_next(tmp_path: Path) -> None:
         assert first.getsockname()[1] < second.getsockname()[1] <= first.getsockname()[1] + 9
 
 
-def test_an_address_that_is_none_is_refused() -> None:
+def test_an_invalid_address_is_refused() -> None:
     with pytest.raises(ConfigError, match="expected an IP address"):
         open_port("somewhere", 0)

@@ -227,7 +227,7 @@ def test_of_several_methods_the_one_that_predicts_unseen_views_best_gets_the_res
         assert all(n >= tried for _, n in final)
 
 
-def test_a_scan_of_few_rows_and_a_trial_that_takes_too_long_leave_what_other_scans_say(
+def test_without_a_trial_the_curves_of_other_scans_decide(
     prepared: PreparedProjections, high: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _as_fast_as(monkeypatch, 0.5, 1e6, 1.0, 1e6, 1.0)

@@ -80,7 +80,7 @@ def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, D
 
 
 @pytest.mark.usefixtures("sweeps")
-def test_a_fit_gets_what_reading_before_it_and_measuring_and_writing_after_it_leave() -> None:
+def test_a_fit_gets_the_time_that_reading_measuring_and_writing_leave() -> None:
     left, deadline, said = _within(100.0, spent=20.0)
     measuring = SWEEP / 2 * 16 / VIEWS.n_views  # of sixteen views there, not back
     assert left + 20 + measuring + deadline.after == pytest.approx(100)

@@ -57,7 +57,7 @@ def test_voxels_and_places_are_those_of_the_whole_volume(method: tuple[str, ...]
 
 
 @pytest.mark.usefixtures("folder")
-def test_fbp_of_a_region_reports_what_it_can_know() -> None:
+def test_fbp_of_a_region_reports_no_residual() -> None:
     """A part of the volume cannot be compared with the views."""
     record = made("-m", "fbp", "--roi", "38:60,10:40,4:29", "-o", "part.h5")
     assert "residual" not in record.metrics and "snr" in record.metrics

@@ -83,7 +83,7 @@ def test_more_groups_than_any_scan_has(
         open_hdf5(path)
 
 
-def test_a_dataset_that_claims_what_no_file_holds(tmp_path: Path) -> None:
+def test_a_dataset_that_claims_an_impossible_size(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file.create_dataset("real", data=np.zeros(1000))
         file.create_dataset("claimed", (2**40, 2, 2), "f8", chunks=(64, 2, 2))

@@ -237,7 +237,7 @@ def test_what_a_model_does_not_have_is_not_missed(world: World, absent: int) -> 
         np.testing.assert_array_equal(camera.next_frame(1.0).counts, world.pattern(0))
 
 
-def test_a_library_that_does_not_tell_what_frames_carry_is_none_the_less_described(world: World) -> None:
+def test_a_library_without_capabilities_of_stamps_is_still_described(world: World) -> None:
     with connected(world) as camera:
         world.fail("dcamdev_getcapability", Error.NOTSUPPORT)
         assert camera.describe()["capabilities"] == "not reported"

@@ -24,7 +24,7 @@ def test_settings_come_back_as_the_camera_has_them(camera: DcamCamera) -> None:
     assert camera.timing.shape == (48, 72)
 
 
-def test_exposure_is_what_the_camera_rounded_it_to(camera: DcamCamera) -> None:
+def test_exposure_is_the_value_that_the_camera_accepted(camera: DcamCamera) -> None:
     """Steps of 10 ns, upwards."""
     accepted = camera.configure(replace(EXTERNAL, exposure=0.0010000123))
     assert accepted.exposure == pytest.approx(0.00100002, abs=1e-12)

@@ -63,7 +63,7 @@ def test_the_suite_passes_under_sanitisers(environment: dict[str, str]) -> None:
     assert passed is not None and int(passed[1]) > 120
 
 
-def test_the_sanitiser_sees_what_it_should(environment: dict[str, str]) -> None:
+def test_the_sanitiser_reports_an_overflow(environment: dict[str, str]) -> None:
     """That the suite passes means something only if an overflow does not."""
     ran = _run(environment, "-c", OVERFLOW, environment[READY_MADE])
     assert ran.returncode != 0

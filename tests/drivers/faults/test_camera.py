@@ -182,7 +182,7 @@ def test_triggers_too_fast(rig: Rig, tmp_path: Path) -> None:
     assert_next_scan_works(rig, tmp_path)
 
 
-def test_triggers_of_which_the_camera_says_that_they_are_too_fast(rig: Rig, tmp_path: Path) -> None:
+def test_triggers_that_the_camera_reports_as_too_fast(rig: Rig, tmp_path: Path) -> None:
     rig.at_frame[table.FIRST_VIEW] = lambda: rig.world.fail("dcamwait_start", Error.TOOFREQUENTTRIGGER)
     scanned = rig.scan(tmp_path)
     assert_complete(scanned)  # nothing was lost, but somebody should know

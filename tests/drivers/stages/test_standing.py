@@ -15,7 +15,7 @@ from simulators.devices.clock import VirtualClock
 
 
 @given(polls=st.integers(-10, 100), part=st.floats(0.01, 0.99), timeout=st.floats(-1, 1))
-def test_the_last_look_is_the_first_of_a_standing_stage_or_that_of_the_deadline(
+def test_the_last_status_is_the_first_of_a_standing_stage_or_at_the_deadline(
     polls: int, part: float, timeout: float
 ) -> None:
     """Looks fall on every POLL and on the deadline; where there is no time left, there is one all the same. The move

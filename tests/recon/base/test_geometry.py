@@ -163,7 +163,7 @@ def test_the_field_holds_every_ray_and_no_more(
     assert top - bottom < np.ptp(z) + voxel + slack and top + bottom == pytest.approx(z.min() + z.max(), abs=slack)
 
 
-def test_shifts_that_all_views_share_are_an_axis_elsewhere() -> None:
+def test_shifts_common_to_all_views_equal_a_moved_axis() -> None:
     angles = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     moved = Geometry.parallel(angles, (10, 32), axis_col=29.5, axis_row=14.5)
     shifted = Geometry.parallel(angles, (10, 32), shifts=np.tile([14.0, 10.0], (48, 1)))

@@ -68,7 +68,7 @@ def test_what_cannot_be_filled_is_refused(data: np.ndarray, weight: np.ndarray |
 
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(0, 0.99), st.integers(0, 1000))
-def test_what_is_filled_lies_between_what_is_known(rows: int, cols: int, share: float, seed: int) -> None:
+def test_filled_values_lie_between_known_ones(rows: int, cols: int, share: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     data = rng.normal(size=(1, rows, cols)).astype(np.float32)
     data[0][rng.random((rows, cols)) < share] = np.nan

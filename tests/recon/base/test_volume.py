@@ -31,7 +31,7 @@ def _fitted(data: np.ndarray, views: Geometry, grid: Grid | None = None) -> Reco
     return reconstruct(data, views, R2(steps=60, gaussians=600, finish=0), grid=grid)
 
 
-def test_a_shift_of_all_views_is_fitted_as_an_axis_elsewhere() -> None:
+def test_a_shift_of_all_views_is_fitted_like_a_moved_axis() -> None:
     # A detector beside the axis sees one half of the sample at a time.
     moved = Geometry.parallel(TURN, (10, 32), axis_col=29.5)
     shifted = Geometry.parallel(TURN, (10, 32), shifts=np.tile([14.0, 0.0], (48, 1)))

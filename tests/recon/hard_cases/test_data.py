@@ -159,7 +159,7 @@ def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_
     assert psnr(truth, found) > psnr(truth, expected) - 0.5
 
 
-def test_views_of_nothing_else_are_no_reason_to_fill_the_others(clean: F32) -> None:
+def test_views_with_only_wild_pixels_do_not_cause_filling_in_others(clean: F32) -> None:
     # Most views before the sample was there: what the few others show is not wild.
     late = np.concatenate((np.full((24, *SHAPE), 1e-5, np.float32), clean[24:]))
     np.testing.assert_array_equal(without_wild_pixels(late), late)

@@ -67,7 +67,7 @@ def test_a_needle_thinner_than_a_pixel_is_as_exact_as_its_position(beam: str, as
     assert found.worst < gradient_bound(FAR, thin / PITCH), found.gradients
 
 
-def test_naive_gradients_of_a_needle_lose_what_its_own_directions_keep() -> None:
+def test_gradients_of_a_needle_are_accurate_only_in_its_own_directions() -> None:
     # The gradient on the logarithm of a width, in float32, of slanted needles 0.05 px wide and longer than the image:
     # from ∂Σ₂ = 1/2 W K M₂ K with moments of δ, and from those of (τ, δv). The former is a small difference of numbers
     # aspect² as large, with the aspect that the image shows of it.

@@ -35,7 +35,7 @@ def test_the_elbow_is_at_the_number_of_materials(rng: np.random.Generator, k: in
     assert found.shares == pytest.approx(np.full(k, 1 / k), abs=0.01)
 
 
-def test_the_elbow_is_where_more_clusters_gain_no_more() -> None:
+def test_the_elbow_is_where_further_clusters_gain_little() -> None:
     assert elbow(np.array([1.0, 0.5, 0.1, 0.08, 0.06, 0.04])) == 3
     assert elbow(np.array([1.0, 0.0])) == elbow(np.array([1.0, 0.1, 0.08])) == 2
     assert clusters(np.array([0.0, 1.0, 1.0, 0.0])).centres.tolist() == [0.0, 1.0]

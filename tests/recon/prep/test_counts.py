@@ -196,7 +196,7 @@ def test_photon_transfer_finds_gain_and_dark_noise() -> None:
     assert variance == pytest.approx(16, rel=0.1)
 
 
-def test_photon_transfer_refuses_what_tells_no_gain() -> None:
+def test_photon_transfer_refuses_frames_without_a_gain() -> None:
     with pytest.raises(ValueError, match="two frames or more"):
         photon_transfer(np.ones((1, 4, 4)))
     with pytest.raises(ValueError, match="give the gain"):

@@ -95,7 +95,7 @@ def test_the_wavelets_are_orthogonal() -> None:
         np.testing.assert_allclose(_synthesised(low, high, axis), values, atol=1e-10)
 
 
-def test_auto_removes_what_it_sees_and_says_so(clean: F32, gains: F32) -> None:
+def test_auto_removes_detected_stripes_and_reports_it(clean: F32, gains: F32) -> None:
     shuffled = np.random.default_rng(7).permutation(len(ANGLES))  # views in any order
     for views, said in ((clean, "none seen"), (clean + gains, "removed by")):
         stack = np.repeat(views[shuffled, None], 2, axis=1)

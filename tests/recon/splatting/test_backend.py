@@ -117,7 +117,7 @@ def test_a_box_leaves_positions_alone_where_asked(random_gaussians: Make, rng: n
         np.testing.assert_array_equal(with_means, without)
 
 
-def test_bounds_hold_after_an_update_and_none_is_none(rng: np.random.Generator) -> None:
+def test_bounds_hold_after_an_update_and_none_means_unbounded(rng: np.random.Generator) -> None:
     p = [rng.normal(size=(40, width)).astype(np.float32) for width in (3, 3, 4, 1)]
     slopes = [rng.normal(size=a.shape).astype(np.float32) for a in p]
     free = [a.copy() for a in p]

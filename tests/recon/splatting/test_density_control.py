@@ -67,7 +67,7 @@ def test_pruning_takes_the_faint_and_the_lost() -> None:
 
 @settings(max_examples=30)
 @given(seed=st.integers(0, 1000), wide=st.floats(0.05, 5))
-def test_what_goes_has_next_to_nothing_in_the_box_and_what_reaches_in_stays(seed: int, wide: float) -> None:
+def test_removed_gaussians_hardly_reach_into_the_box_and_others_stay(seed: int, wide: float) -> None:
     rng = np.random.default_rng(seed)
     n = 40
     g = Gaussians.from_physical(

@@ -191,7 +191,7 @@ def test_where_voxels_cannot_explain_the_views_the_fit_is_not_spoiled() -> None:
     assert psnr(volume.data, found) > psnr(volume.data, raw) + 3
 
 
-def test_single_rays_gone_wild_do_not_spoil_what_the_fit_withstood() -> None:
+def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
     g = _blob(8.0)
     data = project(g, VIEWS).numpy() + 0.1 * Projector(VIEWS, GRID).forward(_box())
     wild = data.copy()

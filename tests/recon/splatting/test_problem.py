@@ -177,7 +177,7 @@ def test_binned_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> No
     assert joined.weights == (None, None, None)
 
 
-def test_a_view_of_nothing_else_is_refused_with_the_range(rng: np.random.Generator) -> None:
+def test_a_view_with_only_wild_values_is_refused_with_the_range(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     data[1] = 1e8
     with pytest.raises(ValueError, match=r"1 of 3 views.*within ±4\.5e\+06.*\[1\]"):

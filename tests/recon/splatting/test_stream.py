@@ -288,7 +288,7 @@ def test_a_setting_that_would_do_nothing_is_refused() -> None:
         StreamingFit(VIEWS, GRID, settings=FitSettings(coarse=2))
 
 
-def test_one_wild_pixel_does_not_spoil_what_has_come_or_comes(data: np.ndarray, phantom: Phantom) -> None:
+def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(data: np.ndarray, phantom: Phantom) -> None:
     truth, qualities = phantom.attenuation(GRID), []
     for marred in (None, 3, 30):  # among the first views, and after the model has been placed
         views = data.copy()

@@ -119,7 +119,7 @@ def test_gridding_of_a_real_scan(monkeypatch: pytest.MonkeyPatch, shared_data: P
 
 
 @pytest.mark.parametrize("gridded", [False, True])
-def test_a_block_alone_is_what_it_is_in_the_volume_to_the_bit(
+def test_a_single_block_equals_its_part_of_the_volume_to_the_bit(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, gridded: bool
 ) -> None:
     """From the rows that it needs alone, for views that were moved up and down as well."""

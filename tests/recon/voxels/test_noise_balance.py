@@ -43,7 +43,7 @@ def _grains() -> tuple[F32, F32]:
     return volume.reshape(12, 2, 64, 2, 64, 2).mean(axis=(1, 3, 5)), data.astype(np.float32)
 
 
-def test_it_rises_by_the_cube_of_what_the_residual_lacks() -> None:
+def test_it_rises_by_the_cube_of_the_missing_noise_in_the_residual() -> None:
     balance = NoiseBalance(first=2.0, noise=1.0)
     assert balance.value == 2.0
     balance.after_sweep(_residual(0.8))

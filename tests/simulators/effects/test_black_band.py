@@ -22,7 +22,7 @@ def test_the_light_falls_off_as_a_ramp_to_the_share_that_is_left() -> None:
 
 
 @given(width=st.floats(0.001, 1.5), penumbra=st.floats(0.0, 0.5), share=st.floats(0.0, 0.9))
-def test_the_region_is_what_it_darkens(width: float, penumbra: float, share: float) -> None:
+def test_the_region_covers_the_darkened_pixels(width: float, penumbra: float, share: float) -> None:
     band = {"kind": "black_band", "width": width, "penumbra": penumbra, "share": share}
     anomalies.check_regions(band, shots.shot(sample=False))
 

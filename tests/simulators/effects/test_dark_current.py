@@ -25,7 +25,7 @@ def test_either_way_has_one_distribution() -> None:
         chance.poisson_like(dark, rate)
 
 
-def test_it_adds_to_what_is_there_anew_in_each_frame() -> None:
+def test_it_adds_new_electrons_to_each_frame() -> None:
     one, other = (DarkCurrent(5.0).apply(np.full((60, 80), 10.5), shots.shot(frame=k)) for k in (1, 2))
     assert set(np.unique(one)) <= {10.5, 11.5, 12.5}
     assert (one != other).any()

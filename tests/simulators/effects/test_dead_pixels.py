@@ -27,7 +27,7 @@ def test_they_move_with_the_region_and_are_not_the_hot_ones() -> None:
     assert ((dead == 0) & (hot > 0)).sum() <= 3  # 0.5 expected
 
 
-def test_a_binned_pixel_loses_the_share_of_its_dead_ones() -> None:
+def test_a_binned_pixel_loses_the_share_of_its_dead_pixels() -> None:
     dead = DeadPixels(0.1).apply(np.ones((60, 80)), shots.shot())
     shot = shots.shot(detector=shots.sized(30, 40).detector, binning=2)
     for charge in (0.0, 3.0):

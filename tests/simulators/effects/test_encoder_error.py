@@ -19,7 +19,7 @@ def test_the_sample_stands_at_the_angle_of_its_waves() -> None:
     np.testing.assert_allclose(1e3 * np.degrees(turned - angles), error, atol=1e-9)
 
 
-def test_a_frame_is_that_of_the_other_angle() -> None:
+def test_a_frame_equals_the_frame_at_the_true_angle() -> None:
     scene = shots.scene({"kind": "encoder_error", "harmonics": [[2, 500.0, 0.0]]})
     angle = 0.4 + math.radians(0.5 * math.cos(0.8))
     np.testing.assert_array_equal(shots.frame(scene), shots.frame(shots.scene(), shots.shot(angle=angle)))

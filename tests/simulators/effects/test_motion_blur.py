@@ -41,7 +41,7 @@ def test_motion_blur_is_the_mean_transmission_over_the_exposure() -> None:
 
 
 @given(radians=st.floats(-0.5, 0.5), tolerance=st.floats(0.1, 3.0), most=st.integers(2, 40))
-def test_moments_are_as_many_as_the_arc_needs_and_no_more(radians: float, tolerance: float, most: int) -> None:
+def test_the_number_of_moments_follows_the_length_of_the_arc(radians: float, tolerance: float, most: int) -> None:
     blur = MotionBlur(tolerance, most)
     n = blur.samples(shots.shot(angle_at=_turning(radians)))
     arc = abs(radians) * RADIUS_PX

@@ -90,7 +90,7 @@ def test_what_stays_is_drawn_for_the_effect_and_its_own_seed_alone(name: str) ->
 
 
 @pytest.mark.parametrize(("first", "second"), list(combinations(ADDITIVE, 2)))
-def test_what_two_effects_add_is_what_each_adds_alone(first: str, second: str) -> None:
+def test_contributions_of_two_effects_add_up(first: str, second: str) -> None:
     shot = on_demand.shot(2)
 
     def added(*names: str) -> np.ndarray:

@@ -49,7 +49,7 @@ def test_the_mean_is_the_integral_of_the_current_itself(ring: RingCurrent) -> No
 
 @pytest.mark.parametrize("ring", RINGS.values(), ids=RINGS)
 @given(start=st.floats(0, 1e4), first=st.floats(1e-3, 100), second=st.floats(1e-3, 100))
-def test_exposures_that_follow_one_another_collect_what_one_would(
+def test_consecutive_exposures_collect_the_light_of_one_long_exposure(
     ring: RingCurrent, start: float, first: float, second: float
 ) -> None:
     apart = first * ring.mean(start, first) + second * ring.mean(start + first, second)

@@ -23,7 +23,7 @@ def test_one_wave_a_turn_is_a_sample_that_stands_beside_the_axis() -> None:
     np.testing.assert_allclose(wandering, seen(Pose.turned(ANGLES, 9), beside), atol=1e-14)
 
 
-def test_no_wave_is_an_axis_elsewhere_and_others_are_their_cosines() -> None:
+def test_zero_waves_shift_the_axis_and_others_are_cosines() -> None:
     there, here = (
         seen(posed(Runout(((0, 3.0, 0.0), (3, 2.0, 10.0)), ((2, 5.0, -40.0),)), ANGLES, rows=9), POINT),
         seen(Pose.turned(ANGLES, 9), POINT),

@@ -103,7 +103,7 @@ def test_impossible_materials_are_refused(
         Material("it", density, ((13, 1.0),), charge, shift)
 
 
-def test_what_is_no_formula_and_what_is_not_tabulated_is_refused() -> None:
+def test_unknown_formulas_and_untabulated_energies_are_refused() -> None:
     with pytest.raises(ValueError, match="unknown symbol Xx"):
         of_formula("it", "Xx2O", 1.0)
     with pytest.raises(ValueError, match=r"from 0.1 to 800 keV; got 8 ... 900 keV"):

@@ -19,7 +19,7 @@ DENSITIES = {
 
 
 @pytest.mark.parametrize(("name", "density"), DENSITIES.items(), ids=DENSITIES)
-def test_a_material_needs_no_more_than_its_name(name: str, density: float) -> None:
+def test_a_known_material_needs_only_its_name(name: str, density: float) -> None:
     material = palette_of("materials", None)(name)
     assert material.name == name
     assert material.density == pytest.approx(density, rel=0.01)

@@ -43,7 +43,7 @@ def test_harmonics_take_their_share_of_the_light() -> None:
     np.testing.assert_allclose(spectrum.weights, [0.988, 0.01, 0.002], rtol=1e-12)
 
 
-def test_a_table_is_taken_as_it_is_less_what_has_no_weight() -> None:
+def test_a_table_is_used_unchanged_without_energies_of_zero_weight() -> None:
     spectrum = _light(Beam(1.0, spectrum=((20.0, 1.0), (25.0, 0.0), (30.0, 3.0))))
     assert (spectrum.energies.tolist(), spectrum.weights.tolist()) == ([20.0, 30.0], [0.25, 0.75])
 
@@ -62,7 +62,7 @@ def test_a_pink_beam_has_the_nodes_that_its_sample_needs(material: Attenuation, 
     assert spectrum.energies.size <= most
 
 
-def test_a_long_table_is_kept_to_what_its_sample_needs() -> None:
+def test_a_long_table_is_reduced_to_the_energies_that_the_sample_needs() -> None:
     energies = np.linspace(10, 60, 400)
     table = tuple(zip(energies.tolist(), (1 + np.sin(energies / 7)).tolist(), strict=True))
     spectrum = _light(Beam(1.0, spectrum=table), thickness=5.0)

@@ -86,7 +86,7 @@ def test_scenes_that_come_with_the_package_load(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_every_effect_of_the_catalogue_is_what_it_says(name: str) -> None:
+def test_every_effect_of_the_catalogue_matches_its_entry(name: str) -> None:
     effect = load_effect(name)
     assert (effect.name, effect.domain) == (name, CATALOGUE[name].domain)
     assert effect.__module__ == f"simulators.effects.{name}"

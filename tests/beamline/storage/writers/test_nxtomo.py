@@ -271,7 +271,7 @@ def test_rows_only_grow(tmp_path: Path, frames: list[Frame]) -> None:
         assert {file[path].shape[0] for path in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {3}
 
 
-def test_a_disk_that_takes_no_more_is_named_and_the_rows_before_stay(
+def test_a_full_disk_is_named_and_earlier_rows_stay(
     tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)

@@ -25,7 +25,7 @@ def shift_positions(rig: Rig, counts: int) -> None:
 
 
 @pytest.mark.parametrize("beside", [3, -7])
-def test_relative_moves_do_not_add_up_what_the_servo_is_beside_its_target(beside: int) -> None:
+def test_relative_moves_do_not_accumulate_deviations_of_the_servo(beside: int) -> None:
     rig = Rig()
     stage = rig.open()
     stage.start_move(0.0, math.radians(30))

@@ -196,7 +196,7 @@ def test_other_outputs_can_be_switched_and_that_of_the_pulses_cannot(rig: Rig) -
         (Fault.OTHER_ID, "does not have the form.*reply to message"),
     ],
 )
-def test_a_reply_that_is_none_is_named_and_the_next_request_is_in_step_again(fault: Fault, words: str) -> None:
+def test_an_unreadable_reply_is_named_and_the_next_request_is_in_step_again(fault: Fault, words: str) -> None:
     rig = Rig(faults={REPLIES_TO_OPEN: fault})
     stage = rig.open()
     with pytest.raises(DeviceError, match=words):

@@ -195,7 +195,7 @@ def test_a_workspace_serves_again_and_changes_nothing(rng: np.random.Generator) 
     np.testing.assert_array_equal(moments(table, np.asfortranarray(g)), room)
 
 
-def test_nothing_and_what_misses_the_image_leave_zeros() -> None:
+def test_no_gaussians_or_gaussians_beside_the_image_leave_zeros() -> None:
     shape = (8, 24)
     assert not _image(np.empty((0, 8), np.float32), shape).any()
     away = _table(np.array([[-50.0, 3.0], [3.0, 90.0]]), *(np.ones(2) for _ in range(4)))

@@ -9,7 +9,7 @@ from recon.kernels.cpu.vectors import add_product, combine, dot, replace_by_resi
 
 
 @pytest.mark.parametrize("n", [1, 5, 100_001])
-def test_they_are_what_numpy_gives(n: int, rng: np.random.Generator) -> None:
+def test_results_equal_those_of_numpy(n: int, rng: np.random.Generator) -> None:
     a, b, w = (rng.normal(size=n).astype(np.float32) for _ in range(3))
     wide = [v.astype(np.float64) for v in (a, b, w)]
     assert dot(a, b) == pytest.approx(float(wide[0] @ wide[1]), rel=1e-6, abs=1e-6 * n)

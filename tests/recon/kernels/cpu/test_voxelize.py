@@ -116,7 +116,7 @@ def test_needles_discs_and_dots_keep_their_digits(
     np.testing.assert_allclose(layout.fill(), expected, atol=3e-5)
 
 
-def test_only_what_meets_the_box_is_placed(rng: np.random.Generator) -> None:
+def test_only_gaussians_that_meet_the_box_are_placed(rng: np.random.Generator) -> None:
     # More than one task of the search, most of it outside, in the order of the model.
     model, _ = _model(rng, 3000, 0.3, 0.6)
     model[0][:] = rng.uniform(-100, 100, (3000, 3))

@@ -35,7 +35,7 @@ def _agrees(name: str, pose: Pose, detector: Detector) -> None:
 @pytest.mark.parametrize("name", SOLIDS)
 @settings(max_examples=4, deadline=None)
 @given(angle=st.floats(-7.0, 7.0), tilt=st.tuples(small, small) | st.none(), shift=st.tuples(near, near, near))
-def test_chords_are_what_a_search_finds_whatever_the_pose(
+def test_chords_agree_with_a_numerical_search_in_any_pose(
     name: str, sod: float, angle: float, tilt: tuple[float, float] | None, shift: tuple[float, float, float]
 ) -> None:
     pose = Pose.turned(angle, 6).shifted_by(shift)
@@ -147,7 +147,7 @@ def test_a_needle_across_the_frame(thin: float) -> None:
     np.testing.assert_allclose(seen, [thin * math.sqrt(3), 0.0], rtol=1e-12 + (2e-16 / thin) ** 2)
 
 
-def test_where_a_shadow_is_no_number_there_is_none() -> None:
+def test_a_body_with_a_nan_shadow_covers_no_column() -> None:
     """Before, first and last column were whole numbers far outside of the frame."""
     assert columns(np.arange(5.0), 1.0, 1.0, 2.0) == (1, 3)
     for low, high in ((math.nan, 2.0), (1.0, math.nan), (2.0, 1.0)):

@@ -58,7 +58,7 @@ def test_truth_and_labels_of_tall_voxels() -> None:
 
 
 @pytest.mark.parametrize("name", SOLIDS)
-def test_labels_are_what_is_at_the_centre(name: str) -> None:
+def test_a_label_names_the_solid_at_the_voxels_centre(name: str) -> None:
     grid = Grid((40, 44, 48), 0.021, centre=(0.02, -0.03, 0.04))
     labels = Phantom.of([SOLIDS[name]]).labels(grid)
     assert labels.dtype == np.uint8
@@ -86,7 +86,7 @@ def test_solids_may_share_a_name() -> None:
 
 def test_names_that_do_not_fit_are_refused() -> None:
     ball = Ellipsoid((0.1, 0.1, 0.1), 1.0)
-    with pytest.raises(ValueError, match="3 solids have 2 names; give one name a solid, or none"):
+    with pytest.raises(ValueError, match="3 solids have 2 names; give each solid a name, or none"):
         Phantom.of([ball] * 3, names=["a", "b"])
     Phantom.of([ball] * 255, names=[f"grain {i}" for i in range(255)])
     with pytest.raises(ValueError, match="at most 255 names, got 256; let solids share"):

@@ -28,7 +28,7 @@ def test_the_radius_is_the_widest_shadow(name: str) -> None:
     assert widest - pitch <= phantom.radius <= (1 + loose) * widest
 
 
-def test_the_farthest_of_all_counts_and_none_is_none() -> None:
+def test_the_radius_is_of_the_farthest_solid_and_0_without_solids() -> None:
     can = Cylinder(0.5, 1.0, 1.0)
     assert Phantom.of([can]).radius == 0.5  # not the corner of the box around it
     assert Phantom.of([can, Ellipsoid((0.1, 0.1, 0.1), 1.0, (3.0, 4.0, 0.0))]).radius == pytest.approx(5.1)

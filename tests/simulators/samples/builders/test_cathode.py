@@ -29,7 +29,7 @@ def _of(cathode: Cathode, role: str) -> list[Any]:
     return [piece.solid for piece in cathode.pieces() if piece.role == role]
 
 
-def test_grains_fill_what_is_asked_and_do_not_overlap() -> None:
+def test_grains_reach_the_requested_fill_without_overlap() -> None:
     cathode = Cathode(**SMALL, separator_um=10, collector_um=20)
     found = _of(cathode, "particle")
     room = math.pi * 0.09**2 * (0.15 - 0.03)

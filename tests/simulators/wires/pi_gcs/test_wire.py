@@ -94,7 +94,7 @@ def test_replies_can_be_spoilt_on_their_way() -> None:
         ("CTO 1 3 0 1 1 0.1", 24), ("TRO 1 2", 17), ("MOV 1 " + "1" * 260, 3), ("HLT 1", 10), ("STP", 10), ("\x18", 10),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_in_the_register_once_and_nothing_else_happens(wire: Wire, command: str, code: int) -> None:
+def test_a_wrong_command_only_sets_the_error_register_once(wire: Wire, command: str, code: int) -> None:
     assert wire.complains(command) == code
     assert wire.ask("ERR?") == "0"
     assert wire.raw(b"\x05") == b"0\n"

@@ -75,7 +75,7 @@ def test_a_limit_between_here_and_the_switch_ends_the_search() -> None:
 
 
 @given(st.lists(st.integers(-100_000, 100_000), max_size=5))
-def test_a_preset_changes_what_the_counter_says_and_turns_nothing(presets: list[int]) -> None:
+def test_a_preset_changes_the_counter_without_turning_the_motor(presets: list[int]) -> None:
     wire = Wire()
     turned = 0
     for preset in presets:

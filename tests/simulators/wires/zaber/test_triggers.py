@@ -90,7 +90,7 @@ def test_without_a_count_it_goes_on_until_disabled(wire: Wire) -> None:
     assert wire.counts() == [500, 1000]
 
 
-def test_a_stop_takes_away_what_was_predicted(wire: Wire) -> None:
+def test_a_stop_removes_predicted_pulses(wire: Wire) -> None:
     set_up(wire, "1 dist 500")
     wire.do("move abs 90000")
     wire.clock.sleep(1.0)
@@ -192,7 +192,7 @@ def test_lost_pulses_are_missing_and_no_others() -> None:
     assert wire.counts() == [500, 1500, 2000, 3000, 3500, 4000]
 
 
-def test_what_is_predicted_is_what_happens() -> None:
+def test_predicted_edges_happen() -> None:
     """The copy that looks ahead leaves the triggers as they are."""
     wire = Wire()
     set_up(wire, "1 dist 300", "io set do 1 t", enable="enable 7")
