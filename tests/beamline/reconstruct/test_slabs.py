@@ -95,9 +95,7 @@ def test_no_more_memory_is_taken_than_was_given(tmp_path: Path, monkeypatch: pyt
     ("method", "more", "memory", "near"),
     [
         ("sirt", ["--iterations", "4"], "20M", 1e-6),
-        pytest.param(
-            "fista-tv", ["--iterations", "5", "--tv-weight", "0.002"], "24M", 2e-3, marks=pytest.mark.slow
-        ),
+        pytest.param("fista-tv", ["--iterations", "5", "--tv-weight", "0.002"], "24M", 2e-3, marks=pytest.mark.slow),
     ],
 )
 def test_slabs_of_iterative_methods(tmp_path: Path, method: str, more: list[str], memory: str, near: float) -> None:
