@@ -236,7 +236,9 @@ def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
 
 
 _EVERY_PAIR = {
-    ("auto", None, 0.0), ("auto", 1.3, 2.0), ("none", None, 2.0), ("none", 1.3, 0.0), ("3,3", None, 0.0), ("3,3", 1.3, 2.0),
+    ("auto", None, 0.0), ("auto", 1.3, 2.0),
+    ("none", None, 2.0), ("none", 1.3, 0.0),
+    ("3,3", None, 0.0), ("3,3", 1.3, 2.0),
 }  # fmt: skip
 
 
