@@ -22,7 +22,8 @@ def rest() -> None:
     """The simulated instrument with its monitor, voxel methods, and fits with the other kernel."""
     with tempfile.TemporaryDirectory() as folder:
         few = "scan.angles={scheme: fixed, views: 12, start_deg: 0, span_deg: 18}"
-        main(["scan", "configs/simulated.yaml", "--no-live", "-o", folder, "--set", few], standalone_mode=False)
+        words = ["--no-live", "-o", folder, "--set", few, "--set", "simulation.clock=virtual"]
+        main(["scan", "configs/simulated.yaml", *words], standalone_mode=False)
     for method in (FistaTv(), OsSirtTv(), R2(fit=FitSettings(kernel=Kernel.GAUSSIAN))):
         warm_up(method)
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -22,6 +23,11 @@ settings.register_profile("ci", deadline=None, max_examples=500, print_blob=True
 settings.register_profile("thorough", deadline=None, max_examples=10_000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "few"))
 
+# The suite starts some hundred processes, and rewrites the asserts of 600 files: from bytecode both take half the time.
+# Containers often ask for none.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work."""
@@ -30,6 +36,15 @@ def pytest_configure(config: pytest.Config) -> None:
         import torch  # here, as tests without it start in half the time
 
         torch.set_num_threads(1)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """The tests of a file go to one worker, which alone makes its fixtures and compiles its kernels."""
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False  # by the number of tests, which says nothing of their time
+    return LoadFileScheduling(config, log) if config.option.dist == "load" else None
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import h5py
@@ -27,7 +28,9 @@ SMALL = (
 )
 
 
+@cache
 def small(*overrides: str) -> Config:
+    """A value, read once."""
     return load(config_folder() / "simulated.yaml", [*SMALL, *overrides], environment={})
 
 

@@ -64,7 +64,8 @@ def _add_upright(p: Packed, view: View, out: Reals) -> None:
     """Add upright cylinders in a parallel beam, whose shadow is the same in all rows between their ends."""
     profiles: dict[tuple[int, int], Reals] = {}
     for b in np.flatnonzero(p.kind == CYLINDER):
-        across, _, up = (p.centre[b] - view.origin[0]) @ view.axes[0]
+        middle = p.centre[b] - view.origin[0]
+        across, _, up = (middle[:, None] * view.axes[0]).sum(axis=0)  # to the bit `_dot`; `@` may fuse and round once
         rows = np.flatnonzero(np.abs(view.v - up) <= p.size[b, 1] + 1e-9 * view.pitch)
         if rows.size:
             profile = profiles.setdefault((int(rows[0]), int(rows[-1])), np.zeros(view.u.size))

@@ -134,6 +134,7 @@ def test_early_stopping_says_which_views_it_takes(folder: Path) -> None:
     assert "3 of 30 views are held out to say when to stop" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_measured_scan_from_hdf5_and_from_its_tiffs(folder: Path, shared_data: Path) -> None:
     options = ("-m", "fbp", "--bin", "2", "--no-report")
     scan = shared_data / "diamond_24737_parallel_91x135x160.h5"

@@ -88,6 +88,7 @@ def speck(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
     return 1 - 0.15 * np.exp(-0.5 * ((row - 60) ** 2 + (col - 100) ** 2) / 4.0**2) * (50 <= view < 53)
 
 
+@pytest.mark.slow
 def test_a_view_that_the_volume_does_not_explain_is_flagged_with_its_place(shared_data: Path, tmp_path: Path) -> None:
     """A speck of 15 % that stands still in three views: no check sees it but by the reconstruction."""
     words = ["recon", str(shared_data / DIAMOND), "-m", "fbp", "-o", str(tmp_path / "v.h5"), "--no-report"]

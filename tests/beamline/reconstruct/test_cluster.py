@@ -49,6 +49,7 @@ def two() -> Iterator[Cluster]:
         yield cluster
 
 
+@pytest.mark.slow
 def test_the_work_of_a_lost_worker_is_done_again(two: Cluster, tmp_path: Path) -> None:
     scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 9.0)), shape=(3, 32), axis_col=15.7)
     views = Geometry.parallel(scan.angles, scan.shape, axis_col=scan.axis_col)

@@ -185,6 +185,7 @@ def test_a_partial_volume_in_the_way_of_a_run_without_slabs_stays(folder: Path) 
     assert result.exit_code == 0 and Path("out.partial.h5").read_text() == "of somebody else"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_a_killed_run_is_resumed_to_the_bit(folder: Path) -> None:
     """By SIGKILL, which nothing in the program sees."""

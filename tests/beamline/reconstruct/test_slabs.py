@@ -40,7 +40,13 @@ def volume(*options: str) -> np.ndarray:
 
 @pytest.mark.usefixtures("tall")
 @pytest.mark.parametrize(
-    ("memory", "more"), [("3M", []), ("2M", ["--bin", "2"]), ("3M", ["--rows", "33:181"]), ("3M", ["--air", "none"])]
+    ("memory", "more"),
+    [
+        ("3M", []),
+        ("2M", ["--bin", "2"]),
+        pytest.param("3M", ["--rows", "33:181"], marks=pytest.mark.slow),
+        pytest.param("3M", ["--air", "none"], marks=pytest.mark.slow),
+    ],
 )
 def test_the_volume_is_the_same_to_the_bit(tmp_path: Path, memory: str, more: list[str]) -> None:
     whole = volume(*more, "--memory", "1G", "-o", "whole.h5")
@@ -89,7 +95,7 @@ def test_no_more_memory_is_taken_than_was_given(tmp_path: Path, monkeypatch: pyt
     ("method", "more", "memory", "near"),
     [
         ("sirt", ["--iterations", "4"], "20M", 1e-6),
-        ("fista-tv", ["--iterations", "5", "--tv-weight", "0.002"], "24M", 2e-3),
+        pytest.param("fista-tv", ["--iterations", "5", "--tv-weight", "0.002"], "24M", 2e-3, marks=pytest.mark.slow),
     ],
 )
 def test_slabs_of_iterative_methods(tmp_path: Path, method: str, more: list[str], memory: str, near: float) -> None:
@@ -106,7 +112,10 @@ def test_slabs_of_iterative_methods(tmp_path: Path, method: str, more: list[str]
     assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
 
 
-@pytest.mark.parametrize(("method", "memory", "shape"), [("os-sirt-tv", 44, (320, 96)), ("cgls", 56, (200, 256))])
+@pytest.mark.parametrize(
+    ("method", "memory", "shape"),
+    [("os-sirt-tv", 44, (320, 96)), pytest.param("cgls", 56, (200, 256), marks=pytest.mark.slow)],
+)
 def test_slabs_take_no_more_memory_than_was_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, memory: int, shape: tuple[int, int]
 ) -> None:

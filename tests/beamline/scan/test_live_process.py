@@ -96,13 +96,13 @@ def test_no_view_is_taken_before_it_is_ready_or_the_time_to_wait_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patience: float
 ) -> None:
     monkeypatch.setattr(module, "READY_WITHIN", patience)
+    waits_for = "block_started" if patience else "scan_done"  # which would never come, were the patience not over
     compiles = (
         f"""
 import pathlib, sys, time
 events = pathlib.Path(sys.argv[1]).with_name("events.jsonl")
-while "block_started" not in events.read_text():
+while "{waits_for}" not in events.read_text():
     time.sleep(0.05)
-time.sleep({0 if patience else 100})
 """
         + READY
     )

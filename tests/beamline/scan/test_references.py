@@ -180,6 +180,7 @@ def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Pa
         config_folder() / "simulated.yaml",
         [
             f"simulation.scene={scene}",
+            "simulation.clock=virtual",
             "scan.angles.views=4",
             "scan.mode=step",
             "recon.live=false",

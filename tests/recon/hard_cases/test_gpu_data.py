@@ -21,6 +21,7 @@ from tests.recon.hard_cases.on_gpu import DEVICE, quiet, some
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
 parameters = importlib.import_module("recon.kernels.gpu.parameters")
+pytestmark = pytest.mark.slow  # where the interpreter stands in; tests/recon/kernels/gpu is quick
 
 
 def losses_of(

@@ -20,6 +20,7 @@ from tests.recon.helpers import as_leaves, gradients, in_double
 
 images = importlib.import_module("recon.kernels.gpu.images")
 tiles = importlib.import_module("recon.kernels.gpu.tiles")
+pytestmark = pytest.mark.slow  # where the interpreter stands in; tests/recon/kernels/gpu is quick
 SOURCE = Geometry.cone([0.0], SHAPE, 1.0, 10.0, 20.0)  # the source is at y = -10
 
 

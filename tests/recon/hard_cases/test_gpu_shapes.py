@@ -21,6 +21,7 @@ from tests.recon.helpers import as_leaves, gradients, in_double
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
 voxels = importlib.import_module("recon.kernels.gpu.voxels")
+pytestmark = pytest.mark.slow  # where the interpreter stands in; tests/recon/kernels/gpu is quick
 
 
 @pytest.mark.parametrize(("beam", "aspect"), [("parallel", 1e2), ("parallel", 1e4), ("leaning", 1e4), ("cone", 50.0)])
