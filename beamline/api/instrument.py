@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from beamline.config.load import Config, changed, load, override_of
 from beamline.core.errors import ConfigError, ScanStopped
-from beamline.core.events import Event
+from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
@@ -163,14 +163,14 @@ class Instrument:
         self, config: Config, output: str | Path | None, live: bool, stop: StopRequest,
         on_event: Callable[[Event], None] | None,
     ) -> ScanResult:  # fmt: skip
-        self.last, said = None, dict[str, Mapping[str, Any]]()
+        self.last, said = None, list[ScanDone | ReconDone]()
 
         def remember(event: Event) -> None:
-            if event.event in ("scan_done", "recon_done"):
-                said[event.event] = event.data
+            if isinstance(event, ScanDone | ReconDone):
+                said.append(event)
 
         def tell(event: Event) -> None:
-            if self._tell is not None and event.event != "done" and (text := sentence(event)):
+            if self._tell is not None and not isinstance(event, RunDone) and (text := sentence(event)):
                 self._tell(text)
 
         how = commands_of(config) if live else Commands()
@@ -233,23 +233,23 @@ def _of_devices(config: Config) -> Mapping[str, Any]:
     return {**used, "devices": {**used["devices"], "camera": camera}, "pitch": pitch}
 
 
-def _result(config: Config, said: Mapping[str, Mapping[str, Any]]) -> ScanResult | None:
+def _result(config: Config, said: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
     """The result of a scan by its events; None where it ended before its file was made."""
-    done = said.get("scan_done")
+    done = next((event for event in said if isinstance(event, ScanDone)), None)
     if done is None:
         return None
-    volume = said.get("recon_done", {}).get("output")
+    volume = next((event.data["output"] for event in said if isinstance(event, ReconDone)), None)
     return ScanResult(
-        path=done["path"],
+        path=done.path,
         sample=config.sample.name,
-        frames=done["n_frames"],
-        missing=tuple(done["missing"]),
-        flags=done["flags"],
-        alarms=done["alarmed_frames"],
-        retaken=done["retaken"],
-        reference_faults=tuple(done["reference_faults"]),
-        status=done["status"],
-        seconds=done["seconds"],
-        bytes=done["bytes"],
+        frames=done.n_frames,
+        missing=tuple(done.missing),
+        flags=done.flags,
+        alarms=done.alarmed_frames,
+        retaken=done.retaken,
+        reference_faults=tuple(done.reference_faults),
+        status=done.status,
+        seconds=done.seconds,
+        bytes=done.bytes,
         volume=None if volume is None else Path(volume),
     )

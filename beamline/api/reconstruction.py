@@ -15,7 +15,7 @@ import numpy as np
 from beamline.api.instrument import Tell, to_stderr
 from beamline.api.reading import scan_file
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event
+from beamline.core.events import Event, VolumeDone, Warned
 from beamline.core.narration import sentence
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
@@ -105,17 +105,19 @@ def reconstruct(
             that exists or cannot be written. Nothing is written then.
     """
     place, chosen = scan_file(path), _method(method)
-    done: dict[str, Any] = {}
+    last: list[VolumeDone] = []
     warned: list[str] = []
     settings: dict[str, Any] = {}
     held: list[Volume] = []
 
     def sink(event: Event) -> None:
-        if event.event == "done":
-            done.update(event.data)
-        elif event.event == "warning":
-            warned.append(str(event.data["message"]))
-        if tell is not None and event.event not in ("done", "progress") and (text := sentence(event)):
+        match event:
+            case VolumeDone():
+                last.append(event)
+                return
+            case Warned(message=message):
+                warned.append(message)
+        if tell is not None and (text := sentence(event)):
             tell(text)
 
     def take(record: ReconRecord) -> None:
@@ -135,14 +137,15 @@ def reconstruct(
         command = f"beamline.api.reconstruct({str(place)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         options = ReconOptions(source, target, wanted, chosen, command=command)
         figures = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
+    (done,) = last
     return ReconResult(
-        method=done["method"],
+        method=done.method,
         figures=figures,
         settings=settings,
-        axis_col=done["axis_col"],
-        units=done["units"],
+        axis_col=done.axis_col,
+        units=done.units,
         warnings=tuple(warned),
-        ended_early=bool(done.get("ended_early")),
+        ended_early=bool(done.ended_early),
         output=None if output is None else Path(output),
         report=target.report,
         _held=held[0] if held else None,

@@ -14,7 +14,7 @@ from typing import Self
 
 import click
 
-from beamline.core.events import Event
+from beamline.core.events import Event, RunStarted
 from beamline.core.files import RUNS
 from beamline.core.process import ChildProcess
 
@@ -77,9 +77,9 @@ class PageBeside:
         self._held.close()
 
     def __call__(self, event: Event) -> None:
-        if event.event != "run_started":
+        if not isinstance(event, RunStarted):
             return
-        page = ["watch", str(event.data["folder"]), "--control", "--until-stdin-ends"]
+        page = ["watch", str(event.folder), "--control", "--until-stdin-ends"]
         command = [sys.executable, "-m", "beamline.cli.main", *page]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it

@@ -204,7 +204,7 @@ def _with_monitor(load: Load, folder: Path, n: int, clock: Clock) -> int:
 def _pipeline(load: Load, folder: Path, n: int, clock: Clock) -> int:
     writer = _writer(load, folder, clock)
     monitor = start(load.context, load.checks)
-    recorder = Recorder(writer, monitor, load.timeline(n), preview_bin=load.preview_bin, emit=lambda event, data: None)
+    recorder = Recorder(writer, monitor, load.timeline(n), preview_bin=load.preview_bin, sink=lambda event: None)
     status = "failed"
     try:
         for row in range(n):

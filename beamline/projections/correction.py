@@ -28,7 +28,7 @@ from beamline.projections.steps.defects import Defects
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.flats import Flats
 from beamline.projections.steps.references import ReferenceCheck
-from beamline.projections.steps.step import Done, ViewFilter, ViewStep
+from beamline.projections.steps.step import StepDone, ViewFilter, ViewStep
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
@@ -61,7 +61,7 @@ class ScanCorrection:
         self.rows, self.binning = rows_of(source, selection), selection.binning
         counted = selection.step(CountModel).noise == "counts"
         self._filters: list[ViewFilter] = []
-        self._filtered: dict[str, Done] = {}
+        self._filtered: dict[str, StepDone] = {}
         for step in selection.in_order:
             if isinstance(step, ViewStep):
                 found, self._filtered[step.name] = step.on(source, selection)
@@ -201,16 +201,16 @@ class ScanCorrection:
         return None if part is None else self._filtered_views(part, None)
 
     @property
-    def done(self) -> dict[str, Done]:
+    def done(self) -> dict[str, StepDone]:
         """What each step did, by name."""
         if self._references is None:
-            return {**{name: Done(parameters={}) for name in ("flats", "defects", "noise")}, **self._filtered}
+            return {**{name: StepDone(parameters={}) for name in ("flats", "defects", "noise")}, **self._filtered}
         flats, noise, settings = self._flats, self._noise, asdict(self._settings)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in settings.items()}
         return {
-            "defects": Done(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-            "flats": Done(flats, {"flats": flats or self._selection.step(Flats).fields}),
-            "noise": Done(noise, {"noise": noise or "logarithms of counts"}),
+            "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
+            "flats": StepDone(flats, {"flats": flats or self._selection.step(Flats).fields}),
+            "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
             **self._filtered,
         }
 

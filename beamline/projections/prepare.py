@@ -31,7 +31,7 @@ from beamline.projections.selection import (
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.references import ReferenceCheck
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import Done, ScanStep
+from beamline.projections.steps.step import ScanStep, StepDone
 from beamline.projections.tilt import spread, spread_views, warn_of_tilt, with_tilt
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
@@ -90,7 +90,7 @@ class PreparedProjections:
     measured: NDArray[np.bool_] | None = None
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
-    done: Mapping[str, Done] = field(default_factory=dict)
+    done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
 
     @property

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing, write_whole
+from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import check_axis, cone_of, geometry_of, rows_of
 from beamline.reconstruct.options import ReconOptions
@@ -86,7 +87,7 @@ def try_axes(
     if best in (trials[0], trials[-1]):
         Warnings(sink, clock)(f"The lowest score is at the end of the range, column {best.col:g}: try further.")
     scores = {f"{trial.col:g}": trial.score for trial in trials}
-    sink(Event("done", clock.now(), {"output": str(path), "axis_col": best.col, "scores": scores}))
+    sink(Done({"output": str(path), "axis_col": best.col, "scores": scores}, time=clock.now()))
 
 
 def _circle(shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import Sink, StateEntered
+from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
 from beamline.reconstruct.growing import ScanFollower
@@ -105,14 +106,14 @@ def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTimi
     The state `ready` says that it is there, and where the volume can be watched.
     """
     compiled = compilation_events(sink, clock)
-    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    sink(StateEntered("warming_up", "Compiling the fit's kernels, if need be", time=clock.now()))
     warm_up(on_kernel=compiled)
     picture = options.target.live_picture
     message = (
         f"The live volume is ready for views. To watch it grow, open {picture}: drawn anew about every "
         f"{rhythm.snapshot:g} s, as soon as there are views enough"
     )
-    sink(Event("state", clock.now(), {"state": "ready", "message": message, "picture": picture}))
+    sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 
 
 def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> ScanSource:
@@ -126,7 +127,7 @@ def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming)
             if clock.now() - begin > rhythm.patience:
                 raise DataError(f"No scan began in {options.source.path} within {rhythm.patience:.0f} s.") from error
             if not told:
-                sink(Event("state", clock.now(), {"state": "waiting", "message": f"Waiting for {options.source.path}"}))
+                sink(StateEntered("waiting", f"Waiting for {options.source.path}", time=clock.now()))
                 told = True
             clock.sleep(rhythm.poll)
 

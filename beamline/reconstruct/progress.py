@@ -4,9 +4,8 @@ before."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 
-from beamline.core.events import Event, Sink
+from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 
@@ -34,7 +33,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
             left = (progress.steps - progress.step) / rate
         elif seconds is not None and not progress.steps and not progress.unit:
             left = max(0.0, seconds - spent)
-        sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress), "per_s": rate, "eta_s": left}))
+        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=left, time=clock.now()))
 
     return listen
 
@@ -45,7 +44,7 @@ def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
 
     def compiled(n: int) -> None:
         now = clock.now()
-        sink(Event("progress", now, {"stage": "kernels", "n": n, "seconds": now - begin}))
+        sink(KernelsCompiled("kernels", n, now - begin, time=now))
 
     return compiled
 
@@ -54,4 +53,4 @@ def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> N
     """Say what each correction did to the views; "" is not said."""
     for state, message in messages.items():
         if message:
-            sink(Event("state", clock.now(), {"state": state, "message": message}))
+            sink(StateEntered(state, message, time=clock.now()))

@@ -6,14 +6,14 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink
+from beamline.core.events import Sink, StateEntered, VolumeDone, Warned
 from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
@@ -37,6 +37,7 @@ from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+_ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # settings of an outcome that its event tells
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
 
 
@@ -142,12 +143,12 @@ def write_result(
         metrics[made.method]["unexplained"] = left.share
         hiding = hiding_warning(made, left)
         if hiding:
-            sink(Event("warning", clock.now(), {"message": hiding}))
+            sink(Warned(hiding, time=clock.now()))
             context = replace(context, warnings=[*context.warnings, hiding])
     if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
         left_out.append("the look for views that do not fit the volume")
     elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
-        sink(Event("warning", clock.now(), {"message": odd}))
+        sink(Warned(odd, time=clock.now()))
         context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
     compared = not direct_method and target.report is not None and has_direct_method(prepared.geometry)
@@ -169,12 +170,12 @@ def write_result(
                 break  # it shows no air
             metrics[name]["air"] = beside_fbp.air
             if lost := lost_mass_warning(made, beside_fbp):
-                sink(Event("warning", clock.now(), {"message": lost}))
+                sink(Warned(lost, time=clock.now()))
                 context = replace(context, warnings=[*context.warnings, lost])
     if left_out:
         why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
         remark = f"Left out, as {why}: {', '.join(left_out)}."
-        sink(Event("state", clock.now(), {"state": "left_out", "message": remark}))
+        sink(StateEntered("left_out", remark, time=clock.now()))
         context = replace(context, warnings=[*context.warnings, remark])
     own = metrics[made.method]
     phases.enter("report")
@@ -210,29 +211,28 @@ def write_result(
             remove(page)
         raise
     phases.end()
-    summary: dict[str, Any] = {
-        "output": target.output,
-        "report": target.report,
-        "method": made.method,
-        "axis_col": prepared.axis_col,
-        "n_views": prepared.geometry.n_views,
-        "shape": record.volume.grid.shape,
-        "units": f"1/{prepared.length_unit}",
-        "elapsed": clock.now() - context.started,
-        "times": phases.seconds,
-        **own,
-    }
-    said = ("ended_early", "resumed_from", "checkpoint_lost")
-    summary |= {name: made.settings[name] for name in said if name in made.settings}
-    if hiding:
-        summary["hiding"] = hiding
-    if made.chosen:
-        summary["chosen"] = made.chosen
-    if (further := made.next_decibel) is not None:
-        summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_text}
-    if len(metrics) > 1:
-        summary[BASELINE] = metrics[BASELINE]
-    sink(Event("done", clock.now(), summary))
+    said: dict[str, Any] = {name: made.settings[name] for name in _ENDS if name in made.settings}
+    sink(
+        VolumeDone(
+            output=target.output,
+            report=target.report,
+            method=made.method,
+            axis_col=prepared.axis_col,
+            n_views=prepared.geometry.n_views,
+            shape=record.volume.grid.shape,
+            units=f"1/{prepared.length_unit}",
+            elapsed=clock.now() - context.started,
+            times=phases.seconds,
+            metrics=own,
+            **said,
+            hiding=hiding or None,
+            chosen=made.chosen or None,
+            next_db=made.next_decibel,
+            next_db_said=None if made.next_decibel is None else made.next_decibel_text,
+            fbp=metrics[BASELINE] if len(metrics) > 1 else None,
+            time=clock.now(),
+        )
+    )
     return own
 
 

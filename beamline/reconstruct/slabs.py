@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Sink
+from beamline.core.events import Counted, Sink, StateEntered
 from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
 from beamline.core.text import size
@@ -242,11 +242,10 @@ def prepare_within(
     def told(n: int, total: int) -> None:
         now = clock.now()
         rate = n / max(now - began, 1e-9)
-        data = {"stage": "correction", "n": n, "of": total, "per_s": rate, "eta_s": (total - n) / rate}
-        sink(Event("progress", now, data))
+        sink(Counted("correction", n, total, rate, (total - n) / rate, time=now))
 
     def said(text: str) -> None:
-        sink(Event("state", clock.now(), {"state": "memory", "message": text}))
+        sink(StateEntered("memory", text, time=clock.now()))
 
     memory = memory_of(options)
     spill = spill_of(source, options, told, said)

@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.steps.step import Done, PrepStep, options_of
+from beamline.projections.steps.step import PrepStep, StepDone, options_of
 
 if TYPE_CHECKING:
     from beamline.storage.writers.recon_file import Value
@@ -61,11 +61,11 @@ def key_of(option: str) -> str:
     return option.lstrip("-").replace("-", "_")
 
 
-def recorded(steps: Sequence[PrepStep], done: Mapping[str, Done]) -> dict[str, Value]:
+def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
     """What the file of a volume records of the steps, by name."""
     found: dict[str, Value] = {}
     for step in steps:
-        did = done.get(step.name, Done())
+        did = done.get(step.name, StepDone())
         said = {f"{step.name}_said": did.said} if did.said else {}
         found |= _options(step) | said if did.parameters is None else did.parameters
     return found
