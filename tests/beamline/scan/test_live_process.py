@@ -63,7 +63,7 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     assert words[words.index("--follow") :][:5] == ["--follow", "--earlier", "a.h5", "--earlier", "b.h5"]
 
 
-READY = """print('{"event": "state", "state": "ready"}', flush=True)\n"""
+READY = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""
 
 
 def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
@@ -73,7 +73,8 @@ def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
 def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
     code = """
 import json, pathlib, sys
-print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "n_views": 5}))
+print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "picture": "p", "n_views": 5,
+                  "seconds": 1.0, "unlearnt": None}))
 print("a library's chatter")
 pathlib.Path(sys.argv[2]).write_text("volume")
 print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
