@@ -23,7 +23,7 @@ from beamline.scan.live_process import Commands, commands_of
 from beamline.scan.run import run_scan
 from drivers.manual import Ask
 
-Tell = Callable[[str], None]
+Say = Callable[[str], None]
 
 _OF_A_SCAN = ("roi", "binning", "readout")  # of the camera, which each scan sets anew
 
@@ -86,10 +86,10 @@ class Instrument:
         last: result of the newest scan, also of one that raised; None before the first, and where it took no frame.
     """
 
-    def __init__(self, config: Config, connected: devices.ConnectedDevices, tell: Tell | None = to_stderr) -> None:
+    def __init__(self, config: Config, connected: devices.ConnectedDevices, say: Say | None = to_stderr) -> None:
         self.config = config
         self.last: ScanResult | None = None
-        self._devices, self._tell = connected, tell
+        self._devices, self._say = connected, say
         self._open, self._one_at_a_time = True, threading.Lock()
 
     def __enter__(self) -> Self:
@@ -169,18 +169,18 @@ class Instrument:
             if isinstance(event, ScanDone | ReconDone):
                 said.append(event)
 
-        def tell(event: Event) -> None:
-            if self._tell is not None and not isinstance(event, RunDone) and (text := sentence(event)):
-                self._tell(text)
+        def say(event: Event) -> None:
+            if self._say is not None and not isinstance(event, RunDone) and (text := sentence(event)):
+                self._say(text)
 
         how = commands_of(config) if live else Commands()
-        if how.remark and self._tell is not None:
-            self._tell(how.remark)
+        if how.remark and self._say is not None:
+            self._say(how.remark)
         try:
             with stop_signals(stop):
                 run_scan(
                     config, None if output is None else Path(output),
-                    [remember, tell, *([on_event] if on_event else [])], stop,
+                    [remember, say, *([on_event] if on_event else [])], stop,
                     live=how.live, afterwards=how.afterwards, instrument=self._devices,
                 )  # fmt: skip
         except ScanStopped:
@@ -194,7 +194,7 @@ class Instrument:
 
 def connect(
     config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
-    tell: Tell | None = to_stderr,
+    say: Say | None = to_stderr,
 ) -> Instrument:  # fmt: skip
     """Open every device of a configuration. Nothing moves.
 
@@ -203,25 +203,25 @@ def connect(
         set: values that replace those of the file, such as {"scan.angles.views": 90}.
         ask: puts a request to the operator, where shutter or sample are moved by hand, and returns when it is done;
             None: at the terminal.
-        tell: gets a sentence on what happens, as the commands print it (`print`, a logger's `info`); None: nobody does.
+        say: gets a sentence on what happens, as the commands print it (`print`, a logger's `info`); None: nobody does.
 
     Raises:
         ConfigError: every fault with file, line, key and legal values.
         DeviceError: a device does not answer; those opened before it are closed again.
     """
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
-    return Instrument(read, devices.connect(read, ask=ask), tell)
+    return Instrument(read, devices.connect(read, ask=ask), say)
 
 
 def scan(
     config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
-    tell: Tell | None = to_stderr, **of_scan: Any,
+    say: Say | None = to_stderr, **of_scan: Any,
 ) -> ScanResult:  # fmt: skip
     """Connect, run one scan, and close the devices. Arguments and errors are those of `connect` and `Instrument.scan`.
 
     `set` is for both: it may change what devices are opened with.
     """
-    with connect(config, set=set, ask=ask, tell=tell) as instrument:
+    with connect(config, set=set, ask=ask, say=say) as instrument:
         return instrument.scan(**of_scan)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from beamline.api.instrument import Tell, to_stderr
+from beamline.api.instrument import Say, to_stderr
 from beamline.api.reading import scan_file
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, VolumeDone, Warned
@@ -82,7 +82,7 @@ def reconstruct(
     binning: int | None = None,
     selection: Selection | None = None,
     output: str | Path | None = None,
-    tell: Tell | None = to_stderr,
+    say: Say | None = to_stderr,
 ) -> ReconResult:
     """Reconstruct a finished scan of any format, as `beamline recon` does.
 
@@ -98,7 +98,7 @@ def reconstruct(
             `beamline.projections.steps`; the arguments above go before it.
         output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
             A scan that does not fit into the memory needs one.
-        tell: gets a sentence on what happens; None: nobody does.
+        say: gets a sentence on what happens; None: nobody does.
 
     Raises:
         ConfigError: a method or a selection that cannot be. DataError: no scan, data that give no volume, or an output
@@ -117,8 +117,8 @@ def reconstruct(
                 return
             case Warned(message=message):
                 warned.append(message)
-        if tell is not None and (text := sentence(event)):
-            tell(text)
+        if say is not None and (text := sentence(event)):
+            say(text)
 
     def take(record: ReconRecord) -> None:
         settings.update(record.parameters)

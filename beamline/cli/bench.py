@@ -89,13 +89,13 @@ def acquire(
             click.echo(f"{machine_line(found)}\n{frame}, previews of {work.preview_bin} x {work.preview_bin}\n")
         began = clock.now()
 
-        def said(n: int, of: int, stage: str) -> None:
+        def progress(n: int, of: int, stage: str) -> None:
             per_min = 60 * n / max(clock.now() - began, 1e-9)
             left = (of - n) * 60 / per_min if n else None
             shown = sinks[0] if as_json else terminal
             shown(TrialReached("bench", n, of, stage, left, per_min, time=clock.now()))
 
-        for one in rates(work, folder, clock, seconds, rounds, said):
+        for one in rates(work, folder, clock, seconds, rounds, progress):
             taken.append(one)
         rows = summary(work, taken)
         for row in rows if as_json else ():
@@ -167,20 +167,20 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
     clock = SystemClock()
     with json_events(as_json) as sinks:
 
-        def said(event: Event, text: str) -> None:
+        def show(event: Event, text: str) -> None:
             for sink in sinks:
                 sink(replace(event, time=clock.now()))
             if not sinks:
                 click.echo(text)
 
         found = machine()
-        said(BenchStarted({"machine": found}), machine_line(found) + "\n")
+        show(BenchStarted({"machine": found}), machine_line(found) + "\n")
         click.echo("Compiling kernels that are not in the cache.", err=True)
         warm_up()
         for timing in _timings(gaussians, side):
-            said(BenchDone({**asdict(timing), "ns_per_pair": timing.ns_per_pair}), _line(timing))
+            show(BenchDone({**asdict(timing), "ns_per_pair": timing.ns_per_pair}), _line(timing))
         for row in _rows() if volumes else ():
-            said(BenchDone(row), _volume_line(row))
+            show(BenchDone(row), _volume_line(row))
         for sink in sinks:
             sink(Done({}, time=clock.now()))
 

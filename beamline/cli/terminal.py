@@ -231,7 +231,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
     """A listener that says how far a stage of the work is, a few times a second."""
     began, said = clock.now(), -math.inf
 
-    def listen(n: int, total: int) -> None:
+    def progress(n: int, total: int) -> None:
         nonlocal said
         now = clock.now()
         if now - said < SAY_EVERY and n < total:
@@ -240,7 +240,7 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
         rate = n / max(now - began, 1e-9)
         sink(Counted(stage, n, total, rate, (total - n) / rate, time=now))
 
-    return listen
+    return progress
 
 
 def results(done: VolumeDone) -> str:

@@ -64,11 +64,11 @@ class PageBeside:
     """A sink that serves the page of a run from a process of its own, as long as the context lasts.
 
     Args:
-        tell: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
+        say: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
     """
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self._held = tell, ExitStack()
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._held = say, ExitStack()
 
     def __enter__(self) -> Self:
         return self
@@ -85,12 +85,12 @@ class PageBeside:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
             self._held.enter_context(ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True))
         except OSError as error:
-            self._tell(f"There is no page ({error}). The scan is not affected.")
+            self._say(f"There is no page ({error}). The scan is not affected.")
 
     def _pass_on(self, line: str) -> None:
         what, _, address = line.strip().partition(" ")
         if what in (LOOK, ACT):
-            self._tell(f"Page, to {what}: {address.strip()}")
+            self._say(f"Page, to {what}: {address.strip()}")
 
 
 def _end_with_stdin() -> None:

@@ -32,7 +32,7 @@ class Phases:
         self._name, self._counted, self._said = name, counted, -math.inf
         self._say(0, 0, None, None)
 
-    def told(self, n: int, total: int) -> None:
+    def progress(self, n: int, total: int) -> None:
         """So much of the phase is done; of nothing nothing is said."""
         now = self._clock.now()
         if not n:

@@ -154,12 +154,12 @@ class Spill:
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
         batch: views that are corrected at a time.
-        told: how many of how many frames were read.
+        progress: how many of how many frames were read.
     """
 
     views: NDArray[np.float32]
     batch: int
-    told: Callable[[int, int], None]
+    progress: Callable[[int, int], None]
 
 
 def prepare_projections(
@@ -204,10 +204,10 @@ def prepare_projections(
         else:
             whole = selection.axis_rows
             by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
-            axis_col, axis = _axis_beside_jumps(source, by, usable, warn, phases.told)
+            axis_col, axis = _axis_beside_jumps(source, by, usable, warn, phases.progress)
     check_axis(source, axis_col)
     phases.enter("jumps", "guesses")
-    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col, phases.told)
+    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col, phases.progress)
     if jumps.said:
         warn(jumps.said)
     usable = replace(usable, frames=jumps.frames, left_out=usable.left_out + scan_frames.size - jumps.frames.size)
@@ -219,9 +219,9 @@ def prepare_projections(
         check(jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids))
     phases.enter("correction")
     if spill is None:
-        projections = correction.at_once(scan_frames[chosen], told=phases.told)
+        projections = correction.at_once(scan_frames[chosen], progress=phases.progress)
     else:
-        projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
+        projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.progress)
     phases.enter("background, rings, views held out, hardening")
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     others, held_out = None, None
@@ -279,16 +279,16 @@ def _axis_beside_jumps(
     correction: ScanCorrection,
     usable: UsableViews,
     warn: Warn,
-    told: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
-            found = locate_axis(source, correction, part, lambda _: None, told)
+            found = locate_axis(source, correction, part, lambda _: None, progress)
             if found[1].confident:
                 return found
-    return locate_axis(source, correction, usable.frames, warn, told)
+    return locate_axis(source, correction, usable.frames, warn, progress)
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
@@ -396,7 +396,7 @@ def locate_axis(
     correction: ScanCorrection,
     frames: NDArray[np.int64],
     warn: Warn,
-    told: Callable[[int, int], None] = lambda n, total: None,
+    progress: Callable[[int, int], None] = lambda n, total: None,
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
 
@@ -408,7 +408,7 @@ def locate_axis(
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
     frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
-    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), told)
+    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
     try:
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:

@@ -44,7 +44,7 @@ class AxisRange:
 
 
 def try_axes(
-    options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock, listen: Callable[[int, int], None]
+    options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock, progress: Callable[[int, int], None]
 ) -> None:
     """Reconstruct the middle row chosen by FBP with each axis and write the sheet; the event `done` says the scores.
 
@@ -52,7 +52,7 @@ def try_axes(
     what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
 
     Args:
-        listen: is told the number of axes done, and of all.
+        progress: is told the number of axes done, and of all.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -80,7 +80,7 @@ def try_axes(
             part = image[inside]
             score = -float(np.minimum(part, 0).sum()) / max(float(np.abs(part).sum()), 1e-30)
             trials.append(AxisTrial(col, score, image if i in kept else None))
-            listen(i + 1, columns.size)
+            progress(i + 1, columns.size)
     picture = axis_sheet(trials, f"{source.path.name}, row {first}")
     write_whole(path, picture)
     best = min(trials, key=lambda trial: trial.score)

@@ -300,14 +300,14 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
 
-    def said(text: str) -> None:
+    def say(text: str) -> None:
         job.sink(StateEntered("slab", text, time=job.clock.now()))
 
     with connected(options.cluster) if options.cluster is not None else nullcontext() as cluster:
         workers = None
         if cluster is not None:
             workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
-        result = in_slabs(job.run_on, job.prepared, options, slabs, control, said, job.warn, workers)
+        result = in_slabs(job.run_on, job.prepared, options, slabs, control, say, job.warn, workers)
     return job.outcome(result, job.stop_latch.stopped, _chosen(result))
 
 

@@ -80,13 +80,13 @@ def follow(
     _compile(options, sink, clock, rhythm)
     with _open(options, sink, clock, rhythm) as source:
         growing = ScanFollower(options, source, sink, clock, warn)
-        with stop_scope() as stopped:
-            if _watch(growing, clock, rhythm, stopped):
-                growing.catch_up(stopped)
+        with stop_scope() as should_stop:
+            if _watch(growing, clock, rhythm, should_stop):
+                growing.catch_up(should_stop)
             else:
                 n = growing.n_views_taken
                 warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
-            made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
+            made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, should_stop)
     # Opened again: HDF5 may still have the texts of the end as they were when it first read them.
     with _open(options, sink, clock, rhythm) as source:
         facts = facts_of(source)
@@ -132,7 +132,7 @@ def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming)
             clock.sleep(rhythm.poll)
 
 
-def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: Callable[[], bool]) -> bool:
+def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, should_stop: Callable[[], bool]) -> bool:
     """Take views and fit, in turns, until the scan has ended (True) or a stop finds views enough for a volume (False).
 
     Raises:
@@ -145,7 +145,7 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: C
             last_frame = clock.now()
         if ended:
             return True
-        if stopped() and not growing.source.finished:
+        if should_stop() and not growing.source.finished:
             if not growing.has_volume:
                 raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False

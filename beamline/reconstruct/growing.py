@@ -159,10 +159,10 @@ class ScanFollower:
         wanted = parse_views(self._options.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[wanted])]
 
-    def catch_up(self, stopped: Callable[[], bool]) -> None:
+    def catch_up(self, should_stop: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
         while self._taken < self._frames:
-            if self.n_views_taken >= _LEAST_VIEWS and stopped():
+            if self.n_views_taken >= _LEAST_VIEWS and should_stop():
                 self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.n_views} views.")
                 return
             self.take_new_frames(ended=True)
@@ -267,7 +267,7 @@ class ScanFollower:
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
     def finish(
-        self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]
+        self, seconds: float, snapshot_every: float, should_stop: Callable[[], bool]
     ) -> tuple[ReconOutcome, PreparedProjections]:
         """The last round over all views in `seconds` or until `stopped`, with snapshots.
 
@@ -290,9 +290,9 @@ class ScanFollower:
         prepared = self._prepared(self.axis_col, usable)
         self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=self._clock.now()))
 
-        last, stop_latch = self._clock.now(), StopLatch(stopped)
+        last, stop_latch = self._clock.now(), StopLatch(should_stop)
 
-        def listen(progress: Progress) -> bool:
+        def on_progress(progress: Progress) -> bool:
             nonlocal last
             self._say(progress)
             if self._clock.now() - last >= snapshot_every:
@@ -301,7 +301,7 @@ class ScanFollower:
             return stop_latch()
 
         try:
-            self._say(self._fit.finish(seconds, listen))
+            self._say(self._fit.finish(seconds, on_progress))
         except ValueError as error:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume, gaussians = self._fit.snapshot(), self._fit.gaussians

@@ -21,7 +21,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
     first: Progress | None = None
     step = 0
 
-    def listen(progress: Progress) -> None:
+    def on_progress(progress: Progress) -> None:
         nonlocal first, step
         if first is None or progress.step < step:  # a followed scan's fit may begin anew
             first = progress
@@ -35,7 +35,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
             left = max(0.0, seconds - spent)
         sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=left, time=clock.now()))
 
-    return listen
+    return on_progress
 
 
 def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:

@@ -125,7 +125,7 @@ def write_result(
     region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
 
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
-        found = measure(volume, None if region_only else prepared, truth, mask, phases.told)
+        found = measure(volume, None if region_only else prepared, truth, mask, phases.progress)
         return {**found, "seconds": seconds}
 
     left = unexplained(
@@ -147,7 +147,7 @@ def write_result(
             context = replace(context, warnings=[*context.warnings, hiding])
     if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
         left_out.append("the look for views that do not fit the volume")
-    elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
+    elif odd := odd_views_warning(made, prepared, context.selection, phases.progress):
         sink(Warned(odd, time=clock.now()))
         context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
@@ -160,7 +160,7 @@ def write_result(
         grid, out = made.volume.grid, None
         if isinstance(made.volume.data, np.memmap):
             out = scratch_array(target.output.parent, grid.shape)
-        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.told, out)
+        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.progress, out)
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     if BASELINE in volumes:  # it is the first

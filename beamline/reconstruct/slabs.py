@@ -149,7 +149,7 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
 
 
 def spill_of(
-    source: ScanSource, options: ReconOptions, told: Callable[[int, int], None], warn: Callable[[str], None]
+    source: ScanSource, options: ReconOptions, progress: Callable[[int, int], None], warn: Callable[[str], None]
 ) -> Spill | None:
     """Where the views go if they do not fit into the memory; None where they do, and where slabs are not possible.
 
@@ -178,7 +178,7 @@ def spill_of(
         f"the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."
     )
     shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
-    return Spill(scratch_array(options.target.output.parent, shape), batch, told)
+    return Spill(scratch_array(options.target.output.parent, shape), batch, progress)
 
 
 def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
@@ -239,16 +239,16 @@ def prepare_within(
     """As `prepare_projections`, and the slabs if line integrals lie on disk; none: all at once."""
     began = clock.now()
 
-    def told(n: int, total: int) -> None:
+    def progress(n: int, total: int) -> None:
         now = clock.now()
         rate = n / max(now - began, 1e-9)
         sink(Counted("correction", n, total, rate, (total - n) / rate, time=now))
 
-    def said(text: str) -> None:
+    def say(text: str) -> None:
         sink(StateEntered("memory", text, time=clock.now()))
 
     memory = memory_of(options)
-    spill = spill_of(source, options, told, said)
+    spill = spill_of(source, options, progress, say)
     check = None if options.region is None else partial(locate, options.region, options.selection)
     prepared = prepare_projections(source, options.selection, warn, spill, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)

@@ -59,12 +59,12 @@ def check_output(scan: Scan, out: Path) -> None:
 
 
 def write_scan(
-    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, check_stop: Callable[[], bool]
+    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, should_stop: Callable[[], bool]
 ) -> SimulatedScan:
     """Compute every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
 
     Args:
-        check_stop: called before each frame; true ends the scan with a valid file and labels.
+        should_stop: called before each frame; true ends the scan with a valid file and labels.
 
     Raises:
         DataError: a file exists or cannot be written, or the disk is too small.
@@ -79,7 +79,7 @@ def write_scan(
     try:
         with writer:
             for planned in scan:
-                if check_stop():
+                if should_stop():
                     writer.close("stopped")
                     break
                 log.add(n, _write(scan, planned, n, writer))

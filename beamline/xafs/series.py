@@ -44,12 +44,12 @@ class SeriesResult:
     stopped: bool = False
 
 
-def run_series(series: Series, sink: Sink, clock: Clock, check_stop: Callable[[], bool]) -> SeriesResult:
+def run_series(series: Series, sink: Sink, clock: Clock, should_stop: Callable[[], bool]) -> SeriesResult:
     """The curve of a series of radiographs.
 
     Args:
         sink: gets `progress` events (n, of, per_s, eta_s).
-        check_stop: called after each energy; true ends the series.
+        should_stop: called after each energy; true ends the series.
     """
     energies: list[float] = []
     points: list[tuple[float, float]] = []
@@ -62,7 +62,7 @@ def run_series(series: Series, sink: Sink, clock: Clock, check_stop: Callable[[]
         if now - reported >= REPORT_EVERY or done == series.n:
             reported, rate = now, done / max(now - start, 1e-9)
             sink(Counted("xafs", done, series.n, rate, (series.n - done) / rate, time=clock.now()))
-        if done < series.n and check_stop():
+        if done < series.n and should_stop():
             stopped = True
             break
     return SeriesResult(curve_of(np.array(energies), points, series.regions), stopped)
