@@ -16,7 +16,7 @@ FARTHEST = 1e9
 """rad; no stage goes further."""
 
 
-class Pulse(Protocol):
+class EmittedPulse(Protocol):
     """A pulse on the cable: when it rose, s, and where the stage was in fact, rad."""
 
     @property
@@ -29,7 +29,7 @@ class Pulse(Protocol):
 class Cable(Protocol):
     """The trigger cable, and what measures where the stage is in fact: a simulated line, or a counter card."""
 
-    def next_after(self, time: float) -> Pulse | None:
+    def next_after(self, time: float) -> EmittedPulse | None:
         """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
         ...
 
@@ -71,7 +71,7 @@ class StageBench:
     clock: Clock
     line: Cable
 
-    def pulses(self) -> list[Pulse]:
+    def pulses(self) -> list[EmittedPulse]:
         """Those that have been emitted by now."""
         return emitted(self.line, self.clock)
 
@@ -97,9 +97,9 @@ Build = Callable[..., StageBench]
 """Opens the stage anew, with settings of its driver that differ from the usual ones."""
 
 
-def emitted(line: Cable, clock: Clock) -> list[Pulse]:
+def emitted(line: Cable, clock: Clock) -> list[EmittedPulse]:
     """The pulses that have come out of a cable by now, in their order."""
-    found: list[Pulse] = []
+    found: list[EmittedPulse] = []
     after = -math.inf
     while (pulse := line.next_after(after)) is not None and pulse.time <= clock.now():
         found.append(pulse)
