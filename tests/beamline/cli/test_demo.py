@@ -115,7 +115,7 @@ def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest
         assert threading.current_thread() is threading.main_thread()
         done = VolumeDone(
             Path("runs/x/recon.h5"), Path("runs/x/report.html"), "r2", 17.0, 9, (2, 3, 4), "1/mm", 1.0, {},
-            {"psnr": 30.0}, fbp={"psnr": 25.0},
+            {"psnr": 30.0}, fbp={"psnr": 25.0}, time=0.0,
         )  # fmt: skip
         for sink in sinks:
             sink(done)
