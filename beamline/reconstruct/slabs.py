@@ -19,6 +19,7 @@ from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import choose_views, cone_of, rows_of
 from beamline.projections.steps.resampling import TiltAndLens
+from beamline.projections.steps.step import ViewStep
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
@@ -55,12 +56,14 @@ class Needs:
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
         weighted: rays have weights.
+        copies: float32 views that a step of the correction takes, see `ViewFilter`.
     """
 
     method: Method
     geometry: Geometry
     raw: int
     weighted: bool
+    copies: int = 0
 
     @classmethod
     def of(
@@ -85,7 +88,13 @@ class Needs:
     @property
     def at_once(self) -> int:
         """With everything in memory."""
-        return self.raw + self.line_integrals + self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
+        work = self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
+        return self.raw + self.line_integrals + max(work, self.filters)
+
+    @property
+    def filters(self) -> int:
+        """While views are filtered, beside the views."""
+        return self.copies * self.line_integrals // self.geometry.n_views
 
     @property
     def view(self) -> int:
@@ -109,7 +118,7 @@ class Needs:
     @property
     def least(self) -> int:
         """The least memory that suffices."""
-        return max(self.slab(_ROWS), self.view, self.figures)
+        return max(self.slab(_ROWS), self.view + self.filters, self.figures)
 
     def height(self, memory: int) -> int:
         """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
@@ -145,7 +154,9 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     if axis is not None:
         axis = (axis - (selection.binning - 1) / 2) / selection.binning
     needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
-    return replace(needs, method=options.method_for(needs.geometry))
+    filters = [step.on(source, selection)[0] for step in selection.in_order if isinstance(step, ViewStep)]
+    copies = max((each.copies for each in filters if each is not None), default=0)
+    return replace(needs, method=options.method_for(needs.geometry), copies=copies)
 
 
 def spill_of(
@@ -172,7 +183,7 @@ def spill_of(
     refuse_smallest(
         source, replace(needs, weighted=surely_weighted(source, options)), memory, options.selection.binning
     )
-    batch = max(1, int(_BATCH * memory / needs.view))
+    batch = max(1, int((_BATCH * memory - needs.filters) / needs.view))
     warn(
         f"All at once would take {size(needs.at_once)}, {size(memory)} of memory may be used: views and volume lie on "
         f"the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."

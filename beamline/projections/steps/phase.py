@@ -109,7 +109,8 @@ class Phase:
             found.retrieve(views.data, selection.step(Defects).floor)
             return views
 
-        return ViewFilter(apply, found.reach, "--phase mixes"), StepDone(said, {"phase": said})
+        copies = 7 if self.unsharp is None else 9
+        return ViewFilter(apply, found.reach, "--phase mixes", copies), StepDone(said, {"phase": said})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
         """The filter for the pixels that the selection makes, and a sentence about it.

@@ -97,8 +97,9 @@ class TiltAndLens:
             found.apply(views.data, first)
             return replace(views, masked=found.nearest(views.masked, first))
 
-        mixes = "--tilt and --distortion mix"
-        return ViewFilter(apply, found.reach, mixes), self.done(turned if self.tilt_deg else "")
+        copies = 17 if self.distortion is None else 26
+        taken = ViewFilter(apply, found.reach, "--tilt and --distortion mix", copies)
+        return taken, self.done(turned if self.tilt_deg else "")
 
     def done(self, said: str) -> StepDone:
         """What it did, with what is recorded where nothing was asked, too."""

@@ -102,11 +102,13 @@ class ViewFilter:
             changed in place.
         reach: rows, binned, beside a row from which it takes something.
         mixes: the subject and verb that say who mixes neighbouring pixels.
+        copies: memory that it takes, as float32 views; it does not grow with the views in a batch.
     """
 
     apply: Callable[[Projections, int], Projections]
     reach: int
     mixes: str
+    copies: int
 
 
 @runtime_checkable
