@@ -307,7 +307,7 @@ print(json.dumps({"event": "enough", "n_views": 90, "planned": 180, "mean": 0.1,
 """
     reasons: list[str] = []
     command = script(said)(tmp_path / "scan.h5", tmp_path / "recon.h5")
-    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event, data: None, reasons.append)
+    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event: None, reasons.append)
     process.finish(stop=lambda: False, hurry=lambda: False)
     assert reasons == ["90 of 180 views are enough, the others would add 0.10 dB (0.00 to 0.20)"]
     words = follow_command(small("recon.live=true", "recon.stop_when={psnr_loss: 0.5}"))(tmp_path, tmp_path)
@@ -362,4 +362,4 @@ class _Live:
     def __init__(self, folder: Path, code: str) -> None:
         self.said: list[str] = []
         command = script(code)(folder / "scan.h5", folder / "recon.h5")
-        self.process = LiveReconstruction(command, folder / "recon.log", lambda event, data: self.said.append(event))
+        self.process = LiveReconstruction(command, folder / "recon.log", lambda event: self.said.append(event.event))
