@@ -34,7 +34,7 @@ _CLEAR = 0.1  # of the typical residual that the best axis has to take away
 
 
 def axis_by_views(
-    projections: F32, geometry: Geometry, told: Callable[[int], None] = lambda n: None, *, near: bool = False
+    projections: F32, geometry: Geometry, progress: Callable[[int], None] = lambda n: None, *, near: bool = False
 ) -> AxisEstimate:
     """The column by which a volume of two thirds of the views leaves least of the others.
 
@@ -44,7 +44,7 @@ def axis_by_views(
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
         geometry: of these views; the search begins at its `axis_col`.
-        told: is told the number of candidates tried so far.
+        progress: takes the number of candidates tried so far.
         near: the start stays, after three candidates, where no axis beside it leaves 2 % less.
 
     Returns:
@@ -57,7 +57,7 @@ def axis_by_views(
     if geometry.n_views < _LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
     cols = geometry.detector_shape[1]
-    judges = [_Judge(projections, geometry, each, told) for each in (_COARSE_COLS, COLS)]
+    judges = [_Judge(projections, geometry, each, progress) for each in (_COARSE_COLS, COLS)]
     coarse, fine = judges
     fine.others = coarse
     start, half = geometry.axis_col, 0.5 * fine.bin
@@ -93,7 +93,7 @@ class _Judge:
     projections: F32
     geometry: Geometry
     cols: int
-    told: Callable[[int], None]
+    progress: Callable[[int], None]
     others: _Judge | None = None
     found: dict[float, float] = field(default_factory=dict)
     _grid: Grid | None = None
@@ -114,7 +114,7 @@ class _Judge:
     def __call__(self, axis_col: float) -> float:
         if axis_col not in self.found:
             self.found[axis_col] = self._residual(axis_col)
-            self.told(len(self.found) + (len(self.others.found) if self.others else 0))
+            self.progress(len(self.found) + (len(self.others.found) if self.others else 0))
         return self.found[axis_col]
 
     def _residual(self, axis_col: float) -> float:

@@ -17,7 +17,7 @@ from recon.base.method import Method
 
 
 @dataclass(frozen=True)
-class Entry:
+class MethodEntry:
     """Where a method is.
 
     Attributes:
@@ -32,16 +32,16 @@ class Entry:
     compared: bool = True
 
 
-REGISTRY: dict[str, Entry] = {
-    "r2": Entry("recon.splatting.r2", "R2", streams=True),
-    "r2-published": Entry("recon.splatting.published", "R2Published", streams=True, compared=False),
-    "fbp": Entry("recon.voxels.direct", "Fbp"),
-    "sirt": Entry("recon.voxels.methods.sirt", "Sirt"),
-    "sart": Entry("recon.voxels.methods.sart", "Sart"),
-    "cgls": Entry("recon.voxels.methods.cgls", "Cgls"),
-    "asd-pocs": Entry("recon.voxels.methods.asd_pocs", "AsdPocs"),
-    "fista-tv": Entry("recon.voxels.methods.fista_tv", "FistaTv"),
-    "os-sirt-tv": Entry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
+REGISTRY: dict[str, MethodEntry] = {
+    "r2": MethodEntry("recon.splatting.r2", "R2", streams=True),
+    "r2-published": MethodEntry("recon.splatting.published", "R2Published", streams=True, compared=False),
+    "fbp": MethodEntry("recon.voxels.direct", "Fbp"),
+    "sirt": MethodEntry("recon.voxels.methods.sirt", "Sirt"),
+    "sart": MethodEntry("recon.voxels.methods.sart", "Sart"),
+    "cgls": MethodEntry("recon.voxels.methods.cgls", "Cgls"),
+    "asd-pocs": MethodEntry("recon.voxels.methods.asd_pocs", "AsdPocs"),
+    "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
+    "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
 }
 
 DEFAULT = "r2"
@@ -127,13 +127,13 @@ def with_trait(trait: str) -> tuple[str, ...]:
 
 
 @cache
-def _entries() -> Mapping[str, Entry]:
-    """Our methods, and those of other packages."""
+def _entries() -> Mapping[str, MethodEntry]:
+    """Ours, and those of other packages."""
 
-    def made(name: str, method: type[Method]) -> Entry:
+    def made(name: str, method: type[Method]) -> MethodEntry:
         if method.name != name:
             raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
-        entry = Entry(method.__module__, method.__name__, hasattr(method, "stream"))
+        entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
         if getattr(import_module(entry.module), entry.cls, None) is not method:
             raise ValueError(f"its class {method.__qualname__} is not at the top of the module {entry.module}")
         _ = method(), method.label, method.traits.direct  # every setting has a default
@@ -142,7 +142,7 @@ def _entries() -> Mapping[str, Entry]:
     return {**REGISTRY, **plugins("method", (*REGISTRY, AUTO), made)}
 
 
-def _entry(name: str) -> Entry:
+def _entry(name: str) -> MethodEntry:
     if name not in _entries():
         raise ValueError(f"method must be one of {', '.join(_entries())}, got {name!r}")
     return _entries()[name]

@@ -47,7 +47,7 @@ class MethodConformance:
 
     @pytest.fixture
     def method(self) -> Method:
-        raise NotImplementedError
+        pytest.fail("A subclass gives the fixture `method`: the method, with settings that are done within seconds.")
 
     def test_it_is_an_immutable_value_that_says_who_it_is(self, method: Method) -> None:
         assert is_dataclass(method) and method.__dataclass_params__.frozen

@@ -155,11 +155,11 @@ def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | No
     if listen is None or control.decide is not None:
         return None
 
-    def told(progress: Progress) -> None:
+    def on_progress(progress: Progress) -> None:
         word = progress.unit or ("steps" if progress.n_gaussians else "iterations")
         listen(replace(progress, unit=f"{word} of the trial of {name}"))
 
-    return told
+    return on_progress
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:

@@ -367,7 +367,7 @@ STEP = Extension(
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import Done, option
+from beamline.projections.steps.step import StepDone, option
 
 
 @dataclass(frozen=True)
@@ -386,7 +386,7 @@ class Lift:
 
     def apply(self, views, angles):
         views.projections.data[...] += self.by
-        return Done(f"Lifted by {self.by:g}." if self.by else "")
+        return StepDone(f"Lifted by {self.by:g}." if self.by else "")
 """
     },
     (("beamline/projections/steps/registry.py", '    "hardening": "Hardening",', '    "lift": "Lift",'),),

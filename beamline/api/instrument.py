@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, Self
 
 from beamline.config.load import Config, changed, load, override_of
 from beamline.core.errors import ConfigError, ScanStopped
-from beamline.core.events import Event
+from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
@@ -23,7 +23,7 @@ from beamline.scan.live_process import Commands, commands_of
 from beamline.scan.run import run_scan
 from drivers.manual import Ask
 
-Tell = Callable[[str], None]
+Say = Callable[[str], None]
 
 _OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets anew
 
@@ -86,10 +86,10 @@ class Instrument:
         last: result of the newest scan, also of one that raised; None before the first, and if it took no frame.
     """
 
-    def __init__(self, config: Config, connected: devices.ConnectedDevices, tell: Tell | None = to_stderr) -> None:
+    def __init__(self, config: Config, connected: devices.ConnectedDevices, say: Say | None = to_stderr) -> None:
         self.config = config
         self.last: ScanResult | None = None
-        self._devices, self._tell = connected, tell
+        self._devices, self._say = connected, say
         self._open, self._one_at_a_time = True, threading.Lock()
 
     def __enter__(self) -> Self:
@@ -163,24 +163,24 @@ class Instrument:
         self, config: Config, output: str | Path | None, live: bool, stop: StopRequest,
         on_event: Callable[[Event], None] | None,
     ) -> ScanResult:  # fmt: skip
-        self.last, said = None, dict[str, Mapping[str, Any]]()
+        self.last, said = None, list[ScanDone | ReconDone]()
 
         def remember(event: Event) -> None:
-            if event.event in ("scan_done", "recon_done"):
-                said[event.event] = event.data
+            if isinstance(event, ScanDone | ReconDone):
+                said.append(event)
 
-        def tell(event: Event) -> None:
-            if self._tell is not None and event.event != "done" and (text := sentence(event)):
-                self._tell(text)
+        def say(event: Event) -> None:
+            if self._say is not None and not isinstance(event, RunDone) and (text := sentence(event)):
+                self._say(text)
 
         how = commands_of(config) if live else Commands()
-        if how.remark and self._tell is not None:
-            self._tell(how.remark)
+        if how.remark and self._say is not None:
+            self._say(how.remark)
         try:
             with stop_signals(stop):
                 run_scan(
                     config, None if output is None else Path(output),
-                    [remember, tell, *([on_event] if on_event else [])], stop,
+                    [remember, say, *([on_event] if on_event else [])], stop,
                     live=how.live, afterwards=how.afterwards, instrument=self._devices,
                 )  # fmt: skip
         except ScanStopped:
@@ -194,7 +194,7 @@ class Instrument:
 
 def connect(
     config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
-    tell: Tell | None = to_stderr,
+    say: Say | None = to_stderr,
 ) -> Instrument:  # fmt: skip
     """Open every device of a configuration. Nothing moves.
 
@@ -203,25 +203,25 @@ def connect(
         set: values that replace those of the file, such as {"scan.angles.views": 90}.
         ask: puts a request to the operator, where shutter or sample are moved by hand, and returns when it is done;
             None: at the terminal.
-        tell: gets the sentences that the commands print, as `print` or a logger's `info`; None: they are dropped.
+        say: gets a sentence on what happens, as the commands print it (`print`, a logger's `info`); None: nobody does.
 
     Raises:
         ConfigError: every fault with file, line, key and legal values.
         DeviceError: a device does not answer; those opened before it are closed again.
     """
     read = load(config, [override_of(key, value) for key, value in (set or {}).items()])
-    return Instrument(read, devices.connect(read, ask=ask), tell)
+    return Instrument(read, devices.connect(read, ask=ask), say)
 
 
 def scan(
     config: str | Path, *, set: Mapping[str, object] | None = None, ask: Ask | None = None,
-    tell: Tell | None = to_stderr, **of_scan: Any,
+    say: Say | None = to_stderr, **of_scan: Any,
 ) -> ScanResult:  # fmt: skip
     """Connect, run one scan, and close the devices. Arguments and errors are those of `connect` and `Instrument.scan`.
 
     `set` is for both: it may change what devices are opened with.
     """
-    with connect(config, set=set, ask=ask, tell=tell) as instrument:
+    with connect(config, set=set, ask=ask, say=say) as instrument:
         return instrument.scan(**of_scan)
 
 
@@ -233,23 +233,23 @@ def _of_devices(config: Config) -> Mapping[str, Any]:
     return {**used, "devices": {**used["devices"], "camera": camera}, "pitch": pitch}
 
 
-def _result(config: Config, said: Mapping[str, Mapping[str, Any]]) -> ScanResult | None:
-    """The result of a scan by its events; None if it ended before its file was made."""
-    done = said.get("scan_done")
+def _result(config: Config, said: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
+    """The result of a scan by its events; None where it ended before its file was made."""
+    done = next((event for event in said if isinstance(event, ScanDone)), None)
     if done is None:
         return None
-    volume = said.get("recon_done", {}).get("output")
+    volume = next((event.data["output"] for event in said if isinstance(event, ReconDone)), None)
     return ScanResult(
-        path=done["path"],
+        path=done.path,
         sample=config.sample.name,
-        frames=done["n_frames"],
-        missing=tuple(done["missing"]),
-        flags=done["flags"],
-        alarms=done["alarmed_frames"],
-        retaken=done["retaken"],
-        reference_faults=tuple(done["reference_faults"]),
-        status=done["status"],
-        seconds=done["seconds"],
-        bytes=done["bytes"],
+        frames=done.n_frames,
+        missing=tuple(done.missing),
+        flags=done.flags,
+        alarms=done.alarmed_frames,
+        retaken=done.retaken,
+        reference_faults=tuple(done.reference_faults),
+        status=done.status,
+        seconds=done.seconds,
+        bytes=done.bytes,
         volume=None if volume is None else Path(volume),
     )

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from beamline.api.instrument import Tell, to_stderr
+from beamline.api.instrument import Say, to_stderr
 from beamline.api.reading import scan_file
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event
+from beamline.core.events import Event, VolumeDone, Warned
 from beamline.core.narration import sentence
 from beamline.core.signals import StopOnSignal
 from beamline.projections.selection import Selection
@@ -82,7 +82,7 @@ def reconstruct(
     binning: int | None = None,
     selection: Selection | None = None,
     output: str | Path | None = None,
-    tell: Tell | None = to_stderr,
+    say: Say | None = to_stderr,
 ) -> ReconResult:
     """Reconstruct a finished scan of any format, as `beamline recon` does.
 
@@ -98,25 +98,27 @@ def reconstruct(
         `beamline.projections.steps`; the arguments above take precedence.
         output: file of the volume, as -o takes it (.h5, .tif, .npy, ...), with a report beside; None: no file is left.
             A scan that does not fit into the memory needs one.
-        tell: gets sentences on the progress; None: they are dropped.
+        say: gets a sentence on what happens; None: nobody does.
 
     Raises:
         ConfigError: an impossible method or selection. DataError: no scan, data that give no volume, or an output
         that exists or cannot be written. Nothing is written then.
     """
     place, chosen = scan_file(path), _method(method)
-    done: dict[str, Any] = {}
+    last: list[VolumeDone] = []
     warned: list[str] = []
     settings: dict[str, Any] = {}
     held: list[Volume] = []
 
     def sink(event: Event) -> None:
-        if event.event == "done":
-            done.update(event.data)
-        elif event.event == "warning":
-            warned.append(str(event.data["message"]))
-        if tell is not None and event.event not in ("done", "progress") and (text := sentence(event)):
-            tell(text)
+        match event:
+            case VolumeDone():
+                last.append(event)
+                return
+            case Warned(message=message):
+                warned.append(message)
+        if say is not None and (text := sentence(event)):
+            say(text)
 
     def take(record: ReconRecord) -> None:
         settings.update(record.parameters)
@@ -135,14 +137,15 @@ def reconstruct(
         command = f"beamline.api.reconstruct({str(place)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         options = ReconOptions(source, target, wanted, chosen, command=command)
         figures = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
+    (done,) = last
     return ReconResult(
-        method=done["method"],
+        method=done.method,
         figures=figures,
         settings=settings,
-        axis_col=done["axis_col"],
-        units=done["units"],
+        axis_col=done.axis_col,
+        units=done.units,
         warnings=tuple(warned),
-        ended_early=bool(done.get("ended_early")),
+        ended_early=bool(done.ended_early),
         output=None if output is None else Path(output),
         report=target.report,
         _held=held[0] if held else None,

@@ -11,8 +11,9 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError, ScanStopped
-from beamline.core.events import Event, fan_out
+from beamline.core.events import Done
 from beamline.core.signals import terminated_like_interrupted
+from beamline.core.sinks import fan_out
 from beamline.reconstruct.batch import TABLE, BatchOptions, run_batch
 from drivers.base.clock import SystemClock
 
@@ -60,7 +61,7 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
             raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
         failed = [row for row in rows if not row.has_volume]
         counts = {"done": len(rows) - len(failed), "failed": len(failed), "output": output / TABLE}
-        sink(Event("done", clock.now(), counts))
+        sink(Done(counts, time=clock.now()))
     if failed:
         raise DataError(f"{len(failed)} of {len(rows)} scans failed; {output / TABLE} says why.")
     if not as_json:

@@ -7,14 +7,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.terminal import Terminal
-from beamline.core.events import Event
+from beamline.core.events import BenchDone, BenchStarted, Done, Event, TrialReached
 from beamline.core.machine import machine, machine_line
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
@@ -83,25 +83,25 @@ def acquire(
         found = machine()
         start = {"machine": found, "folder": folder.absolute(), "rows": work.shape[0], "cols": work.shape[1]}
         if as_json:
-            sinks[0](Event("bench_started", clock.now(), start))
+            sinks[0](BenchStarted(start, time=clock.now()))
         else:
             frame = f"{work.shape[0]} x {work.shape[1]} pixels, {size(work.frame_bytes)} a frame"
             click.echo(f"{machine_line(found)}\n{frame}, previews of {work.preview_bin} x {work.preview_bin}\n")
         began = clock.now()
 
-        def said(n: int, of: int, stage: str) -> None:
+        def progress(n: int, of: int, stage: str) -> None:
             per_min = 60 * n / max(clock.now() - began, 1e-9)
             left = (of - n) * 60 / per_min if n else None
-            data = {"stage": "bench", "n": n, "of": of, "per_min": per_min, "eta_s": left, "label": stage}
-            (sinks[0] if as_json else terminal)(Event("progress", clock.now(), data))
+            shown = sinks[0] if as_json else terminal
+            shown(TrialReached("bench", n, of, stage, left, per_min, time=clock.now()))
 
-        for one in rates(work, folder, clock, seconds, rounds, said):
+        for one in rates(work, folder, clock, seconds, rounds, progress):
             taken.append(one)
         rows = summary(work, taken)
         for row in rows if as_json else ():
-            sinks[0](Event("bench", clock.now(), asdict(row)))
+            sinks[0](BenchDone(row, time=clock.now()))
         if as_json:
-            sinks[0](Event("done", clock.now(), {}))
+            sinks[0](Done({}, time=clock.now()))
     if not as_json:
         click.echo(_rate_table(rows, rounds))
 
@@ -167,22 +167,22 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
     clock = SystemClock()
     with json_events(as_json) as sinks:
 
-        def tell(kind: str, data: dict[str, Any], text: str) -> None:
+        def show(event: Event, text: str) -> None:
             for sink in sinks:
-                sink(Event(kind, clock.now(), data))
+                sink(replace(event, time=clock.now()))
             if not sinks:
                 click.echo(text)
 
         found = machine()
-        tell("bench_started", {"machine": found}, machine_line(found) + "\n")
+        show(BenchStarted({"machine": found}), machine_line(found) + "\n")
         click.echo("Compiling kernels that are not in the cache.", err=True)
         warm_up()
         for timing in _timings(gaussians, side):
-            tell("bench", {**asdict(timing), "ns_per_pair": timing.ns_per_pair}, _line(timing))
+            show(BenchDone({**asdict(timing), "ns_per_pair": timing.ns_per_pair}), _line(timing))
         for row in _rows() if volumes else ():
-            tell("bench", asdict(row), _volume_line(row))
+            show(BenchDone(row), _volume_line(row))
         for sink in sinks:
-            sink(Event("done", clock.now(), {}))
+            sink(Done({}, time=clock.now()))
 
 
 def _timings(gaussians: int, side: int) -> Iterator[Timing]:

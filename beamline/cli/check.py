@@ -8,7 +8,7 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
-from beamline.core.events import Event
+from beamline.core.events import Done
 from drivers.base.clock import SystemClock
 
 
@@ -33,6 +33,6 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
             click.echo("\n".join(worked.lines()))
         refuse_violations(worked.timeline)
         for sink in sinks:
-            sink(Event("done", SystemClock().now(), worked.data()))
+            sink(Done(worked.data(), time=SystemClock().now()))
     if not as_json:
         click.echo(f"\n{file} is valid: no limit is violated.")

@@ -17,10 +17,11 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Sink, fan_out
+from beamline.core.events import Event, FrameFlagged, RunDone, Sink, SnapshotWritten, VolumeDone, Warned
 from beamline.core.narration import sentence
 from beamline.core.process import ChildProcess
 from beamline.core.signals import stop_signals
+from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
 
@@ -53,8 +54,9 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
         with stop_signals(stop), _compiling(), Terminal(sys.stderr) as terminal:
             run_demo(config, output, [terminal, last.append, *sinks], stop, shlex.join(["beamline", *sys.argv[1:]]))
     if not as_json:
-        click.echo(f"{'folder':<10}{Path(last[-1].data['output']).parent}")
-        click.echo(results(last[-1].data))
+        done = last[-1]
+        assert isinstance(done, VolumeDone)
+        click.echo(f"{'folder':<10}{done.output.parent}\n{results(done)}")
 
 
 @contextmanager
@@ -105,7 +107,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     outside = fan_out(*sinks)
 
     def all_but_done(event: Event) -> None:
-        if event.event != "done":  # of the scan; the demonstration goes on
+        if not isinstance(event, RunDone):  # of the scan; the demonstration goes on
             outside(event)
 
     with connect(config) as instrument:
@@ -153,13 +155,13 @@ class _Snapshots:
     def __call__(self, event: Event) -> None:
         from beamline.storage.writers.recon_file import read_reconstruction
 
-        if event.event == "snapshot":
+        if isinstance(event, SnapshotWritten):
             try:
-                volume = read_reconstruction(Path(event.data["path"])).volume
+                volume = read_reconstruction(Path(event.path)).volume
             except DataError:
-                return  # the run is over and the snapshot is gone
-            self.volumes.append((float(event.data["seconds"]), volume))
-        elif event.event in ("flag", "warning"):
+                return  # the run is over and it is gone
+            self.volumes.append((event.seconds, volume))
+        elif isinstance(event, FrameFlagged | Warned):
             text = sentence(event)
             if text and text not in self.flags:
                 self.flags.append(text)

@@ -12,7 +12,7 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import set_option
-from beamline.core.events import Event
+from beamline.core.events import Diagnosed, Done
 from beamline.core.signals import terminated_like_interrupted
 from beamline.doctor.check import Grade
 from drivers.base.clock import SystemClock
@@ -63,10 +63,10 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
         for check in examine(config, clock, session=session):
             checks.append(check)
             for sink in sinks:
-                sink(Event("check", clock.now(), vars(check)))
+                sink(Diagnosed(check, time=clock.now()))
         counts = Counter(check.verdict for check in checks)
         for sink in sinks:
-            sink(Event("done", clock.now(), {str(verdict).replace(" ", "_"): counts[verdict] for verdict in Grade}))
+            sink(Done({str(grade).replace(" ", "_"): counts[grade] for grade in Grade}, time=clock.now()))
     if not as_json:
         _show(checks, compared=file is not None)
         click.echo(", ".join(f"{counts[verdict]} {verdict}" for verdict in Grade if counts[verdict]))

@@ -12,7 +12,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
 from beamline.cli.recon import parsed, refuse_shared, volume_path
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event
+from beamline.core.events import Done
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
@@ -108,7 +108,7 @@ def export(
         share = clipped / math.prod(shape)
         for sink in sinks:
             facts = {"output": output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
-            sink(Event("done", clock.now(), {**facts, "seconds": seconds}))
+            sink(Done({**facts, "seconds": seconds}, time=clock.now()))
     if as_json:
         return
     click.echo(f"output   {output} ({format_of(output).name}, {pixels.dtype.name})")
@@ -125,7 +125,7 @@ def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
         model = read_model(volume)
         write_ply(output, model)
         for sink in sinks:
-            sink(Event("done", SystemClock().now(), {"output": output, "gaussians": model.gaussians.n}))
+            sink(Done({"output": output, "gaussians": model.gaussians.n}, time=SystemClock().now()))
     if not as_json:
         click.echo(f"output     {output} (PLY)\ngaussians  {model.gaussians.n}, {model.gaussians.kernel}")
 

@@ -14,9 +14,10 @@ from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import DataError
-from beamline.core.events import Event, fan_out
+from beamline.core.events import Done, RuleBroken
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
+from beamline.core.sinks import fan_out
 from beamline.core.text import count, printable, size, spans
 from beamline.storage.codecs import CODECS
 from drivers.base.clock import SystemClock
@@ -37,7 +38,7 @@ def info(file: Path, as_json: bool, **said: Any) -> None:
     with json_events(as_json) as sinks:
         facts = dict(describe(SourceOptions(file, **said)))
         for sink in sinks:
-            sink(Event("done", SystemClock().now(), facts))
+            sink(Done(facts, time=SystemClock().now()))
     if as_json:
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
@@ -85,8 +86,8 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
         for sink in sinks:
             for finding in findings:
-                sink(Event("flag", now, vars(finding)))
-            sink(Event("done", now, {"file": file, **counts}))
+                sink(RuleBroken(**vars(finding), time=now))
+            sink(Done({"file": file, **counts}, time=now))
     errors = count(counts["error"], "error")
     if not as_json:
         for finding in findings:
@@ -121,7 +122,7 @@ def recover(file: Path, as_json: bool) -> None:
             click.echo(f"Warning: {said}", err=True)
         for sink in sinks:
             for done in found:
-                sink(Event("done", SystemClock().now(), vars(done)))
+                sink(Done(done, time=SystemClock().now()))
     if not as_json:
         click.echo("\n".join(done.said() for done in found))
 
@@ -168,7 +169,7 @@ def ingest(
         )
         seconds = clock.now() - began
         for sink in json_sinks:
-            sink(Event("done", clock.now(), {**vars(done), "output": done.path, "seconds": seconds}))
+            sink(Done({**vars(done), "output": done.path, "seconds": seconds}, time=clock.now()))
     if as_json:
         return
     click.echo(f"output   {done.path} ({done.definition})")
@@ -205,7 +206,7 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
         done = archive_scan(scan, output, codec, keep_damaged=keep_damaged, progress=progress)
         facts = {**vars(done), "codec": codec, "ratio": done.raw_bytes / done.bytes, "seconds": clock.now() - began}
         for sink in json_sinks:
-            sink(Event("done", clock.now(), facts))
+            sink(Done(facts, time=clock.now()))
     if as_json:
         return
     click.echo(f"output   {output} ({codec})")

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from click.exceptions import ClickException, Exit
 
 from beamline.core.errors import exit_code, user_message
-from beamline.core.events import Event, JsonLines, Sink
+from beamline.core.events import Event, Failed, Sink
+from beamline.core.sinks import JsonLines, fan_out
 from drivers.base.clock import SystemClock
 
 
@@ -20,18 +21,13 @@ def json_events(wanted: bool) -> Iterator[list[Sink]]:
         yield []
         return
     lines = JsonLines(sys.stdout)
-    last = ""
-
-    def remember(event: Event) -> None:
-        nonlocal last
-        last = event.event
-        lines(event)
+    last: list[Event] = []
 
     try:
-        yield [remember]
+        yield [fan_out(last.append, lines)]
     except (Exit, ClickException):
         raise
     except (Exception, KeyboardInterrupt) as error:
-        if last not in ("done", "failed"):
-            lines(Event("failed", SystemClock().now(), {"message": user_message(error), "exit_code": exit_code(error)}))
+        if not (last and last[-1].event in ("done", "failed")):
+            lines(Failed(user_message(error), exit_code(error), time=SystemClock().now()))
         raise

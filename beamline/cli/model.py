@@ -18,9 +18,10 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.recon import parsed, refuse_shared, volume_path
 from beamline.cli.terminal import Terminal, counting
-from beamline.core.events import Event, Sink, fan_out
+from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
+from beamline.core.sinks import fan_out
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
             raise click.UsageError(f"{error}. Nothing was written.") from error
         made = voxelised(model, grid, counting("slices", sink, clock))
         write_volume(output, replace(model.record, volume=made, time=clock.now()))
-        sink(Event("done", clock.now(), {"output": output, "shape": grid.shape, "voxel": grid.voxel_size}))
+        sink(Done({"output": output, "shape": grid.shape, "voxel": grid.voxel_size}, time=clock.now()))
     if not as_json:
         click.echo(f"output  {output}, {' x '.join(map(str, grid.shape))} voxels")
 
@@ -126,6 +127,6 @@ def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_js
     with _making(volume, output, as_json) as (model, sink, clock):
         views = model.geometry.angles if angles is None else angles
         write_views(output, model, views, counting("views", sink, clock))
-        sink(Event("done", clock.now(), {"output": output, "n_views": views.size}))
+        sink(Done({"output": output, "n_views": views.size}, time=clock.now()))
     if not as_json:
         click.echo(f"output  {output}, {views.size} views")

@@ -15,9 +15,10 @@ from beamline.cli.options import json_option, set_option
 from beamline.cli.scan_options import scan_options
 from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import AlarmError, ScanStopped
-from beamline.core.events import Event, fan_out
+from beamline.core.events import Done, FrameFlagged, Warned
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal
+from beamline.core.sinks import fan_out
 from beamline.core.text import spans
 from drivers.base.clock import SystemClock
 
@@ -98,14 +99,14 @@ def monitor(
                 now = {(flag.check, flag.level) for flag in judged.flags}
                 for flag in judged.flags:
                     if (flag.check, flag.level) not in active:
-                        sink(Event("flag", clock.now(), asdict(flag)))
+                        sink(FrameFlagged(**vars(flag), time=clock.now()))
                 active = now
             said_of = verdict(source, found, limits)
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in found]))):
                 write_whole(sheet, contact_sheet(worst))
         altered = [said_of.altered] if said_of.altered else []
         for fault in [*said_of.references, *altered]:
-            sink(Event("warning", clock.now(), {"message": fault}))
+            sink(Warned(fault, time=clock.now()))
         n, alarmed, again, references = said_of.n_frames, said_of.alarmed, said_of.retaken, said_of.references
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
@@ -114,7 +115,7 @@ def monitor(
             "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in said_of.kinds],
         }  # fmt: skip
         for json_sink in json_sinks:
-            json_sink(Event("done", clock.now(), done))
+            json_sink(Done(done, time=clock.now()))
     if not as_json:
         end = f"{file}: {n} frames, flagged: {counted(said_of.flags)}"
         end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""

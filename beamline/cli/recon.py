@@ -9,7 +9,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,9 +32,10 @@ from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import LogLines, Terminal, counting, results
 from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
-from beamline.core.events import Event, Sink, fan_out, while_it_works
+from beamline.core.events import Done, Event, Failed, FitReached, Sink, StateEntered, VolumeDone
 from beamline.core.files import named_on_failure, refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
+from beamline.core.sinks import fan_out, while_it_works
 from beamline.core.version import version
 from beamline.scan.run_folder import new_log
 from beamline.storage.volumes.registry import suffixes_text
@@ -339,8 +340,8 @@ def recon(
     stop = StopOnSignal(ready=follow or budget is not None)
 
     def made(event: Event) -> None:
-        """Whether there is a volume: from the first step or iteration on. Progress with a unit is trials or slices."""
-        if event.event == "progress" and event.data.get("stage") == "recon" and not event.data.get("unit"):
+        """From the first step or iteration on there is a volume; what has a unit is a trial, or slices."""
+        if isinstance(event, FitReached) and not event.unit:
             stop.ready = True
 
     with (
@@ -352,11 +353,13 @@ def recon(
         with _logged(log, shown) as logged:
             sink = fan_out(last.append, made, *logged, shown)
             metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=stop)
+    done = last[-1]
+    assert isinstance(done, VolumeDone)
     if not as_json:
-        click.echo(results(last[-1].data))
-    if lost := last[-1].data.get("checkpoint_lost"):
-        raise DataError(f"The last checkpoint was left out: {lost} The volume is in {output}.")
-    if last[-1].data.get("ended_early"):
+        click.echo(results(done))
+    if done.checkpoint_lost:
+        raise DataError(f"The last checkpoint was left out: {done.checkpoint_lost} The volume is in {output}.")
+    if done.ended_early:
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:
         require(metrics, max_residual)
@@ -391,7 +394,7 @@ def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     with json_events(as_json) as sinks:
         found = estimate(options, clock)
         for sink in sinks:
-            sink(Event("done", clock.now(), asdict(found)))
+            sink(Done(found, time=clock.now()))
     if not as_json:
         click.echo("\n".join(found.lines()))
 
@@ -432,9 +435,9 @@ def _logged(path: Path | None, tell: Sink) -> Iterator[list[Sink]]:
         with named_on_failure(path):
             file = closing.enter_context(new_log(path))
         lines = while_it_works(LogLines(file), tell)
-        lines(Event("state", SystemClock().now(), {"message": f"splatline {version()}: {shlex.join(sys.argv)}"}))
+        lines(StateEntered("", f"splatline {version()}: {shlex.join(sys.argv)}", time=SystemClock().now()))
         try:
             yield [lines]
         except (Exception, KeyboardInterrupt) as error:
-            lines(Event("failed", SystemClock().now(), {"message": user_message(error)}))
+            lines(Failed(user_message(error), time=SystemClock().now()))
             raise

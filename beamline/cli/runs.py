@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,7 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event
+from beamline.core.events import Done
 from beamline.core.files import RUNS
 from beamline.core.text import printable, size
 from drivers.base.clock import SystemClock
@@ -41,7 +40,7 @@ def runs(folder: Path | None, as_json: bool) -> None:
     with json_events(as_json) as sinks:
         found = [describe(run) for run in runs_in(folder)]
         for sink in sinks:
-            sink(Event("done", SystemClock().now(), {"folder": folder, "runs": [asdict(run) for run in found]}))
+            sink(Done({"folder": folder, "runs": found}, time=SystemClock().now()))
     if as_json:
         return
     if not found:

@@ -15,7 +15,7 @@ from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
 from beamline.core.errors import AlarmError, DataError
-from beamline.core.events import Event, Sink
+from beamline.core.events import Done, Sink
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
 from beamline.core.text import count
@@ -118,7 +118,7 @@ def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
         click.echo(f"Warning: {said}", err=True)
     for done in found:
         for sink in json_sinks:
-            sink(Event("done", SystemClock().now(), vars(done)))
+            sink(Done(done, time=SystemClock().now()))
         if not json_sinks:
             click.echo(done.said())
 
@@ -159,7 +159,7 @@ def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, j
         click.echo("\n".join(worked.lines()))
     refuse_violations(worked.timeline)
     for sink in json_sinks:
-        sink(Event("done", SystemClock().now(), worked.data()))
+        sink(Done(worked.data(), time=SystemClock().now()))
 
 
 def _results(result: RunResult) -> str:

@@ -13,7 +13,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_option
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event
+from beamline.core.events import Done
 from beamline.core.signals import terminated_like_interrupted
 from drivers.base.clock import SystemClock
 from recon.base.choices import NECK
@@ -102,7 +102,7 @@ def segment(
         found = segment_volume(options)
         files = {"output": output, "table": options.table, "picture": options.picture}
         for sink in sinks:
-            sink(Event("done", SystemClock().now(), {**files, **settings_of(found, options)}))
+            sink(Done({**files, **settings_of(found, options)}, time=SystemClock().now()))
     if not as_json:
         click.echo(summary(found, options))
     if view:

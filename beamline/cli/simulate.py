@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -15,11 +14,12 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
-from beamline.core.events import Event, Sink, fan_out
+from beamline.core.events import CostExplained, Done, Event, Sink
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.shipped import shipped_scenes
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
+from beamline.core.sinks import fan_out
 from beamline.core.text import size
 from drivers.base.clock import Clock, SystemClock
 
@@ -110,7 +110,7 @@ def simulate(
             raise ScanStopped(
                 f"Stopped after {written.n_frames} of {len(scan)} frames; {out} holds them and is readable."
             )
-        output.event("done", outputs)
+        output.event(Done(outputs))
 
 
 def _refuse_outputs(out: Path | None, truth: Path | None, picture: Path | None) -> None:
@@ -141,8 +141,8 @@ class _Output:
         if self._plain:
             click.echo(text)
 
-    def event(self, name: str, data: Mapping[str, Any]) -> None:
-        self._sink(Event(name, self._clock.now(), data))
+    def event(self, event: Event) -> None:
+        self._sink(replace(event, time=self._clock.now()))
 
 
 def _explain(scan: Scan, output: _Output) -> None:
@@ -150,7 +150,7 @@ def _explain(scan: Scan, output: _Output) -> None:
 
     found, where = frame_cost(scan, time.perf_counter), machine()
     costs = [asdict(cost) | {"domain": cost.domain and cost.domain.words} for cost in found.costs]
-    output.event("explain", asdict(found) | {"costs": costs, "machine": where})
+    output.event(CostExplained(asdict(found) | {"costs": costs, "machine": where}))
     output.lines(f"{machine_line(where)}\n\n{cost_table(found)}")
 
 

@@ -6,16 +6,30 @@ import errno
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from beamline.core.events import Event, Sink
+from beamline.core.events import (
+    Counted,
+    Done,
+    Event,
+    Failed,
+    FitReached,
+    FrameStored,
+    KernelsCompiled,
+    PhaseReached,
+    ReconStarted,
+    RunDone,
+    Sink,
+    TrialReached,
+    VolumeDone,
+)
 from beamline.core.narration import sentence
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
@@ -28,9 +42,11 @@ LONG = 2.0
 SAY_EVERY = 0.2
 """s between events on the progress of many frames."""
 PLAIN_EVERY = 5.0
-"""Real s between progress lines on a stream that is not a terminal."""
-_OF_FRAMES = ("ingest", "xafs", "monitor", "correction", "validate")  # stages whose progress counts frames
-_OF_ITSELF = ("axes", "slices", "views")  # stages named after the unit of their progress
+"""Real s between progress lines on a stream that is no terminal."""
+_COUNTED = {
+    **dict.fromkeys(("ingest", "xafs", "monitor", "correction", "validate"), ("frames", "frames")),
+    "archive": ("written and compared", "MB"),
+}  # stage: the name of its bar and what it counts; other stages are named after what they count
 _OF_TRIALS = {
     "tradeoff": "trials",
     "study": "trials",
@@ -95,36 +111,33 @@ class Terminal:
 
     def _take(self, event: Event) -> None:
         self._end_of_phase()
-        if event.event == "frame":
-            self._show("scan", event.data["n"], event.data["of"], rates(event.data))
-        elif event.event == "progress" and event.data.get("stage") in _OF_FRAMES:
-            self._show("frames", event.data["n"], event.data["of"], rate_text(event.data))
-        elif event.event == "progress" and event.data.get("stage") == "archive":
-            self._show("written and compared", event.data["n"], event.data["of"], rate_text(event.data, "MB"))
-        elif event.event == "progress" and event.data.get("stage") == "phase":
-            self._show_phase(event.data)
-        elif event.event == "progress" and event.data.get("stage") in _OF_ITSELF:
-            what = event.data["stage"]
-            self._show(what, event.data["n"], event.data["of"], rate_text(event.data, what))
-        elif event.event == "progress" and event.data.get("stage") in _OF_TRIALS:
-            what = _OF_TRIALS[event.data["stage"]]
-            self._show(what, event.data["n"], event.data["of"], trials(event.data, what))
-        elif event.event == "progress" and event.data.get("stage") == "kernels":
-            note = f"{event.data['n']} compiled in {event.data['seconds']:.0f} s; once on a machine, 1 to 2 minutes"
-            self._show("kernels", event.data["n"], 0, note)
-        elif event.event == "progress":
-            self._show("volume", event.data["step"], event.data["steps"], fit(event.data))
-        elif event.event not in ("failed", "done"):  # the command prints these events itself
-            text = sentence(event)
-            if text and text != self._last_text:  # a snapshot of the same views replaces the last one
-                self._last_text = text
-                self._console.print(printable(text))
+        match event:
+            case FrameStored(n, of):
+                self._show("scan", n, of, rates(event))
+            case Counted(stage, n, of):
+                what, counted = _COUNTED.get(stage, (stage, stage))
+                self._show(what, n, of, rate_text(event, counted))
+            case PhaseReached():
+                self._show_phase(event)
+            case TrialReached(stage, n, of):
+                self._show(_OF_TRIALS[stage], n, of, trials(event, _OF_TRIALS[stage]))
+            case KernelsCompiled(_, n, seconds):
+                self._show("kernels", n, 0, f"{n} compiled in {seconds:.0f} s; once on a machine, 1 to 2 minutes")
+            case FitReached(_, step, steps):
+                self._show("volume", step, steps, fit(event))
+            case Failed() | VolumeDone() | RunDone() | Done():
+                pass  # the command prints these itself
+            case _:
+                text = sentence(event)
+                if text and text != self._last_text:  # a snapshot of the same views replaces the one before
+                    self._last_text = text
+                    self._console.print(printable(text))
 
-    def _show_phase(self, data: Mapping[str, Any]) -> None:
-        if data["n"] or not self._bar.disable:
-            self._show(data["phase"], data["n"], data["of"], phase_text(data))
+    def _show_phase(self, reached: PhaseReached) -> None:
+        if reached.n or not self._bar.disable:
+            self._show(reached.phase, reached.n, reached.of, rate_text(reached, reached.counted))
             return
-        self._long = threading.Timer(LONG, self.say, [f"{data['phase']}: begun {LONG:.0f} s ago"])
+        self._long = threading.Timer(LONG, self.say, [f"{reached.phase}: begun {LONG:.0f} s ago"])
         self._long.daemon = True
         self._long.start()
 
@@ -168,7 +181,7 @@ class LogLines:
         self._stream, self._lock = stream, threading.Lock()
 
     def __call__(self, event: Event) -> None:
-        said = sentence(event) if event.event not in ("done", "recon_started") else None
+        said = None if isinstance(event, ReconStarted) else sentence(event)
         if said is None:
             said = ", ".join(f"{name} {value}" for name, value in event.data.items())
         at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
@@ -177,46 +190,40 @@ class LogLines:
             self._stream.flush()
 
 
-def rates(data: Mapping[str, Any]) -> str:
-    """n/N, frames/s, MB/s and the time left, of a `frame` event."""
-    speed = f"{data['frames_per_s']:.1f} frames/s  {data['mb_per_s']:.1f} MB/s"
-    return f"{data['n']}/{data['of']}  {speed}  {_clock_time(data['eta_s'])} left"
+def rates(frame: FrameStored) -> str:
+    """n/N, frames/s, MB/s and the time left."""
+    speed = f"{frame.frames_per_s:.1f} frames/s  {frame.mb_per_s:.1f} MB/s"
+    return f"{frame.n}/{frame.of}  {speed}  {_clock_time(frame.eta_s)} left"
 
 
-def rate_text(data: Mapping[str, Any], what: str = "frames") -> str:
-    """n/N, frames/s and the time left, of a `progress` event of a copy, an energy scan or trials of axes."""
-    return f"{data['n']}/{data['of']}  {data['per_s']:.1f} {what}/s  {_clock_time(data['eta_s'])} left"
+def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
+    """n/N, rate and the time left, where they are known; else that it has begun."""
+    if not (done.of and done.per_s) or done.eta_s is None:
+        return "begun"
+    return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {_clock_time(done.eta_s)} left"
 
 
-def phase_text(data: Mapping[str, Any]) -> str:
-    """n/N, rate and time left, of a `progress` event of a phase, or only its begin."""
-    known = data["of"] and data["per_s"] and data["eta_s"] is not None
-    return rate_text(data, data["counted"]) if known else "begun"
+def trials(done: TrialReached, what: str = "trials") -> str:
+    """n/N, trials/min, the time left if known, and the running one."""
+    parts = [f"{done.n}/{done.of}"]
+    if done.eta_s is not None:
+        parts += [f"{done.per_min:.1f} {what}/min", f"{_clock_time(done.eta_s)} left"]
+    return "  ".join([*parts, done.label])
 
 
-def trials(data: Mapping[str, Any], what: str = "trials") -> str:
-    """n/N, trials/min, the time left if known, and the running one, of a `progress` event of many trials or scans."""
-    parts = [f"{data['n']}/{data['of']}"]
-    if data["eta_s"] is not None:
-        parts += [f"{data['per_min']:.1f} {what}/min", f"{_clock_time(data['eta_s'])} left"]
-    return "  ".join([*parts, str(data["label"])])
-
-
-def fit(data: Mapping[str, Any]) -> str:
-    """n/N, rate, views, Gaussians (iterations have none), residuals and time left, of a `progress` event of a fit."""
-    step, steps = data["step"], data["steps"]
-    word = data.get("unit") or ("steps" if data["n_gaussians"] else "iterations")
-    parts = [f"{step}/{steps} {word}"] if steps else [f"{step} {word}"] if data.get("unit") else []
-    parts += [f"{data['per_s']:.3g} {word.split()[0]}/s"] if data.get("per_s") else []
-    parts += [f"{data['n_views']} views"]
-    parts += [f"{data['n_gaussians']} Gaussians"] if data["n_gaussians"] else []
-    if data["residual"] is not None and math.isfinite(data["residual"]):
-        parts.append(f"residual {data['residual']:.4f}")
-    unseen = data.get("held_out")  # NaN from another process comes as None
-    if unseen is not None and math.isfinite(unseen):
-        parts.append(f"held out {unseen:.4f}")
-    if data.get("eta_s") is not None:
-        parts.append(f"{_clock_time(data['eta_s'])} left")
+def fit(at: FitReached) -> str:
+    """n/N, rate, views, Gaussians (iterations have none), residuals and time left."""
+    word = at.unit or ("steps" if at.n_gaussians else "iterations")
+    parts = [f"{at.step}/{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
+    parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
+    parts += [f"{at.n_views} views"]
+    parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
+    if at.residual is not None and math.isfinite(at.residual):
+        parts.append(f"residual {at.residual:.4f}")
+    if at.held_out is not None and math.isfinite(at.held_out):
+        parts.append(f"held out {at.held_out:.4f}")
+    if at.eta_s is not None:
+        parts.append(f"{_clock_time(at.eta_s)} left")
     return ", ".join(parts)
 
 
@@ -224,37 +231,34 @@ def counting(stage: str, sink: Sink, clock: Clock) -> Callable[[int, int], None]
     """A listener that reports the progress of a stage of the work, a few times a second."""
     began, said = clock.now(), -math.inf
 
-    def listen(n: int, total: int) -> None:
+    def progress(n: int, total: int) -> None:
         nonlocal said
         now = clock.now()
         if now - said < SAY_EVERY and n < total:
             return
         said = now
         rate = n / max(now - began, 1e-9)
-        sink(Event("progress", now, {"stage": stage, "n": n, "of": total, "per_s": rate, "eta_s": (total - n) / rate}))
+        sink(Counted(stage, n, total, rate, (total - n) / rate, time=now))
 
-    return listen
+    return progress
 
 
-def results(data: Mapping[str, Any]) -> str:
-    """The result of a reconstruction, from its `done` event: files, grid, then a table of metrics by method."""
-    lines = [f"{'output':<10}{data['output']}"]
-    lines += [f"{'report':<10}{data['report']}"] if data.get("report") else []
-    lines.append(f"{'volume':<10}{' x '.join(str(n) for n in data['shape'])} in {data['units']}")
-    lines.append(f"{'axis_col':<10}{data['axis_col']:.2f}")
-    for name, key in (("chosen", "chosen"), ("next dB", "next_db_said")):
-        if key in data:
-            lines.append(f"{name:<10}{data[key]}")
-    columns = {str(data["method"]): data}
-    if BASELINE in data:
-        columns[BASELINE] = data[BASELINE]
+def results(done: VolumeDone) -> str:
+    """The result of a reconstruction: files, grid, then a table of metrics by method."""
+    lines = [f"{'output':<10}{done.output}"]
+    lines += [f"{'report':<10}{done.report}"] if done.report else []
+    lines.append(f"{'volume':<10}{' x '.join(str(n) for n in done.shape)} in {done.units}")
+    lines.append(f"{'axis_col':<10}{done.axis_col:.2f}")
+    lines += [f"{'chosen':<10}{done.chosen}"] if done.chosen else []
+    lines += [f"{'next dB':<10}{done.next_db_said}"] if done.next_db_said else []
+    columns = {done.method: done.metrics} | ({} if done.fbp is None else {BASELINE: done.fbp})
     lines.append("")
     lines.append(f"{'':<30}" + "".join(f"{name:>14}" for name in columns))
     for name, metric in METRICS.items():
         if any(name in values for values in columns.values()):
             cells = (formatted(name, values[name]) if name in values else "-" for values in columns.values())
             label = metric.label
-            if name == "seconds" and "resumed_from" in data:
+            if name == "seconds" and done.resumed_from:
                 label += ", since resumed"
             lines.append(f"{label:<30}" + "".join(f"{cell:>14}" for cell in cells))
     return "\n".join(lines)

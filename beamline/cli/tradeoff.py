@@ -15,8 +15,8 @@ from beamline.cli.recipe import repeating
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ScanStopped
-from beamline.core.events import fan_out
 from beamline.core.signals import terminated_like_interrupted
+from beamline.core.sinks import fan_out
 from drivers.base.clock import SystemClock
 from recon.methods import names, names_compared
 

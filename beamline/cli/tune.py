@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -13,8 +12,9 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
-from beamline.core.events import Announcer, Event, Sink
+from beamline.core.events import Done, Sink
 from beamline.core.signals import stop_signals
+from beamline.core.sinks import Announcer
 from beamline.core.stop import StopRequest
 
 
@@ -49,7 +49,7 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
                 found = tune_exposure(config, instrument, stop, emit, None if angle is None else math.radians(angle))
                 now = instrument.clock.now()
         for sink in json_sinks:
-            sink(Event("done", now, asdict(found)))
+            sink(Done(found, time=now))
     if not as_json:
         click.echo("\n".join(found.lines()))
     if found.faults:

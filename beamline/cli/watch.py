@@ -14,7 +14,7 @@ from typing import Self
 
 import click
 
-from beamline.core.events import Event
+from beamline.core.events import Event, RunStarted
 from beamline.core.files import RUNS
 from beamline.core.process import ChildProcess
 
@@ -64,11 +64,11 @@ class PageBeside:
     """A sink that serves the page of a run from a process of its own, as long as the context lasts.
 
     Args:
-        tell: takes the addresses, a line each. They contain the tokens, so do not log them.
+        say: takes the addresses, a line each. They hold the tokens, so that they belong into no log.
     """
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self._held = tell, ExitStack()
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._held = say, ExitStack()
 
     def __enter__(self) -> Self:
         return self
@@ -77,20 +77,20 @@ class PageBeside:
         self._held.close()
 
     def __call__(self, event: Event) -> None:
-        if event.event != "run_started":
+        if not isinstance(event, RunStarted):
             return
-        page = ["watch", str(event.data["folder"]), "--control", "--until-stdin-ends"]
+        page = ["watch", str(event.folder), "--control", "--until-stdin-ends"]
         command = [sys.executable, "-m", "beamline.cli.main", *page]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
             self._held.enter_context(ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True))
         except OSError as error:
-            self._tell(f"There is no page ({error}). The scan is not affected.")
+            self._say(f"There is no page ({error}). The scan is not affected.")
 
     def _pass_on(self, line: str) -> None:
         what, _, address = line.strip().partition(" ")
         if what in (LOOK, ACT):
-            self._tell(f"Page, to {what}: {address.strip()}")
+            self._say(f"Page, to {what}: {address.strip()}")
 
 
 def _end_with_stdin() -> None:

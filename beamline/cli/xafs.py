@@ -17,8 +17,9 @@ from beamline.cli.options import POSITIVE, SEED, FiniteRange
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Event, fan_out
+from beamline.core.events import Done
 from beamline.core.signals import stop_signals
+from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
 
@@ -145,7 +146,7 @@ def xafs(
         write(result, target)
         for done in sinks:
             data = result.data() | {"picture": target, "table": table_beside(target), "stopped": run.stopped}
-            done(Event("done", clock.now(), data))
+            done(Done(data, time=clock.now()))
     if not as_json:
         click.echo("\n".join([*lines(result), f"written     {target}, {table_beside(target)}"]))
     if run.stopped:

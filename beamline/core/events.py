@@ -1,49 +1,91 @@
-"""Events: everything that happens in a run, in one vocabulary; terminal, events.jsonl and log are sinks of them."""
+"""Events: everything that happens in a run, one class a kind. Terminal, events.jsonl and log are sinks of them."""
 
 from __future__ import annotations
 
 import json
-import threading
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from pathlib import Path
-from queue import SimpleQueue
-from types import MappingProxyType, TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, ClassVar, dataclass_transform
 
 import numpy as np
 
-from drivers.base.clock import Clock
+KINDS: dict[str, list[type[Event]]] = {}
+"""The classes of each kind; each class below enters itself. Forms of one kind are told apart by their fields."""
+_SPREAD = {"spread": True}  # of a field whose own values stand in the line, a mapping or a dataclass
 
 
-@dataclass(frozen=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+@dataclass(frozen=True, kw_only=True)
 class Event:
-    """One event.
+    """Something that happened; each kind is a frozen dataclass. A field that has its default is not written.
 
     Attributes:
-        event: its kind, one word of the vocabulary below.
-        time: s since the Unix epoch.
-        data: its values, by name.
-
-    Vocabulary: run_started, state, block_started, frame (throttled), block_done, beam, flag, warning, snapshot, enough,
-    progress, scan_done, recon_started, recon_done, tradeoff_started, study_started, trial, bench_started, bench,
-    explain, check, done, failed.
-    Events of a live reconstruction have source="recon".
+        event: its kind, as a JSON line names it.
+        time: s since the Unix epoch; the announcer of a run sets it.
+        source: "recon": an event of the live reconstruction of a scan.
+        scan: in a batch, the file that it is about.
     """
 
-    event: str
-    time: float
-    data: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    event: ClassVar[str]
+    time: float = math.nan
+    source: str | None = None
+    scan: str | None = None
+
+    def __init_subclass__(cls, event: str = "") -> None:
+        dataclass(frozen=True)(cls)
+        cls.event = event
+        if event:
+            KINDS.setdefault(event, []).append(cls)
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """Its values by name, as a JSON line has them."""
+        found: dict[str, Any] = {}
+        own = [each for each in fields(self) if each.name not in ("time", "source", "scan")]
+        for each in (*own, *(each for each in fields(Event) if each.name != "time")):
+            value = getattr(self, each.name)
+            if each.metadata == _SPREAD:
+                found |= _values_of(value) if is_dataclass(value) else value
+            elif value is not each.default:
+                found[each.name] = value
+        return found
 
     def to_json(self) -> str:
-        """One line of JSON; NaN and infinities become null, arrays become lists, paths strings."""
+        """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
         return json.dumps({"event": self.event, "time": round(self.time, 6), **_plain(self.data)}, allow_nan=False)
 
 
 Sink = Callable[[Event], None]
+"""Takes events."""
+
+
+def event_of(values: Mapping[str, Any]) -> Event:
+    """The event of a JSON line of another process.
+
+    Raises:
+        ValueError: no kind of event has these values.
+    """
+    given = {name: value for name, value in values.items() if name != "event"}
+    for each in KINDS.get(str(values.get("event")), ()):
+        spread = [item.name for item in fields(each) if item.metadata == _SPREAD]
+        named = {item.name: item for item in fields(each) if item.name not in spread}
+        rest = {name: value for name, value in given.items() if name not in named}
+        needed = {name for name, item in named.items() if item.default is MISSING}
+        if needed <= given.keys() and (spread or not rest):
+            taken: dict[str, Any] = {name: value for name, value in given.items() if name in named}
+            return each(**taken | dict.fromkeys(spread, rest))
+    raise ValueError(f"no kind of event has the values {dict(values)}")
+
+
+def _values_of(value: Any) -> dict[str, Any]:
+    return {each.name: getattr(value, each.name) for each in fields(value)}
 
 
 def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        value = _values_of(value)
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -59,96 +101,321 @@ def _plain(value: Any) -> Any:
     return value if value is None else str(value)
 
 
-class JsonLines:
-    """A sink that writes one JSON line per event and flushes it, so that a crash loses no earlier event."""
+class RunStarted(Event, event="run_started"):
+    """A scan begins; nothing has moved. duration: planned, s; remarks: of the plan, for people."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def __call__(self, event: Event) -> None:
-        self._stream.write(event.to_json() + "\n")
-        self._stream.flush()
-
-
-def fan_out(*sinks: Sink) -> Sink:
-    """A sink that passes each event to all of `sinks`, in order."""
-
-    def send(event: Event) -> None:
-        for sink in sinks:
-            sink(event)
-
-    return send
+    folder: Path
+    path: Path
+    sample: str
+    n_frames: int
+    duration: float
+    total_bytes: int
+    remarks: Sequence[str]
 
 
-def while_it_works(sink: Sink, tell: Sink) -> Sink:
-    """A sink that gets events until it raises (a full disk, a closed pipe); `tell` then gets a warning, once."""
-    works = True
+class StateEntered(Event, event="state"):
+    """A scan enters a state, or has something to say in it; of a reconstruction, `state` is a topic.
 
-    def send(event: Event) -> None:
-        nonlocal works
-        if not works:
-            return
-        try:
-            sink(event)
-        except Exception as error:
-            works = False
-            message = f"An output of events failed and gets no further events: {error}"
-            tell(Event("warning", event.time, {"message": message}))
-
-    return send
-
-
-Emit = Callable[[str, Mapping[str, Any]], None]
-"""(kind of event, data): the event happened now."""
-
-
-class Warnings:
-    """Sends each warning on as an event, once, and keeps it in `messages` for the report."""
-
-    def __init__(self, sink: Sink, clock: Clock) -> None:
-        self._sink, self._clock = sink, clock
-        self.messages: list[str] = []
-
-    def __call__(self, text: str) -> None:
-        if text not in self.messages:
-            self.messages.append(text)
-            self._sink(Event("warning", self._clock.now(), {"message": text}))
-
-
-_PATIENCE = 10.0  # s
-
-
-class Announcer:
-    """Passes events to sinks in a thread of its own. Leaving the context waits until all events have been passed on.
-
-    It waits for `_PATIENCE` s at most: a terminal or pipe that nobody reads takes no event, and must not keep the
-    program from ending. A sink that raises (a closed pipe, a full disk) gets no further events; the others get a
-    warning.
+    Attributes:
+        message: for people; may be empty.
+        more: values beside it, by name: the picture of `ready`, the prediction of `gain`.
     """
 
-    def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:
-        self._sinks, self._clock = [while_it_works(sink, self._send) for sink in sinks], clock
-        self._queue: SimpleQueue[Event | None] = SimpleQueue()
-        self._thread = threading.Thread(target=self._deliver, name="announcer", daemon=True)
+    state: str
+    message: str
+    more: Any = field(default_factory=dict, metadata=_SPREAD)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._queue.put(None)
-        self._thread.join(_PATIENCE)
+class BlockStarted(Event, event="block_started"):
+    """Darks, flats or projections begin. first_row: of the file; exposure, period: s."""
 
-    def __call__(self, event: str, data: Mapping[str, Any]) -> None:
-        """Queue the event with the current time; returns at once."""
-        self._queue.put(Event(event, self._clock.now(), data))
+    kind: str
+    mode: str
+    n: int
+    first_row: int
+    exposure: float
+    period: float
 
-    def _deliver(self) -> None:
-        while (event := self._queue.get()) is not None:
-            self._send(event)
 
-    def _send(self, event: Event) -> None:
-        for sink in self._sinks:
-            sink(event)
+class BlockDone(Event, event="block_done"):
+    """A block is over. missing: planned triggers without a frame; lost, ignored, extra: see scan.ledger."""
+
+    kind: str
+    mode: str
+    n: int
+    first_row: int
+    frames: int
+    missing: Sequence[int]
+    lost: int
+    ignored: int
+    extra: int
+
+
+class FrameStored(Event, event="frame"):
+    """A frame is in the file; ten times a second at most. mean: of its counts; simulations do not say it."""
+
+    n: int
+    of: int
+    kind: str
+    frames_per_s: float
+    mb_per_s: float
+    eta_s: float
+    mean: float | None = None
+
+
+class BeamRead(Event, event="beam"):
+    """A reading of the beam monitor. read_at: s since the Unix epoch."""
+
+    value: float
+    unit: str
+    read_at: float
+
+
+class FrameFlagged(Event, event="flag"):
+    """A check of the monitor begins to flag, or flags at another level; the fields are those of `monitor.Flag`."""
+
+    check: str
+    level: str
+    frame: int
+    score: float
+    limit: float
+    advice: str
+    region: Sequence[int] | None
+    first: int | None
+
+
+class RuleBroken(Event, event="flag"):
+    """A rule of a format that a file does not keep."""
+
+    severity: str
+    rule: str
+    message: str
+
+
+class Warned(Event, event="warning"):
+    """Something is not as it should be, and the work goes on."""
+
+    message: str
+    state: str | None = None
+
+
+class SnapshotWritten(Event, event="snapshot"):
+    """The volume so far is in a file. unlearnt: relative residual of new views before the fit has learnt them."""
+
+    path: Path
+    picture: Path
+    n_views: int
+    seconds: float
+    unlearnt: float | None
+
+
+class EnoughReached(Event, event="enough"):
+    """The views so far are enough: the others would add `mean` dB, between `low` and `high`."""
+
+    n_views: int
+    planned: int
+    mean: float
+    low: float
+    high: float
+
+
+class Counted(Event, event="progress"):
+    """n of so many frames, slices, views or axes are done; `stage` names the work."""
+
+    stage: str
+    n: int
+    of: int
+    per_s: float
+    eta_s: float
+
+
+class PhaseReached(Event, event="progress"):
+    """A phase of a work begins (n is 0), or n of so many `counted` are done. None: not known."""
+
+    stage: str
+    counted: str
+    phase: str
+    n: int
+    of: int
+    per_s: float | None
+    eta_s: float | None
+
+
+class TrialReached(Event, event="progress"):
+    """n of so many trials, scans or runs are done, and `label` begins."""
+
+    stage: str
+    n: int
+    of: int
+    label: str
+    eta_s: float | None
+    per_min: float
+
+
+class KernelsCompiled(Event, event="progress"):
+    """So many kernels were compiled in so many seconds."""
+
+    stage: str
+    n: int
+    seconds: float
+
+
+class FitReached(Event, event="progress"):
+    """Where a fit or iterations stand; the fields are those of `recon.base.method.Progress`, a rate and a time left.
+
+    Numbers of another process are None where they are not finite.
+    """
+
+    stage: str
+    step: int
+    steps: int
+    seconds: float
+    loss: float | None
+    residual: float | None
+    n_gaussians: int
+    n_views: int
+    held_out: float | None
+    unit: str
+    per_s: float | None
+    eta_s: float | None
+
+
+class ScanDone(Event, event="scan_done"):
+    """The scan file is closed; the fields are those of `scan.run.RunResult`, and the status of the file."""
+
+    path: Path
+    n_frames: int
+    missing: Sequence[int]
+    flags: Mapping[str, Mapping[str, int]]
+    alarmed_frames: int
+    alarmed_views: int
+    retaken: int
+    reference_faults: Sequence[str]
+    seconds: float
+    bytes: int
+    recon: Mapping[str, Any] | None
+    status: str
+
+
+class ReconStarted(Event, event="recon_started"):
+    """Line integrals are ready, and the method begins. again: a live one, anew, as its axis has moved.
+
+    more: of a finished scan, values by name; `axis_confident` is None where the axis was given.
+    """
+
+    file: Path | str
+    method: str
+    n_views: int
+    axis_col: float
+    again: bool | None = None
+    more: Mapping[str, Any] = field(default_factory=dict, metadata=_SPREAD)
+
+
+class Listed(Event):
+    """An event that is printed as it is. values: by name, a mapping or a dataclass."""
+
+    values: Any = field(metadata=_SPREAD)
+
+
+class ReconDone(Listed, event="recon_done"):
+    """The live reconstruction wrote its volume; the values are those of its event `done`, see `VolumeDone`."""
+
+
+class TradeoffStarted(Event, event="tradeoff_started"):
+    """Trials begin. by: the metric that they are compared by."""
+
+    file: Path | str
+    trials: int
+    by: str
+
+
+class StudyStarted(Event, event="study_started"):
+    """The rows of a study begin."""
+
+    file: Path | str
+    rows: int
+    left_out: int
+    study: str
+
+
+class TrialDone(Event, event="trial"):
+    """One trial or row has ended. figures: its settings and metrics, by name."""
+
+    n: int
+    of: int
+    label: str
+    status: str
+    seconds: float
+    message: str
+    quality_db: float
+    peak_bytes: int | None
+    figures: Mapping[str, Any] = field(metadata=_SPREAD)
+
+
+class BenchStarted(Listed, event="bench_started"):
+    """Measurements of speed begin; the values are the machine and what is measured."""
+
+
+class BenchDone(Listed, event="bench"):
+    """One row of the table of a bench."""
+
+
+class CostExplained(Listed, event="explain"):
+    """What a frame of a scene costs, by effect."""
+
+
+class Diagnosed(Listed, event="check"):
+    """One result of `beamline doctor`."""
+
+
+class VolumeDone(Event, event="done"):
+    """A reconstruction has ended well.
+
+    Attributes:
+        output, report: files of the volume and of its report.
+        shape, units: of the volume [z, y, x].
+        elapsed, times: s in all, and of each phase.
+        metrics: of the volume, by name; `seconds` and the residuals are among them.
+        ended_early, resumed_from, checkpoint_lost: where that is so.
+        hiding: the warning of what the volume hides, where it does.
+        chosen: how `auto` came to its method. next_db, next_db_said: what one more decibel costs.
+        fbp: metrics of the FBP that it is compared with.
+    """
+
+    output: Path
+    report: Path | None
+    method: str
+    axis_col: float
+    n_views: int
+    shape: Sequence[int]
+    units: str
+    elapsed: float
+    times: Mapping[str, float]
+    metrics: Mapping[str, float] = field(metadata=_SPREAD)
+    ended_early: Any = None
+    resumed_from: str | None = None
+    checkpoint_lost: str | None = None
+    hiding: str | None = None
+    chosen: str | None = None
+    next_db: Any = None
+    next_db_said: str | None = None
+    fbp: Mapping[str, float] | None = None
+
+
+class RunDone(Event, event="done"):
+    """A run has ended well. result: `scan.run.RunResult`."""
+
+    folder: Path
+    result: Any = field(metadata=_SPREAD)
+
+
+class Done(Listed, event="done"):
+    """A command has ended well; the values are what it found or wrote."""
+
+
+class Failed(Event, event="failed"):
+    """A command has ended otherwise. folder: of the run."""
+
+    message: str
+    exit_code: int | None = None
+    folder: Path | None = None

@@ -3,58 +3,70 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any, TextIO
+from typing import TextIO
 
-from beamline.core.events import Event
+from beamline.core.events import (
+    BlockDone,
+    BlockStarted,
+    EnoughReached,
+    Event,
+    Failed,
+    FrameFlagged,
+    ReconDone,
+    ReconStarted,
+    RunDone,
+    RunStarted,
+    ScanDone,
+    SnapshotWritten,
+    StateEntered,
+    StudyStarted,
+    TradeoffStarted,
+    TrialDone,
+    Warned,
+)
 from beamline.core.text import size, spans
 
 
 def sentence(event: Event) -> str | None:
     """The event as a sentence; None for events that only update a progress display."""
-    data = event.data
-    match event.event:
-        case "run_started":
-            size_text = size(data["total_bytes"])
-            return f"Run {data['folder']}: {data['n_frames']} frames, {size_text}, {data['duration']:.0f} s"
-        case "state" | "warning":
-            text = str(data["message"])
-            return f"Warning: {text}" if event.event == "warning" else text or None
-        case "block_started":
-            return f"{data['n']} {data['kind']} frames ({data['mode']}, {data['exposure']:g} s each)"
-        case "block_done":
-            return _missing(data)
-        case "flag":
-            return f"{str(data['level']).capitalize()} ({data['check']}, frame {data['frame']}): {data['advice']}"
-        case "recon_started":
-            again = " again, from the start" if data.get("again") else ""
-            axis = f"rotation axis at column {data['axis_col']:.2f}"
-            return f"{data['method']}{again}: {data['n_views']} views, {axis}"
-        case "tradeoff_started":
-            return f"{data['trials']} trials of {data['file']}, quality by {data['by']}"
-        case "study_started":
-            return f"{data['study']}: {data['rows']} reconstructions of {data['file']}"
-        case "trial":
-            return _trial(data)
-        case "snapshot":
-            return f"Volume from {data['n_views']} views so far: {data['path']}"
-        case "enough":
-            spread = f"{data['mean']:.2f} dB ({data['low']:.2f} to {data['high']:.2f})"
-            return f"Enough views: {data['n_views']} of {data['planned']}; the others would add {spread}"
-        case "scan_done":
-            alarms = f", {data['alarmed_frames']} WITH AN ALARM" if data.get("alarmed_frames") else ""
-            again = f", {data['retaken']} views taken again" if data.get("retaken") else ""
-            return (
-                f"Scan {data['status']}: {data['n_frames']} frames{again}{alarms}, {size(data['bytes'])}, "
-                f"{data['seconds']:.1f} s: {data['path']}"
-            )
-        case "recon_done":
-            return f"Volume: {data.get('output', '')}"
-        case "failed":
-            return f"Failed: {data['message']}"
-        case "done":
-            return f"Done: {data['folder']}"
+    match event:
+        case RunStarted(folder, _, _, n, duration, total_bytes):
+            return f"Run {folder}: {n} frames, {size(total_bytes)}, {duration:.0f} s"
+        case StateEntered(message=message):
+            return message or None
+        case Warned(message):
+            return f"Warning: {message}"
+        case BlockStarted(kind, mode, n, exposure=exposure):
+            return f"{n} {kind} frames ({mode}, {exposure:g} s each)"
+        case BlockDone():
+            return _missing(event)
+        case FrameFlagged(check, level, frame, advice=advice):
+            return f"{level.capitalize()} ({check}, frame {frame}): {advice}"
+        case ReconStarted():
+            again = " again, from the start" if event.again else ""
+            return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
+        case TradeoffStarted(file, trials, by):
+            return f"{trials} trials of {file}, quality by {by}"
+        case StudyStarted(file, rows, study=study):
+            return f"{study}: {rows} reconstructions of {file}"
+        case TrialDone():
+            return _trial(event)
+        case SnapshotWritten(path, n_views=n_views):
+            return f"Volume from {n_views} views so far: {path}"
+        case EnoughReached(n, planned, mean, low, high):
+            spread = f"{mean:.2f} dB ({low:.2f} to {high:.2f})"
+            return f"Enough views: {n} of {planned}; the others would add {spread}"
+        case ScanDone(path, n, seconds=seconds, bytes=written):
+            alarms = f", {event.alarmed_frames} WITH AN ALARM" if event.alarmed_frames else ""
+            again = f", {event.retaken} views taken again" if event.retaken else ""
+            return f"Scan {event.status}: {n} frames{again}{alarms}, {size(written)}, {seconds:.1f} s: {path}"
+        case ReconDone(values):
+            return f"Volume: {values.get('output', '')}"
+        case Failed(message):
+            return f"Failed: {message}"
+        case RunDone(folder):
+            return f"Done: {folder}"
     return None
 
 
@@ -72,16 +84,16 @@ class UserLog:
             self._stream.flush()
 
 
-def _trial(data: Mapping[str, Any]) -> str:
-    begin = f"{data['n']}/{data['of']} {data['label']}: "
-    if data["status"] != "done":
-        return begin + f"{data['status']}: {data['message']}"
-    quality = f", {data['quality_db']:.2f} dB" if math.isfinite(data["quality_db"]) else ""
-    memory = "" if data["peak_bytes"] is None else f", {size(data['peak_bytes'])}"
-    return begin + f"{data['seconds']:.2f} s{quality}{memory}"
+def _trial(trial: TrialDone) -> str:
+    begin = f"{trial.n}/{trial.of} {trial.label}: "
+    if trial.status != "done":
+        return begin + f"{trial.status}: {trial.message}"
+    quality = f", {trial.quality_db:.2f} dB" if math.isfinite(trial.quality_db) else ""
+    memory = "" if trial.peak_bytes is None else f", {size(trial.peak_bytes)}"
+    return begin + f"{trial.seconds:.2f} s{quality}{memory}"
 
 
-def _missing(data: Mapping[str, Any]) -> str | None:
-    parts = [f"{len(data['missing'])} missing ({spans(data['missing'])})"] if data["missing"] else []
-    parts += [f"{data['extra']} without a trigger"] if data["extra"] else []
-    return f"Of {data['n']} {data['kind']} frames: {', '.join(parts)}" if parts else None
+def _missing(block: BlockDone) -> str | None:
+    parts = [f"{len(block.missing)} missing ({spans(block.missing)})"] if block.missing else []
+    parts += [f"{block.extra} without a trigger"] if block.extra else []
+    return f"Of {block.n} {block.kind} frames: {', '.join(parts)}" if parts else None

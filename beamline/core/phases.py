@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from beamline.core.events import Event, Sink
+from beamline.core.events import PhaseReached, Sink
 from drivers.base.clock import Clock, SystemClock
 
 _SAY_EVERY = 0.2  # s between events on the progress of a phase
@@ -30,10 +30,10 @@ class Phases:
         """End the last phase and begin this one; its progress counts up to `counted`."""
         self.end()
         self._name, self._counted, self._said = name, counted, -math.inf
-        self._say({"phase": name, "n": 0, "of": 0, "per_s": None, "eta_s": None})
+        self._say(0, 0, None, None)
 
-    def told(self, n: int, total: int) -> None:
-        """Report the progress of the phase, if there is any."""
+    def progress(self, n: int, total: int) -> None:
+        """So much of the phase is done; of nothing nothing is said."""
         now = self._clock.now()
         if not n:
             return
@@ -41,7 +41,7 @@ class Phases:
             self._said = now
             rate = n / max(now - self._begun, 1e-9)
             left = (total - n) / rate if rate > 0 else None
-            self._say({"phase": self._name, "n": n, "of": total, "per_s": rate, "eta_s": left})
+            self._say(n, total, rate, left)
 
     def end(self) -> None:
         """End the last phase now."""
@@ -51,5 +51,5 @@ class Phases:
             self._begun = now
         self._name = ""
 
-    def _say(self, data: dict[str, object]) -> None:
-        self._sink(Event("progress", self._clock.now(), {"stage": "phase", "counted": self._counted, **data}))
+    def _say(self, n: int, of: int, per_s: float | None, eta_s: float | None) -> None:
+        self._sink(PhaseReached("phase", self._counted, self._name, n, of, per_s, eta_s, time=self._clock.now()))

@@ -205,7 +205,7 @@ def _with_monitor(load: Load, folder: Path, n: int, clock: Clock) -> int:
 def _pipeline(load: Load, folder: Path, n: int, clock: Clock) -> int:
     writer = _writer(load, folder, clock)
     monitor = start(load.context, load.checks)
-    recorder = Recorder(writer, monitor, load.timeline(n), preview_bin=load.preview_bin, emit=lambda event, data: None)
+    recorder = Recorder(writer, monitor, load.timeline(n), preview_bin=load.preview_bin, sink=lambda event: None)
     status = "failed"
     try:
         for row in range(n):
@@ -235,14 +235,14 @@ is what the others are compared with."""
 
 
 def rates(
-    load: Load, folder: Path, clock: Clock, seconds: float, rounds: int, said: Callable[[int, int, str], None]
+    load: Load, folder: Path, clock: Clock, seconds: float, rounds: int, progress: Callable[[int, int, str], None]
 ) -> Iterator[StageRun]:
     """Measure all stages, `rounds` times in turn, in about so many seconds; each removes its file.
 
     The stages of a round have the same number of frames, at most what half of the free disk holds.
 
     Args:
-        said: told how many of all measurements are done, and which comes next.
+        progress: told how many of all measurements are done, and which comes next.
 
     Raises:
         DataError: the folder is not there or cannot be written to, or its disk has too little space.
@@ -262,7 +262,7 @@ def rates(
         n = FEWEST if at == 0 else int(min(max(share / slowest, FEWEST), most))
         names = list(STAGES)
         for name in names[at % len(names) :] + names[: at % len(names)]:
-            said(done, total, name if at else f"{name}, to warm up")
+            progress(done, total, name if at else f"{name}, to warm up")
             taken = _measure(name, load, folder, n, clock)
             done += 1
             if at:
@@ -270,7 +270,7 @@ def rates(
             else:
                 again = _measure(name, load, folder, n, clock)  # the kernels are compiled now
                 slowest = max(slowest, again.seconds / n)
-    said(total, total, "")
+    progress(total, total, "")
 
 
 def summary(load: Load, taken: Sequence[StageRun]) -> list[RateRow]:

@@ -67,7 +67,7 @@ def options_of(camera: DcamOrca) -> DcamOptions:
         global_exposure=options.GlobalExposure(camera.global_exposure),
         trigger_times=camera.trigger_times,
         trigger_delay=camera.trigger_delay_s,
-        hot_pixels=None if camera.hot_pixels is None else options.HotPixels(camera.hot_pixels),
+        hot_pixels=None if camera.hot_pixels is None else options.HotPixelMode(camera.hot_pixels),
         exposure_tolerance=camera.exposure_tolerance,
         ring_bytes=camera.ring_mb * 1_000_000,
     )

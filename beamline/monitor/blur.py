@@ -179,12 +179,12 @@ def _loss(now: float, usual: FrameScatter) -> float:
 
 
 @njit(nogil=True, inline="always")
-def _clipped(x, most):  # type: ignore[no-untyped-def]
+def _clipped(x, most):
     return min(max(x, -most), most)
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def _product(one, two):  # type: ignore[no-untyped-def]
+def _product(one, two):
     total = np.float32(0)
     for i in range(one.size):
         total += one[i] * two[i]
@@ -192,7 +192,7 @@ def _product(one, two):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def _contrasts(lines, dark, scale, strip, sums):  # type: ignore[no-untyped-def]  # numba infers the types
+def _contrasts(lines, dark, scale, strip, sums):
     """Fills `sums`: near and far along the rows, near and far along the columns."""
     rows, cols = lines.shape
     light, lit = np.empty((strip, cols), np.float32), np.empty((strip, cols), np.float32)

@@ -124,7 +124,7 @@ def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
 
 
 @njit(nogil=True, cache=True)
-def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers the types
+def _smooth(image, out, line):
     """Binomial 1 2 1 along both axes; the frame's edges are mirrors."""
     rows, cols = image.shape
     for row in range(rows):
@@ -140,7 +140,7 @@ def _smooth(image, out, line):  # type: ignore[no-untyped-def]  # numba infers t
 
 
 @njit(nogil=True, cache=True)
-def _deviate(change, usual, weight, deviation, sample):  # type: ignore[no-untyped-def]
+def _deviate(change, usual, weight, deviation, sample):
     """Fills `deviation`; `sample` gets that of one cell of five, of those with a weight: their number."""
     n = 0
     for row in range(change.shape[0]):
@@ -175,7 +175,7 @@ def _shares(change: CellValues, usual: float, weight: CellValues) -> CellValues:
 
 
 @njit(nogil=True, cache=True)
-def _add_normal(smooth, image, turning, weight, share, normal, right):  # type: ignore[no-untyped-def]
+def _add_normal(smooth, image, turning, weight, share, normal, right):
     """Adds the normal equations of the four causes: the upper half of `normal` [4, 4], and `right` [4]."""
     rows, cols = smooth.shape
     basis = np.zeros(4)
@@ -196,8 +196,8 @@ def _add_normal(smooth, image, turning, weight, share, normal, right):  # type: 
 
 
 @njit(nogil=True, cache=True)
-def _take_off(change, smooth, image, turning, weight, solution, residual, left_over):  # type: ignore[no-untyped-def]
-    """Fills `residual` and `left_over`: the change, and the smoothed change, without the causes' part."""
+def _take_off(change, smooth, image, turning, weight, solution, residual, left_over):
+    """Fills `residual` and `left_over`, what the causes do not explain of the change and of the smooth one."""
     rows, cols = change.shape
     for row in range(rows):
         above, below = max(row - 1, 0), min(row + 1, rows - 1)

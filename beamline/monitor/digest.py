@@ -158,7 +158,7 @@ def _entropy(histogram: NDArray[Any]) -> float:
 
 
 @njit(nogil=True, cache=True)
-def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers the types
+def _folded(sums, tops, side):
     """Sums and largest values of `side` neighbours each, from those of `side` rows. They are pairs of pairs while
     `side` is even (and their sums fit into 32 bits); the compiler makes vector instructions of them."""
     width = 1
@@ -180,7 +180,7 @@ def _folded(sums, tops, side):  # type: ignore[no-untyped-def]  # numba infers t
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: ignore[no-untyped-def]
+def _count_greys(image, full, every, preview_bin, preview, peaks):
     """(minima of columns, maximum, sum, sum of squares, pixels from `full` on, two histograms of every k-th row).
 
     Fills preview and peaks. Short loops over one line each: the compiler makes vector instructions of all but the
@@ -231,7 +231,7 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):  # type: igno
 
 
 @njit(nogil=True, cache=True)
-def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):  # type: ignore[no-untyped-def]
+def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):
     """Range and moments of the valid pixels, block by block (Chan, Golub & LeVeque 1983), and preview and peaks."""
     rows, cols = image.shape
     n, saturated = 0, 0
@@ -271,7 +271,7 @@ def _sum_reals(image, saturation, preview_bin, no_data, preview, peaks):  # type
 
 
 @njit(nogil=True, cache=True)
-def _count_reals(image, low, high, no_data):  # type: ignore[no-untyped-def]
+def _count_reals(image, low, high, no_data):
     """Histogram of the valid pixels in ENTROPY_BINS equal bins over [low, high]."""
     histogram = np.zeros(ENTROPY_BINS, np.int64)
     scale = ENTROPY_BINS / (high - low)

@@ -89,7 +89,7 @@ def filters(lags: tuple[int, ...], clutter: Clutter, signals: Reals, speeds: Rea
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def correlate(views, weights, out):  # type: ignore[no-untyped-def]  # numba infers the types
+def correlate(views, weights, out):
     """out[signal, row, col] of views [lag, row, col]; beyond the frame's edges it goes on as at the edge.
 
     The taps are written out: the sum then stays in a register, which halves the time.

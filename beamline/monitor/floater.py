@@ -173,7 +173,7 @@ def _smooth(depth: CellValues) -> CellValues:
 
 
 @njit(nogil=True, cache=True)
-def _peaks(outputs, weight, light, usual, memory, least, peaks):  # type: ignore[no-untyped-def]  # numba infers the types
+def _peaks(outputs, weight, light, usual, memory, least, peaks):
     """Fills `peaks` with (nothing, row, col, score) of the local maxima above `least`, until it is full: their number.
 
     `usual` becomes its mean with this view's, whose weight is `memory`.

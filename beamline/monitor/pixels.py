@@ -110,7 +110,7 @@ def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlace
 
 
 @njit(nogil=True, cache=True)
-def _darker(counts, limit, block, places):  # type: ignore[no-untyped-def]  # numba infers the types
+def _darker(counts, limit, block, places):
     """Fills `places` with the pixels below the limit of their block, until it is full: their number."""
     n = 0
     for row in range(counts.shape[0]):

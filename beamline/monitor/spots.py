@@ -59,7 +59,7 @@ def spots_of(
 
 
 @njit(nogil=True, cache=True)
-def _isolated(peaks, means, before, dark, noises, places):  # type: ignore[no-untyped-def]  # numba infers the types
+def _isolated(peaks, means, before, dark, noises, places):
     """Number of blocks with a spot; the first of them go into `places`."""
     rows, cols = peaks.shape
     n = 0

@@ -79,7 +79,7 @@ def best_trail(older: Peaks, newer: Peaks, rules: Rules, middle: float, turn: fl
 
 
 @njit(nogil=True, cache=True)
-def _search(older, newer, rules, sample, found):  # type: ignore[no-untyped-def]  # numba infers the types
+def _search(older, newer, rules, sample, found):
     least, share, enough, rows, cols, slack = rules
     middle, turn, radius = sample
     best = enough

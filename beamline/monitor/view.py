@@ -163,7 +163,7 @@ def _binned(preview: NDArray[np.float32], blocks: int) -> tuple[CellValues, Cell
 
 
 @njit(nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def _bin(preview, blocks, cells, row_mean, col_mean):  # type: ignore[no-untyped-def]  # numba infers the types
+def _bin(preview, blocks, cells, row_mean, col_mean):
     rows, cols = preview.shape
     for row in range(rows):
         line = preview[row]
@@ -184,7 +184,7 @@ def _bin(preview, blocks, cells, row_mean, col_mean):  # type: ignore[no-untyped
 
 
 @njit(nogil=True, cache=True)
-def _line_integrals(counts, dark, full, lit, scale, darkest, depth, weight):  # type: ignore[no-untyped-def]
+def _line_integrals(counts, dark, full, lit, scale, darkest, depth, weight):
     for row in range(counts.shape[0]):
         for col in range(counts.shape[1]):
             through = max((counts[row, col] - dark[row, col]) / full[row, col] * scale, darkest)

@@ -19,8 +19,6 @@ from beamline.storage.readers.base import ScanSource
 from recon.axis_by_views import COLS, VIEWS, axis_by_views
 from recon.prep.align import AxisError, AxisEstimate, find_axis
 
-Told = Callable[[int, int], None]
-
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
 _CANDIDATES = 14  # of the axis of a cone, usually
@@ -32,7 +30,7 @@ def rotation_axis(
     correction: ScanCorrection,
     usable: UsableViews,
     warn: Warn,
-    told: Told,
+    progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
     """The axis in columns of the full detector, and how it was found; None where it was given.
 
@@ -42,17 +40,17 @@ def rotation_axis(
     """
     axis_col, axis = selection.axis_col, None
     if axis_col is None and cone_of(source, selection) is not None:
-        axis_col, axis = _axis_of_cone(source, selection, usable, warn, told)
+        axis_col, axis = _axis_of_cone(source, selection, usable, warn, progress)
     elif axis_col is None:
         whole = selection.axis_rows
         by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
-        axis_col, axis = _axis_beside_jumps(source, by, usable, warn, told)
+        axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
     return axis_col, axis
 
 
 def _axis_of_cone(
-    source: ScanSource, selection: Selection, usable: UsableViews, warn: Warn, told: Told
+    source: ScanSource, selection: Selection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
 ) -> tuple[float, AxisEstimate | None]:
     """The axis by views held out. What the file states stays, unless they agree better with another one."""
     stated, cols = source.axis_col, source.shape[1]
@@ -66,7 +64,7 @@ def _axis_of_cone(
     geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])
     try:
         found = axis_by_views(
-            views.data, geometry, lambda n: told(n, max(n, _CANDIDATES)), near=stated is not None
+            views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)), near=stated is not None
         )  # fmt: skip
     except ValueError as error:
         if stated is not None:
@@ -93,16 +91,16 @@ def _axis_beside_jumps(
     correction: ScanCorrection,
     usable: UsableViews,
     warn: Warn,
-    told: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis by the longest part between jumps, where that shows it clearly, else by all views."""
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
-            found = locate_axis(source, correction, part, lambda _: None, told)
+            found = locate_axis(source, correction, part, lambda _: None, progress)
             if found[1].confident:
                 return found
-    return locate_axis(source, correction, usable.frames, warn, told)
+    return locate_axis(source, correction, usable.frames, warn, progress)
 
 
 def locate_axis(
@@ -110,7 +108,7 @@ def locate_axis(
     correction: ScanCorrection,
     frames: NDArray[np.int64],
     warn: Warn,
-    told: Told = lambda n, total: None,
+    progress: Callable[[int, int], None] = lambda n, total: None,
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
 
@@ -122,7 +120,7 @@ def locate_axis(
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
     frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
-    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), told)
+    band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
     try:
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:

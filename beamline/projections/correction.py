@@ -28,7 +28,7 @@ from beamline.projections.steps.defects import Defects
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.flats import Flats
 from beamline.projections.steps.references import ReferenceCheck
-from beamline.projections.steps.step import Done, ViewFilter, ViewStep
+from beamline.projections.steps.step import StepDone, ViewFilter, ViewStep
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
@@ -64,7 +64,7 @@ class ScanCorrection:
         self.rows, self.binning = rows_of(source, selection), selection.binning
         counted = selection.step(CountModel).noise == "counts"
         self._filters: list[ViewFilter] = []
-        self._filtered: dict[str, Done] = {}
+        self._filtered: dict[str, StepDone] = {}
         for step in selection.in_order:
             if isinstance(step, ViewStep):
                 found, self._filtered[step.name] = step.on(source, selection)
@@ -106,35 +106,35 @@ class ScanCorrection:
         self,
         frames: NDArray[np.int64],
         rows: slice | None = None,
-        told: Callable[[int, int], None] = lambda n, total: None,
+        progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
         """Line integrals of `frames` (rows of the file), without those that hold no finite pixel: see `view_ids`.
 
         Args:
             frames: rows of the file, in the order they were taken.
             rows: narrows the detector rows, in binned rows.
-            told: how many of how many frames are done; each is read, divided by the flat, and freed of zingers.
+            progress: how many of how many frames are done; each is read, divided by the flat, and freed of zingers.
 
         Raises:
             DataError: frames that cannot be corrected; the message names the file.
         """
         self._look_for_shadow(frames)
         steps = 1 if self._references is None else _STEPS
-        data, frames = self._read(frames, rows, lambda n, of: told(n // steps, of))
+        data, frames = self._read(frames, rows, lambda n, of: progress(n // steps, of))
         if not frames.size:
             raise self._no_view()
         if self._references is None:
             return self._filtered_views(_as_given(data, frames), rows)
-        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, told=told)
+        return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, progress=progress)
 
     def in_batches(
-        self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, told: Callable[[int, int], None]
+        self, frames: NDArray[np.int64], out: NDArray[np.float32], batch: int, progress: Callable[[int, int], None]
     ) -> Projections:
         """As `at_once`, to the bit, with no more than `batch` frames in memory; the scan is read twice.
 
         Args:
             out: float32 [frame, row, col], at least so many: takes the line integrals.
-            told: how many of how many frames were read.
+            progress: how many of how many frames were read.
 
         Raises:
             DataError: as `at_once`; photons are counted: their weights would have to be in memory.
@@ -154,7 +154,7 @@ class ScanCorrection:
                 alive.append(found)
                 if found.size:
                     survey.survey(self._transmission(survey, data, found))
-                told(min((done + 1) * batch, frames.size), passes * frames.size)
+                progress(min((done + 1) * batch, frames.size), passes * frames.size)
             columns = survey.air_columns
             settings = replace(self._settings, air=columns if any(columns) else "none")
             stream = Correction(self._references, settings, masked=survey.masked)
@@ -173,7 +173,7 @@ class ScanCorrection:
             out[at : at + n] = corrected.data
             at += n
             kept.append(replace(corrected, data=np.empty((0, *out.shape[1:]), np.float32)))
-            told(begun + min((done + 1) * batch, frames.size), passes * frames.size)
+            progress(begun + min((done + 1) * batch, frames.size), passes * frames.size)
         if not at:
             raise self._no_view()
         return _joined(kept, out[:at])
@@ -207,16 +207,16 @@ class ScanCorrection:
         return None if part is None else self._filtered_views(part, None)
 
     @property
-    def done(self) -> dict[str, Done]:
+    def done(self) -> dict[str, StepDone]:
         """What each step did, by name."""
         if self._references is None:
-            return {**{name: Done(parameters={}) for name in ("flats", "defects", "noise")}, **self._filtered}
+            return {**{name: StepDone(parameters={}) for name in ("flats", "defects", "noise")}, **self._filtered}
         flats, noise, settings = self._flats, self._noise, asdict(self._settings)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in settings.items()}
         return {
-            "defects": Done(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-            "flats": Done(flats, {"flats": flats or self._selection.step(Flats).fields}),
-            "noise": Done(noise, {"noise": noise or "logarithms of counts"}),
+            "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
+            "flats": StepDone(flats, {"flats": flats or self._selection.step(Flats).fields}),
+            "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
             **self._filtered,
         }
 
@@ -282,10 +282,10 @@ class ScanCorrection:
         self,
         frames: NDArray[np.int64],
         rows: slice | None,
-        told: Callable[[int, int], None] = lambda n, total: None,
+        progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one and are not damaged, and these frames."""
-        data = read_binned(self._source, frames, self._widened(rows)[0], self.binning, told)
+        data = read_binned(self._source, frames, self._widened(rows)[0], self.binning, progress)
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             lost = frames[~alive]
@@ -366,15 +366,15 @@ class ScanCorrection:
         frames: NDArray[np.int64],
         last: bool,
         rows: slice | None = None,
-        told: Callable[[int, int], None] = lambda n, total: None,
+        progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
         n = frames.size
         try:
             views = None
             if n:
-                views = self._transmission(correction, data, frames, lambda done: told((n + done) // _STEPS, n))
+                views = self._transmission(correction, data, frames, lambda done: progress((n + done) // _STEPS, n))
                 correction.survey(views)
-            lines = correction.line_integrals(views, last, lambda done: told((2 * n + done) // _STEPS, n))
+            lines = correction.line_integrals(views, last, lambda done: progress((2 * n + done) // _STEPS, n))
             return self._filtered_views(lines, rows)
         except UnlitViewsError as error:
             judged = self._selection.step(Flags).judged
@@ -390,10 +390,10 @@ class ScanCorrection:
         correction: Correction,
         data: NDArray[Any],
         frames: NDArray[np.int64],
-        told: Callable[[int], None] = lambda done: None,
+        progress: Callable[[int], None] = lambda done: None,
     ) -> Transmission:
         try:
-            views = correction.transmission(data, frames.astype(np.float64), frames, told)
+            views = correction.transmission(data, frames.astype(np.float64), frames, progress)
         except ValueError as error:
             raise self._refusal(error) from error
         if self._current_factor is not None:

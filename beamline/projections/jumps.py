@@ -65,7 +65,7 @@ def find_jumps(
     frames: I64,
     jumps: I64,
     axis_col: float,
-    told: Callable[[int, int], None] = lambda n, most: None,
+    progress: Callable[[int, int], None] = lambda n, most: None,
 ) -> Jumps:
     """Where the sample was in each part of a scan between jumps, and which of the views can be used.
 
@@ -76,7 +76,7 @@ def find_jumps(
     Args:
         frames: rows of the file that are to be used.
         jumps: rows from which on the sample is elsewhere.
-        told: how many guesses of where it moved were made, of at most how many.
+        progress: how many guesses of where it moved were made, of at most how many.
     """
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
@@ -95,7 +95,7 @@ def find_jumps(
         return _done(fit, clusters, apart, [Displacement()])
     levels = fit.levels()
     looked = [fit.views(apart, factor, rounds) for factor, rounds in levels[:_ROUGH]]
-    found = _needed(fit.sizes, clusters, apart, looked, told)
+    found = _needed(fit.sizes, clusters, apart, looked, progress)
     assert found.verdict is not None
     bad = np.flatnonzero(~_good(found.verdict))
     real = sorted({*found.jumps, *(one for one in clusters if np.isin(apart[[one[0], one[1] + 1]], bad).any())})
@@ -138,7 +138,7 @@ def _needed(
     clusters: Sequence[tuple[int, int]],
     apart: I64,
     looked: Sequence[_Views],
-    told: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> _Guess:
     """The jumps that views held out need to be predicted, the one that helps most first.
 
@@ -152,7 +152,7 @@ def _needed(
     def guess(jumps: list[tuple[int, int]]) -> _Guess:
         nonlocal made
         found, made = _guess(sizes, jumps, apart, looked), made + 1
-        told(made, most)
+        progress(made, most)
         return found
 
     best = guess(untold)

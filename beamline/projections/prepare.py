@@ -28,7 +28,7 @@ from beamline.projections.selection import (
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.references import ReferenceCheck
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import Done, ScanStep
+from beamline.projections.steps.step import ScanStep, StepDone
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
@@ -87,7 +87,7 @@ class PreparedProjections:
     measured: NDArray[np.bool_] | None = None
     shares: NDArray[np.float32] | None = None
     jumps: str = ""
-    done: Mapping[str, Done] = field(default_factory=dict)
+    done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice], NDArray[np.float32] | None] | None = None
 
     @property
@@ -151,12 +151,12 @@ class Spill:
     Attributes:
         views: float32 [view, row, col], at least as many as are chosen: takes the line integrals.
         batch: views that are corrected at a time.
-        told: how many of how many frames were read.
+        progress: how many of how many frames were read.
     """
 
     views: NDArray[np.float32]
     batch: int
-    told: Callable[[int, int], None]
+    progress: Callable[[int, int], None]
 
 
 def prepare_projections(
@@ -194,9 +194,9 @@ def prepare_projections(
     correction = ScanCorrection(source, selection, warn)
     warn_of_tilt(source, selection, correction, scan_frames, warn)
     phases.enter("rotation axis")
-    axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.told)
+    axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
     phases.enter("jumps", "guesses")
-    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col, phases.told)
+    jumps = find_jumps(source, selection, scan_frames, usable.jumps, axis_col, phases.progress)
     if jumps.said:
         warn(jumps.said)
     usable = replace(usable, frames=jumps.frames, left_out=usable.left_out + scan_frames.size - jumps.frames.size)
@@ -208,9 +208,9 @@ def prepare_projections(
         check(jumps.corrected(geometry_of(source, selection, axis_col, source.angles[ids]), ids))
     phases.enter("correction")
     if spill is None:
-        projections = correction.at_once(scan_frames[chosen], told=phases.told)
+        projections = correction.at_once(scan_frames[chosen], progress=phases.progress)
     else:
-        projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.told)
+        projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.progress)
     phases.enter("background, rings, views held out, hardening")
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     others, held_out = None, None

@@ -36,7 +36,7 @@ def read_binned(
     frames: NDArray[np.int64],
     rows: slice,
     binning: int,
-    told: Callable[[int, int], None] = lambda n, total: None,
+    progress: Callable[[int, int], None] = lambda n, total: None,
 ) -> NDArray[Any]:
     """Frames [frame, row, col], binned by averaging while they are read; NaN stays out of the averages.
 
@@ -53,7 +53,7 @@ def read_binned(
         if binning > 1:
             raw = _mean_bins(raw[:, : height * binning, : width * binning].astype(np.float32), binning)
         out[start : start + batch] = raw
-        told(min(start + batch, len(frames)), len(frames))
+        progress(min(start + batch, len(frames)), len(frames))
     return out
 
 

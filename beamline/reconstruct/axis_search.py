@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import Warnings
+from beamline.core.sinks import Warnings
 from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.selection import Selection, cone_of

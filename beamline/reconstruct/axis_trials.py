@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing, write_whole
+from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import check_axis, cone_of, geometry_of, rows_of
 from beamline.reconstruct.options import ReconOptions
@@ -43,7 +44,7 @@ class AxisRange:
 
 
 def try_axes(
-    options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock, listen: Callable[[int, int], None]
+    options: ReconOptions, wanted: AxisRange, path: Path, sink: Sink, clock: Clock, progress: Callable[[int, int], None]
 ) -> None:
     """Reconstruct the middle of the chosen rows by FBP with each axis and write the sheet; `done` has the scores.
 
@@ -51,7 +52,7 @@ def try_axes(
     what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
 
     Args:
-        listen: is told the number of axes done, and of all.
+        progress: is told the number of axes done, and of all.
 
     Raises:
         ConfigError, DataError: with nothing written.
@@ -79,14 +80,14 @@ def try_axes(
             part = image[inside]
             score = -float(np.minimum(part, 0).sum()) / max(float(np.abs(part).sum()), 1e-30)
             trials.append(AxisTrial(col, score, image if i in kept else None))
-            listen(i + 1, columns.size)
+            progress(i + 1, columns.size)
     picture = axis_sheet(trials, f"{source.path.name}, row {first}")
     write_whole(path, picture)
     best = min(trials, key=lambda trial: trial.score)
     if best in (trials[0], trials[-1]):
         Warnings(sink, clock)(f"The lowest score is at the end of the range, column {best.col:g}: try further.")
     scores = {f"{trial.col:g}": trial.score for trial in trials}
-    sink(Event("done", clock.now(), {"output": str(path), "axis_col": best.col, "scores": scores}))
+    sink(Done({"output": str(path), "axis_col": best.col, "scores": scores}, time=clock.now()))
 
 
 def _circle(shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
 from beamline.core.errors import DataError, QualityError
-from beamline.core.events import Event, Sink
+from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, VolumeDone, Warned, event_of
 from beamline.core.files import named_on_failure, remove, whole_file
 from beamline.core.process import ChildProcess, json_object, last_line, with_our_path
 from beamline.storage.writer_lock import WriterLock, held
@@ -178,14 +178,15 @@ def _run_all(options: BatchOptions, worker: Worker, sink: Sink, clock: Clock) ->
     start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
     for tried, n in enumerate(waiting):
         spent = clock.now() - start
-        progress = {"stage": "batch", "n": tried, "of": len(waiting), "label": rows[n].scan}
         left = spent / tried * (len(waiting) - tried) if tried else None
-        sink(Event("progress", clock.now(), {**progress, "eta_s": left, "per_min": 60 * tried / max(spent, 1e-9)}))
+        rate = 60 * tried / max(spent, 1e-9)
+        sink(TrialReached("batch", tried, len(waiting), rows[n].scan, left, rate, time=clock.now()))
         rows[n] = _one(rows[n], options, worker, sink, clock)
         _write(folder, rows)
         row = rows[n]
         said = f"{row.name}: {row.state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
-        sink(Event("state" if row.has_volume else "warning", clock.now(), {"state": "batch", "message": said}))
+        now = clock.now()
+        sink(StateEntered("batch", said, time=now) if row.has_volume else Warned(said, "batch", time=now))
     return rows
 
 
@@ -240,12 +241,14 @@ def _one(row: BatchRow, options: BatchOptions, worker: Worker, sink: Sink, clock
 
     def pass_on(line: str) -> None:
         nonlocal last
-        data = json_object(line) or {}
-        event = str(data.pop("event", ""))
-        if event in _OURS:
-            last = data
-        elif event:
-            sink(Event(event, float(data.pop("time", clock.now())), {**data, "scan": row.scan}))
+        try:
+            event = event_of(json_object(line) or {})
+        except ValueError:
+            return
+        if isinstance(event, VolumeDone | Done | Failed):
+            last = event.data
+        else:
+            sink(replace(event, scan=row.scan))
 
     place, work = options.folder / row.name, options.folder / f".{row.name}.partial"
     if (place / VOLUME).is_file():

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 import recon
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import ReconStarted, Sink, StateEntered
 from beamline.core.phases import Phases
+from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
 from beamline.projections.prepare import PreparedProjections
@@ -84,7 +85,7 @@ def reconstruct_file(
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
-        sink(Event("state", clock.now(), {"state": "held_out", "message": message}))
+        sink(StateEntered("held_out", message, time=clock.now()))
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
     options.target.require_room(*(options.disk_needs(volume) if slabs else (volume * options.target.written, 0)))
     if wanted is not None:  # before the work
@@ -136,16 +137,13 @@ def reconstruct_file(
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Report the requested corrections of the views, then send the event `recon_started`."""
     corrections_done({name: done.said for name, done in prepared.done.items()}, sink, clock)
-    data = {
-        "file": options.source.path,
-        "method": options.method.name,
-        "n_views": prepared.geometry.n_views,
-        "n_projections": prepared.n_projections,
-        "detector": prepared.geometry.detector_shape,
-        "axis_col": prepared.axis_col,
-        "axis_confident": None if prepared.axis is None else prepared.axis.confident,
-    }
-    sink(Event("recon_started", clock.now(), data))
+    views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
+    more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
+    sink(
+        ReconStarted(
+            options.source.path, options.method.name, views.n_views, prepared.axis_col, more=more, time=clock.now()
+        )
+    )
 
 
 def check_device(device: str) -> None:
@@ -302,14 +300,14 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
 
-    def said(text: str) -> None:
-        job.sink(Event("state", job.clock.now(), {"state": "slab", "message": text}))
+    def say(text: str) -> None:
+        job.sink(StateEntered("slab", text, time=job.clock.now()))
 
     with connected(options.cluster) if options.cluster is not None else nullcontext() as cluster:
         workers = None
         if cluster is not None:
             workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
-        result = in_slabs(job.run_on, job.prepared, options, slabs, control, said, job.warn, workers)
+        result = in_slabs(job.run_on, job.prepared, options, slabs, control, say, job.warn, workers)
     return job.outcome(result, job.stop_latch.stopped, _chosen(result))
 
 

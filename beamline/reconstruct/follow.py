@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import Sink, StateEntered
+from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope, never_stopped
 from beamline.core.text import count
 from beamline.reconstruct.growing import ScanFollower
@@ -79,13 +80,13 @@ def follow(
     _compile(options, sink, clock, rhythm)
     with _open(options, sink, clock, rhythm) as source:
         growing = ScanFollower(options, source, sink, clock, warn)
-        with stop_scope() as stopped:
-            if _watch(growing, clock, rhythm, stopped):
-                growing.catch_up(stopped)
+        with stop_scope() as should_stop:
+            if _watch(growing, clock, rhythm, should_stop):
+                growing.catch_up(should_stop)
             else:
                 n = growing.n_views_taken
                 warn(f"Stopped while the scan runs: the volume is of the first {count(n, 'view')}.")
-            made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, stopped)
+            made, prepared = growing.finish(method.seconds or DEFAULT_SECONDS, rhythm.snapshot, should_stop)
     # Opened again: HDF5 may still have the texts of the end as they were when it first read them.
     with _open(options, sink, clock, rhythm) as source:
         facts = facts_of(source)
@@ -105,14 +106,14 @@ def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTimi
     The state `ready` then says where the volume can be watched.
     """
     compiled = compilation_events(sink, clock)
-    sink(Event("state", clock.now(), {"state": "warming_up", "message": "Compiling the fit's kernels, if need be"}))
+    sink(StateEntered("warming_up", "Compiling the fit's kernels, if need be", time=clock.now()))
     warm_up(on_kernel=compiled)
     picture = options.target.live_picture
     message = (
         f"The live volume is ready for views. To watch it grow, open {picture}: drawn anew about every "
         f"{rhythm.snapshot:g} s, as soon as there are views enough"
     )
-    sink(Event("state", clock.now(), {"state": "ready", "message": message, "picture": picture}))
+    sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 
 
 def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> ScanSource:
@@ -126,12 +127,12 @@ def _open(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming)
             if clock.now() - begin > rhythm.patience:
                 raise DataError(f"No scan began in {options.source.path} within {rhythm.patience:.0f} s.") from error
             if not told:
-                sink(Event("state", clock.now(), {"state": "waiting", "message": f"Waiting for {options.source.path}"}))
+                sink(StateEntered("waiting", f"Waiting for {options.source.path}", time=clock.now()))
                 told = True
             clock.sleep(rhythm.poll)
 
 
-def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: Callable[[], bool]) -> bool:
+def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, should_stop: Callable[[], bool]) -> bool:
     """Take views and fit, in turns, until the scan has ended (True) or a stop finds views enough for a volume (False).
 
     Raises:
@@ -144,7 +145,7 @@ def _watch(growing: ScanFollower, clock: Clock, rhythm: FollowTiming, stopped: C
             last_frame = clock.now()
         if ended:
             return True
-        if stopped() and not growing.source.finished:
+        if should_stop() and not growing.source.finished:
             if not growing.has_volume:
                 raise KeyboardInterrupt("stopped before the views were enough for a volume; nothing was written")
             return False

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import EnoughReached, ReconStarted, Sink, StateEntered
+from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
@@ -24,7 +25,7 @@ from beamline.projections.prepare import (
 )
 from beamline.projections.selection import check_axis, geometry_of
 from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import Done, ScanStep
+from beamline.projections.steps.step import ScanStep, StepDone
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
@@ -158,10 +159,10 @@ class ScanFollower:
         wanted = parse_views(self._options.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[wanted])]
 
-    def catch_up(self, stopped: Callable[[], bool]) -> None:
+    def catch_up(self, should_stop: Callable[[], bool]) -> None:
         """Take the frames of an ended scan that were not taken yet; after a stop, only those that a volume needs."""
         while self._taken < self._frames:
-            if self.n_views_taken >= _LEAST_VIEWS and stopped():
+            if self.n_views_taken >= _LEAST_VIEWS and should_stop():
                 self._warn(f"Stopped: the volume is of the first {self.n_views_taken} of {self.n_views} views.")
                 return
             self.take_new_frames(ended=True)
@@ -170,7 +171,7 @@ class ScanFollower:
         """Darks or flats that come after the views: all of them are there when the scan has ended, not before."""
         if not self._references_follow:
             message = "No darks or no flats before the views: the volume begins when the scan has ended"
-            self._sink(Event("state", self._clock.now(), {"state": "waiting", "message": message}))
+            self._sink(StateEntered("waiting", message, time=self._clock.now()))
         self._references_follow = True
 
     def _settle_axis(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
@@ -190,15 +191,9 @@ class ScanFollower:
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)
         template = geometry_of(self.source, self._options.selection, axis_col, np.zeros(1))
-        data = {
-            "file": self.source.path,
-            "method": self._options.method.name,
-            "n_views": self.n_views,
-            "axis_col": axis_col,
-            "again": bool(self._history),
-        }
-        self._sink(Event("recon_started", self._clock.now(), data))
-        options = self._options
+        options, again = self._options, bool(self._history)
+        now = self._clock.now()
+        self._sink(ReconStarted(self.source.path, options.method.name, self.n_views, axis_col, again, time=now))
         fit = options.streaming.stream(template, options.seed, self._clock.now)
         for batch in self._batches:
             fit.add_views(batch.data, self.source.angles[batch.view_ids])
@@ -222,7 +217,7 @@ class ScanFollower:
             return
         if gone:
             why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
-        self._sink(Event("state", self._clock.now(), {"state": "correcting", "message": why}))
+        self._sink(StateEntered("correcting", why, time=self._clock.now()))
         self._correction = self._correction.renewed()
         self._batches = []
         self._batches = [self._correction.at_once(frames)]
@@ -258,14 +253,13 @@ class ScanFollower:
         gain = self._enough.look(self._joined().data, planned)
         if gain is None:
             return
-        data = asdict(gain)
         spread = f"{gain.mean:.2f} dB ({gain.low:.2f} to {gain.high:.2f})"
         if self._enough.met(gain):
             self._enough = None
-            self._sink(Event("enough", self._clock.now(), data))
+            self._sink(EnoughReached(**vars(gain), time=self._clock.now()))
             return
         message = f"{gain.n_views} of {gain.planned} views; the others would add {spread}"
-        self._sink(Event("state", self._clock.now(), {"state": "gain", "message": message, **data}))
+        self._sink(StateEntered("gain", message, gain, time=self._clock.now()))
 
     def write_snapshot(self) -> None:
         """Write the present volume and its picture, in place of the last ones."""
@@ -273,7 +267,7 @@ class ScanFollower:
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
     def finish(
-        self, seconds: float, snapshot_every: float, stopped: Callable[[], bool]
+        self, seconds: float, snapshot_every: float, should_stop: Callable[[], bool]
     ) -> tuple[ReconOutcome, PreparedProjections]:
         """The last round over all views in `seconds` or until `stopped`, with snapshots.
 
@@ -294,17 +288,11 @@ class ScanFollower:
         assert self._correction is not None
         self._correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
         prepared = self._prepared(self.axis_col, usable)
-        self._sink(
-            Event(
-                "state",
-                self._clock.now(),
-                {"state": "finishing", "message": "The last round of the fit, over all views"},
-            )
-        )
+        self._sink(StateEntered("finishing", "The last round of the fit, over all views", time=self._clock.now()))
 
-        last, stop_latch = self._clock.now(), StopLatch(stopped)
+        last, stop_latch = self._clock.now(), StopLatch(should_stop)
 
-        def listen(progress: Progress) -> bool:
+        def on_progress(progress: Progress) -> bool:
             nonlocal last
             self._say(progress)
             if self._clock.now() - last >= snapshot_every:
@@ -313,7 +301,7 @@ class ScanFollower:
             return stop_latch()
 
         try:
-            self._say(self._fit.finish(seconds, listen))
+            self._say(self._fit.finish(seconds, on_progress))
         except ValueError as error:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume, gaussians = self._fit.snapshot(), self._fit.gaussians
@@ -360,6 +348,6 @@ class ScanFollower:
                     self._fit.replace_views(projections.data)
         return replace(found, done=done)
 
-    def _tell(self, done: Mapping[str, Done]) -> None:
+    def _tell(self, done: Mapping[str, StepDone]) -> None:
         """Say what steps did."""
         corrections_done({name: each.said for name, each in done.items()}, self._sink, self._clock)

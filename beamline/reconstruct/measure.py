@@ -106,13 +106,13 @@ def measure(
     prepared: PreparedProjections | None,
     truth: Volume | None,
     mask: NDArray[np.int8] | None,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
     With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. With views: the
     residual in up to 16 of the views used, and in the views held out where there are any. Of a detector with more than
-    2^17 pixels only bands of rows with so many pixels are used. `told` hears how many of these views were compared.
+    2^17 pixels only bands of rows with so many pixels are used. `progress` hears how many of these views were compared.
     """
     values: dict[str, float] = {}
     if truth is not None:
@@ -126,12 +126,12 @@ def measure(
     n = prepared.geometry.n_views
     some = np.unique(np.linspace(0, n - 1, min(n, _RESIDUAL_VIEWS)).round().astype(np.int64))
     weights = prepared.ray_factors()
-    values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights, told)
+    values["residual"] = _residual(volume, prepared.projections.data, prepared.geometry, some, weights, progress)
     if prepared.held_out is not None:
         data, unseen = prepared.held_out
         weights = prepared.ray_factors(unseen.n_views)
         later = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
-        values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later, told)
+        values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later, progress)
     return {name: float(value) for name, value in values.items()}
 
 
@@ -141,7 +141,7 @@ def _residual(
     geometry: Geometry,
     views: NDArray[np.int64],
     weights: RayWeights | None,
-    told: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> float:
     """The residual of the volume in these views, without unmeasured rays."""
     left = total = 0.0
@@ -158,7 +158,7 @@ def _residual(
         known = None if weights is None else (weights[views, rows] > 0).astype(np.float32)
         found, scale = residual_norms(lines, data[views, rows], part, known)
         left, total = left + found**2, total + scale**2
-        told((n + 1) * some.n_views // len(bands), some.n_views)
+        progress((n + 1) * some.n_views // len(bands), some.n_views)
     if total == 0:
         raise ValueError("projections are all zero, so there is nothing to explain")
     return float(np.sqrt(left / total))

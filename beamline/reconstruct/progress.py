@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 
-from beamline.core.events import Event, Sink
+from beamline.core.events import FitReached, KernelsCompiled, Sink, StateEntered
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 
@@ -21,7 +20,7 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
     first: Progress | None = None
     step = 0
 
-    def listen(progress: Progress) -> None:
+    def on_progress(progress: Progress) -> None:
         nonlocal first, step
         if first is None or progress.step < step:  # a followed scan's fit may begin anew
             first = progress
@@ -33,9 +32,9 @@ def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> C
             left = (progress.steps - progress.step) / rate
         elif seconds is not None and not progress.steps and not progress.unit:
             left = max(0.0, seconds - spent)
-        sink(Event("progress", clock.now(), {"stage": "recon", **asdict(progress), "per_s": rate, "eta_s": left}))
+        sink(FitReached("recon", **vars(progress), per_s=rate, eta_s=left, time=clock.now()))
 
-    return listen
+    return on_progress
 
 
 def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
@@ -44,7 +43,7 @@ def compilation_events(sink: Sink, clock: Clock) -> Callable[[int], None]:
 
     def compiled(n: int) -> None:
         now = clock.now()
-        sink(Event("progress", now, {"stage": "kernels", "n": n, "seconds": now - begin}))
+        sink(KernelsCompiled("kernels", n, now - begin, time=now))
 
     return compiled
 
@@ -53,4 +52,4 @@ def corrections_done(messages: Mapping[str, str], sink: Sink, clock: Clock) -> N
     """Report what each correction did to the views; "" is not reported."""
     for state, message in messages.items():
         if message:
-            sink(Event("state", clock.now(), {"state": state, "message": message}))
+            sink(StateEntered(state, message, time=clock.now()))

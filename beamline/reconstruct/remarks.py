@@ -42,17 +42,17 @@ def odd_views_warning(
     made: ReconOutcome,
     prepared: PreparedProjections,
     selection: Selection,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> str:
     """The warning that parts of views are not in the volume; empty without such parts, and for direct methods.
 
-    It is also empty for a stopped volume, because the user waits, and the volume differs from its views in many places.
-    `told` hears how many of how many views were compared.
+    So it is of a volume that was stopped: who did that waits for it, and it differs from its views in many places.
+    `progress` hears how many of how many views were compared.
     """
     if by_name(made.method).traits.direct or made.settings.get("ended_early"):
         return ""
     views = prepared.projections.data
-    found = odd_views.odd_views(made.volume, views, prepared.geometry, prepared.ray_factors(), told=told)
+    found = odd_views.odd_views(made.volume, views, prepared.geometry, prepared.ray_factors(), progress=progress)
     if not found:
         return ""
     first, side = (selection.rows or (0, 0))[0], selection.binning

@@ -6,14 +6,14 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink
+from beamline.core.events import Sink, StateEntered, VolumeDone, Warned
 from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
 from beamline.projections.prepare import PreparedProjections
@@ -36,7 +36,8 @@ from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
-# Approximate cost, in projections of all views: the search for odd views, and a direct method with its figures.
+# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+_ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # settings of an outcome that its event tells
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
 
 
@@ -124,7 +125,7 @@ def write_result(
     region_only = region is not None and made.volume.grid.shape != Grid.matching(prepared.geometry).shape
 
     def judged(volume: Volume, seconds: float) -> dict[str, float]:
-        found = measure(volume, None if region_only else prepared, truth, mask, phases.told)
+        found = measure(volume, None if region_only else prepared, truth, mask, phases.progress)
         return {**found, "seconds": seconds}
 
     left = unexplained(
@@ -142,12 +143,12 @@ def write_result(
         metrics[made.method]["unexplained"] = left.share
         hiding = hiding_warning(made, left)
         if hiding:
-            sink(Event("warning", clock.now(), {"message": hiding}))
+            sink(Warned(hiding, time=clock.now()))
             context = replace(context, warnings=[*context.warnings, hiding])
     if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
         left_out.append("the look for views that do not fit the volume")
-    elif odd := odd_views_warning(made, prepared, context.selection, phases.told):
-        sink(Event("warning", clock.now(), {"message": odd}))
+    elif odd := odd_views_warning(made, prepared, context.selection, phases.progress):
+        sink(Warned(odd, time=clock.now()))
         context = replace(context, warnings=[*context.warnings, odd])
     volumes = {made.method: made.volume}
     compared = not direct_method and target.report is not None and has_direct_method(prepared.geometry)
@@ -159,7 +160,7 @@ def write_result(
         grid, out = made.volume.grid, None
         if isinstance(made.volume.data, np.memmap):
             out = scratch_array(target.output.parent, grid.shape)
-        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.told, out)
+        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.progress, out)
         volumes = {BASELINE: Volume(data, made.volume.grid), **volumes}
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     if BASELINE in volumes:  # it is the first
@@ -169,12 +170,12 @@ def write_result(
                 break  # it shows no air
             metrics[name]["air"] = beside_fbp.air
             if lost := lost_mass_warning(made, beside_fbp):
-                sink(Event("warning", clock.now(), {"message": lost}))
+                sink(Warned(lost, time=clock.now()))
                 context = replace(context, warnings=[*context.warnings, lost])
     if left_out:
         why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
         remark = f"Left out, as {why}: {', '.join(left_out)}."
-        sink(Event("state", clock.now(), {"state": "left_out", "message": remark}))
+        sink(StateEntered("left_out", remark, time=clock.now()))
         context = replace(context, warnings=[*context.warnings, remark])
     own = metrics[made.method]
     phases.enter("report")
@@ -210,29 +211,28 @@ def write_result(
             remove(page)
         raise
     phases.end()
-    summary: dict[str, Any] = {
-        "output": target.output,
-        "report": target.report,
-        "method": made.method,
-        "axis_col": prepared.axis_col,
-        "n_views": prepared.geometry.n_views,
-        "shape": record.volume.grid.shape,
-        "units": f"1/{prepared.length_unit}",
-        "elapsed": clock.now() - context.started,
-        "times": phases.seconds,
-        **own,
-    }
-    said = ("ended_early", "resumed_from", "checkpoint_lost")
-    summary |= {name: made.settings[name] for name in said if name in made.settings}
-    if hiding:
-        summary["hiding"] = hiding
-    if made.chosen:
-        summary["chosen"] = made.chosen
-    if (further := made.next_decibel) is not None:
-        summary |= {"next_db": asdict(further), "next_db_said": made.next_decibel_text}
-    if len(metrics) > 1:
-        summary[BASELINE] = metrics[BASELINE]
-    sink(Event("done", clock.now(), summary))
+    said: dict[str, Any] = {name: made.settings[name] for name in _ENDS if name in made.settings}
+    sink(
+        VolumeDone(
+            output=target.output,
+            report=target.report,
+            method=made.method,
+            axis_col=prepared.axis_col,
+            n_views=prepared.geometry.n_views,
+            shape=record.volume.grid.shape,
+            units=f"1/{prepared.length_unit}",
+            elapsed=clock.now() - context.started,
+            times=phases.seconds,
+            metrics=own,
+            **said,
+            hiding=hiding or None,
+            chosen=made.chosen or None,
+            next_db=made.next_decibel,
+            next_db_said=None if made.next_decibel is None else made.next_decibel_text,
+            fbp=metrics[BASELINE] if len(metrics) > 1 else None,
+            time=clock.now(),
+        )
+    )
     return own
 
 

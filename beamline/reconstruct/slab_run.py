@@ -54,7 +54,7 @@ def in_slabs(
     options: ReconOptions,
     slabs: Sequence[Slab],
     control: RunControl,
-    said: Callable[[str], None],
+    say: Callable[[str], None],
     warn: Warn,
     workers: SlabWorkers | None = None,
 ) -> Reconstruction:
@@ -67,8 +67,8 @@ def in_slabs(
     Args:
         run: reconstructs a slab.
         control: of all slabs together.
-        said: is told of each slab.
-        warn: is told of slices by another method.
+        say: is told of each slab.
+        warn: is told of slices that are not by the method.
         workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
 
     Raises:
@@ -79,7 +79,7 @@ def in_slabs(
     if options.partial is not None:
         partial = open_partial(options.partial)
         refuse_other(options.partial, made_from, partial.made_from, "reconstruction")
-        said(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
+        say(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
     in_all = sum(slab.slices.stop - slab.slices.start for slab in slabs)
 
     def made(n: int, by: RunMethod, decide: Decisions, done: int) -> tuple[Reconstruction | None, str]:
@@ -100,14 +100,14 @@ def in_slabs(
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
             return by(FistaTv(), part, box, one), remark
 
-    def told(n: int) -> None:
-        said(f"Slab {n + 1} of {len(slabs)}: slices {slabs[n].own.start} to {slabs[n].own.stop - 1}.")
+    def progress(n: int) -> None:
+        say(f"Slab {n + 1} of {len(slabs)}: slices {slabs[n].own.start} to {slabs[n].own.stop - 1}.")
 
     left = [n for n in busiest_first(prepared, grid, slabs) if partial is None or not partial.has(n)]
     while partial is None:
         if not left:
             raise DataError("The views are zero everywhere: there is nothing in the beam.")
-        told(n := left.pop(0))
+        progress(n := left.pop(0))
         decide = Decisions(options.seed)
         if (found := made(n, run, decide, 0)[0]) is not None:
             record = _record(prepared, options, grid, begin)
@@ -117,7 +117,7 @@ def in_slabs(
     decided = partial.kept["decided"]
     if workers is None:
         for n in left:
-            told(n)
+            progress(n)
             _add(partial, n, *made(n, run, Decisions(options.seed, decided), partial.n_slices_done), warn)
     else:
 
@@ -126,7 +126,7 @@ def in_slabs(
 
         for n, (found, remark) in _as_they_come(by_worker, left, workers.count):
             _add(partial, n, found, remark, warn)
-            said(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
+            say(f"{partial.n_slices_done} of {grid.shape[0]} slices are there.")
             if (listen := control.on_progress) is not None:
                 seconds, views = control.now() - begin, prepared.geometry.n_views
                 listen(Progress(partial.n_slices_done, grid.shape[0], seconds, nan, nan, 0, views, unit="slices"))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, Sink
+from beamline.core.events import Counted, Sink, StateEntered
 from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
 from beamline.core.text import size
@@ -19,6 +19,7 @@ from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import choose_views, cone_of, rows_of
 from beamline.projections.steps.resampling import TiltAndLens
+from beamline.projections.steps.step import ViewStep
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
@@ -55,12 +56,14 @@ class Needs:
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
         weighted: rays have weights.
+        copies: float32 views that a step of the correction takes, see `ViewFilter`.
     """
 
     method: Method
     geometry: Geometry
     raw: int
     weighted: bool
+    copies: int = 0
 
     @classmethod
     def of(
@@ -84,8 +87,14 @@ class Needs:
 
     @property
     def at_once(self) -> int:
-        """Bytes with everything in memory."""
-        return self.raw + self.line_integrals + self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
+        """With everything in memory."""
+        work = self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
+        return self.raw + self.line_integrals + max(work, self.filters)
+
+    @property
+    def filters(self) -> int:
+        """While views are filtered, beside the views."""
+        return self.copies * self.line_integrals // self.geometry.n_views
 
     @property
     def view(self) -> int:
@@ -108,8 +117,8 @@ class Needs:
 
     @property
     def least(self) -> int:
-        """The least sufficient memory."""
-        return max(self.slab(_ROWS), self.view, self.figures)
+        """The least memory that suffices."""
+        return max(self.slab(_ROWS), self.view + self.filters, self.figures)
 
     def height(self, memory: int) -> int:
         """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
@@ -145,11 +154,13 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     if axis is not None:
         axis = (axis - (selection.binning - 1) / 2) / selection.binning
     needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
-    return replace(needs, method=options.method_for(needs.geometry))
+    filters = [step.on(source, selection)[0] for step in selection.in_order if isinstance(step, ViewStep)]
+    copies = max((each.copies for each in filters if each is not None), default=0)
+    return replace(needs, method=options.method_for(needs.geometry), copies=copies)
 
 
 def spill_of(
-    source: ScanSource, options: ReconOptions, told: Callable[[int, int], None], warn: Callable[[str], None]
+    source: ScanSource, options: ReconOptions, progress: Callable[[int, int], None], warn: Callable[[str], None]
 ) -> Spill | None:
     """Where the views go if they do not fit into the memory; None if they fit, or if slabs are impossible.
 
@@ -172,13 +183,13 @@ def spill_of(
     refuse_smallest(
         source, replace(needs, weighted=surely_weighted(source, options)), memory, options.selection.binning
     )
-    batch = max(1, int(_BATCH * memory / needs.view))
+    batch = max(1, int((_BATCH * memory - needs.filters) / needs.view))
     warn(
         f"All at once would take {size(needs.at_once)}, {size(memory)} of memory may be used: views and volume lie on "
         f"the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."
     )
     shape = (needs.geometry.n_views, *needs.geometry.detector_shape)
-    return Spill(scratch_array(options.target.output.parent, shape), batch, told)
+    return Spill(scratch_array(options.target.output.parent, shape), batch, progress)
 
 
 def surely_weighted(source: ScanSource, options: ReconOptions) -> bool:
@@ -239,17 +250,16 @@ def prepare_within(
     """As `prepare_projections`, and the slabs if line integrals lie on disk; none: all at once."""
     began = clock.now()
 
-    def told(n: int, total: int) -> None:
+    def progress(n: int, total: int) -> None:
         now = clock.now()
         rate = n / max(now - began, 1e-9)
-        data = {"stage": "correction", "n": n, "of": total, "per_s": rate, "eta_s": (total - n) / rate}
-        sink(Event("progress", now, data))
+        sink(Counted("correction", n, total, rate, (total - n) / rate, time=now))
 
-    def said(text: str) -> None:
-        sink(Event("state", clock.now(), {"state": "memory", "message": text}))
+    def say(text: str) -> None:
+        sink(StateEntered("memory", text, time=clock.now()))
 
     memory = memory_of(options)
-    spill = spill_of(source, options, told, said)
+    spill = spill_of(source, options, progress, say)
     check = None if options.region is None else partial(locate, options.region, options.selection)
     prepared = prepare_projections(source, options.selection, warn, spill, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)

@@ -7,8 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import Sink, SnapshotWritten
 from beamline.core.files import write_whole
+from beamline.core.sinks import Warnings
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.live_picture import LivePicture
 from beamline.storage.readers.base import ScanSource
@@ -50,14 +51,9 @@ class Snapshots:
             self._warn(f"A snapshot was left out: {error}")
             return
         self.drawn = True
-        data = {
-            "path": self.path,
-            "picture": self.picture_path,
-            "n_views": fit.n_views,
-            "seconds": self._clock.now() - self._begin,
-            "unlearnt": fit.unlearnt,
-        }
-        self._sink(Event("snapshot", self._clock.now(), data))
+        now = self._clock.now()
+        written = self.path, self.picture_path, fit.n_views, now - self._begin, fit.unlearnt
+        self._sink(SnapshotWritten(*written, time=now))
 
     def remove(self) -> None:
         """Remove the snapshot after the volume is delivered. The picture of the growing volume stays."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, InstrumentError, ReferencesError, ScanStopped
-from beamline.core.events import Emit
+from beamline.core.events import BlockDone, BlockStarted, Sink, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import spans
 from beamline.plan.plan import Block, Timeline
@@ -43,8 +43,8 @@ class Acquisition:
         timeline: without violations.
         camera_settings: roi, binning and readout; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
-        emit: takes (event, data) for block_started, block_done and warning.
-        supervision: may pause the scan, or end it before its first projection, and is told its states.
+        sink: takes `BlockStarted`, `BlockDone` and warnings.
+        supervision: what may pause the scan, or end it before its first projection, and is told its states.
     """
 
     def __init__(
@@ -55,13 +55,13 @@ class Acquisition:
         settle: float,
         clock: Clock,
         stop: StopRequest,
-        emit: Emit = lambda event, data: None,
+        sink: Sink = lambda event: None,
         supervision: Supervision | None = None,
     ) -> None:
-        self._devices, self._timeline, self._stop, self._emit = devices, timeline, stop, emit
+        self._devices, self._timeline, self._stop, self._sink = devices, timeline, stop, sink
         self._supervision, self._refused = supervision or Supervision(), ""
         self._exposures = Exposures(
-            devices, camera_settings, settle, clock, stop, emit, self._supervision, self._wait_while_paused
+            devices, camera_settings, settle, clock, stop, sink, self._supervision, self._wait_while_paused
         )
         self._done: list[TakenBlock] = []
         self.recovered = 0
@@ -110,7 +110,7 @@ class Acquisition:
         finally:
             failures = self._make_safe(home if devices_work and not self._stop.aborting else None)
             for error in failures[1:] if all_taken else failures:
-                self._emit("warning", {"message": _in_words(error)})
+                self._sink(Warned(_in_words(error)))
         if failures:
             self._warn_discrepancies()
             raise failures[0]
@@ -136,24 +136,14 @@ class Acquisition:
     def _block(self, done: TakenBlock) -> Iterator[Frame]:
         block, taken = done.block, done.taken
         self._done.append(done)
-        what = {"kind": block.kind.name.lower(), "mode": str(block.mode), "n": block.left, "first_row": self.n_frames}
-        self._emit("block_started", {**what, "exposure": block.exposure, "period": block.period})
+        what = block.kind.name.lower(), str(block.mode), block.left, self.n_frames
+        self._sink(BlockStarted(*what, block.exposure, block.period))
         self._supervision.states.enter(_state_of(block))
         self._set_shutter_and_sample(block.kind)
         yield from self._exposures.take(block, self.n_frames, taken)
         if block.kind is FrameKind.FLAT:
             self._devices.sample.back()
-        self._emit(
-            "block_done",
-            {
-                **what,
-                "frames": taken.frames,
-                "missing": taken.missing,
-                "lost": taken.lost,
-                "ignored": taken.ignored,
-                "extra": taken.extra,
-            },
-        )
+        self._sink(BlockDone(*what, taken.frames, taken.missing, taken.lost, taken.ignored, taken.extra))
 
     def _again(self, views: Block, taken: Taken) -> Iterator[Frame]:
         """The views that supervision wants repeated. Each names the frame that it replaces, or has a missing trigger,
@@ -174,7 +164,7 @@ class Acquisition:
                     self.recovered += 1
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, frame.replaces))
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
-            self._emit("warning", {"message": f"Frames {spans(rows)} gave no frame when they were taken again."})
+            self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were taken again."))
 
     def _still_needed(self, block: Block) -> bool:
         """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.
@@ -239,7 +229,7 @@ class Acquisition:
                     failures.append(error)
                 else:
                     for failure in failures:
-                        self._emit("warning", {"message": _in_words(failure)})
+                        self._sink(Warned(_in_words(failure)))
                     return True
             failed.append(failures[0])
             return False
@@ -282,7 +272,7 @@ class Acquisition:
     def _warn_discrepancies(self) -> None:
         """Report missing frames if the scan ends with another error, which would hide them."""
         if text := self._discrepancies():
-            self._emit("warning", {"message": text.strip()})
+            self._sink(Warned(text.strip()))
 
     def _discrepancies(self) -> str:
         """Sentences on missing, extra and doubtful frames so far, each after a space."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from beamline.core.events import Emit
+from beamline.core.events import BeamRead, Sink, Warned
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, BeamReading
 
@@ -21,7 +21,7 @@ class BeamLog:
     Args:
         monitor: None: nothing is read.
         period: s of real time between readings.
-        emit: takes (event, data) of `beam` and `warning`, called in the log's thread.
+        sink: takes (event, data) of `beam` and `warning`, called in the log's thread.
         react: told each reading. Then the first one is taken before the context is entered.
     """
 
@@ -29,10 +29,10 @@ class BeamLog:
         self,
         monitor: BeamMonitor | None,
         period: float,
-        emit: Emit,
+        sink: Sink,
         react: Callable[[BeamReading], None] | None = None,
     ) -> None:
-        self._monitor, self._period, self._emit, self._react = monitor, period, emit, react
+        self._monitor, self._period, self._sink, self._react = monitor, period, sink, react
         self._readings: list[BeamReading] = []
         self._failed = 0  # failed readings in a row
         self._begun = self._ended = 0  # readings
@@ -84,10 +84,10 @@ class BeamLog:
             return
         if self._failed:
             failed = "1 failed reading" if self._failed == 1 else f"{self._failed} failed readings"
-            self._emit("warning", {"message": f"{name}: it answers again after {failed}."})
+            self._sink(Warned(f"{name}: it answers again after {failed}."))
             self._failed = 0
         self._readings.append(reading)
-        self._emit("beam", {"value": reading.value, "unit": reading.unit, "read_at": reading.time})
+        self._sink(BeamRead(reading.value, reading.unit, reading.time))
         if self._react is not None:
             self._react(reading)
 
@@ -96,4 +96,4 @@ class BeamLog:
         if self._failed > 1 or self._over.is_set():
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
-        self._emit("warning", {"message": f"{problem} The scan goes on without readings until it answers again."})
+        self._sink(Warned(f"{problem} The scan goes on without readings until it answers again."))

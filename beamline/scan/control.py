@@ -18,7 +18,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Emit
+from beamline.core.events import Sink, Warned
 from beamline.core.files import EVENTS, parts_of
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.scan.run_folder import CONTROL, SCAN
@@ -99,7 +99,7 @@ def _not_private(folder: os.stat_result) -> str:
 
 @contextmanager
 def verbs_taken(
-    folder: Path, stop: StopRequest, pause: PauseRequest, emit: Emit = lambda event, data: None
+    folder: Path, stop: StopRequest, pause: PauseRequest, sink: Sink = lambda event: None
 ) -> Iterator[None]:
     """While the context lasts, verbs for the run in this folder are obeyed; a warning if this is impossible.
 
@@ -117,7 +117,7 @@ def verbs_taken(
             if fault := requests.fault():
                 if not told:
                     message = f"No verb from another terminal is done: {place}: {fault}. Ctrl-C here stops the scan."
-                    emit("warning", {"message": message})
+                    sink(Warned(message))
                 told = True
                 continue
             for verb, action in actions.items():

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import BeamlineError, InstrumentError
-from beamline.core.events import Emit
+from beamline.core.events import Sink, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
@@ -136,7 +136,7 @@ class Exposures:
     Args:
         camera_settings: roi, binning and readout for all blocks; each block sets its own exposure and trigger.
         settle: s to wait after each move of a step scan.
-        emit: where warnings go.
+        sink: where warnings go.
         supervision: says when to pause, and is told the states of a fly scan.
         wait_while_paused: called before each frame of a stage that stands, and before each run-up.
     """
@@ -148,13 +148,13 @@ class Exposures:
         settle: float,
         clock: Clock,
         stop: StopRequest,
-        emit: Emit,
+        sink: Sink,
         supervision: Supervision,
         wait_while_paused: Callable[[], None],
     ) -> None:
         self._stage, self._camera = devices.stage, devices.camera
         self._settings, self._settle = camera_settings, settle
-        self._clock, self._stop, self._emit = clock, stop, emit
+        self._clock, self._stop, self._sink = clock, stop, sink
         self._supervision, self._wait_while_paused = supervision, wait_while_paused
 
     def take(self, block: Block, first_row: int, taken: Taken) -> Iterator[Frame]:
@@ -380,7 +380,7 @@ class Exposures:
                 if failed:
                     raise
                 failed = True
-                self._emit("warning", {"message": str(error)})
+                self._sink(Warned(str(error)))
 
     def _wait(self, seconds: float, until_stop: bool = True) -> bool:
         """Wait for a move that should take `seconds`; False if a stop cut it short."""

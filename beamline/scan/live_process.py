@@ -7,12 +7,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from beamline.config.load import Config, plan_of
-from beamline.core.events import Emit
+from beamline.core.events import (
+    Done,
+    EnoughReached,
+    Failed,
+    ReconDone,
+    Sink,
+    StateEntered,
+    VolumeDone,
+    Warned,
+    event_of,
+)
 from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, Ending, json_object
 from beamline.core.text import count, size
@@ -189,13 +199,13 @@ class LiveReconstruction:
         self,
         command: Sequence[str],
         log: Path,
-        emit: Emit,
+        sink: Sink,
         enough: Callable[[str], None] = lambda reason: None,
         what: str = "live reconstruction",
         silence: float = _SILENCE,
         low_priority: bool = True,
     ) -> None:
-        self._emit, self._log, self._enough, self._what = emit, log, enough, what
+        self._sink, self._log, self._enough, self._what = sink, log, enough, what
         self._silence = silence
         self._done: Mapping[str, Any] | None = None
         self._wanted = True  # nobody has asked it to end
@@ -208,7 +218,7 @@ class LiveReconstruction:
                 )
         except OSError as error:
             message = f"The {what} could not be started ({error}). The scan is not affected."
-            emit("warning", {"message": message})
+            sink(Warned(message))
 
     def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
         """Wait until it has compiled its kernels or ended, `stop` returns True, or so many real s are over.
@@ -224,7 +234,7 @@ class LiveReconstruction:
                     f"The live reconstruction is not ready after {seconds:.0f} s. The scan begins; the volume takes "
                     "its views up later."
                 )
-                self._emit("warning", {"message": message})
+                self._sink(Warned(message))
                 return
 
     def finish(self, stop: Callable[[], bool], hurry: Callable[[], bool]) -> Mapping[str, Any] | None:
@@ -246,7 +256,7 @@ class LiveReconstruction:
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
             message = f"The {self._what} gave no volume: {reason}; see {self._log.name}. The scan is not affected."
-            self._emit("warning", {"message": message, "source": "recon"})
+            self._sink(Warned(message, source="recon"))
         return self._done
 
     def close(self) -> None:
@@ -263,23 +273,23 @@ class LiveReconstruction:
                 f"The live reconstruction has ended {when}; see {self._log.name}. The scan goes on without it. To "
                 "start another: beamline recon FILE --follow -o OUT.h5"
             )
-            self._emit("warning", {"message": message, "source": "recon"})
+            self._sink(Warned(message, source="recon"))
 
     def _pass_on(self, line: str) -> None:
-        data = json_object(line)
-        if data is None or "event" not in data:
+        try:
+            event = event_of(json_object(line) or {})
+        except ValueError:
             return
-        event = str(data.pop("event"))
-        data.pop("time", None)
-        if event == "state" and data.get("state") == "ready":
-            self._ready.set()
-        if event == "enough":
-            self._enough(
-                f"{data['n_views']} of {data['planned']} views are enough, the others would add {data['mean']:.2f} dB "
-                f"({data['low']:.2f} to {data['high']:.2f})"
-            )
-        if event == "done":
-            self._done, event = data, "recon_done"
-        elif event == "failed":
-            event, data["message"] = "warning", f"{self._what.capitalize()}: {data.get('message', 'failed')}"
-        self._emit(event, {**data, "source": "recon"})
+        match event:
+            case StateEntered(state="ready"):
+                self._ready.set()
+            case EnoughReached(n_views=n, planned=planned, mean=mean, low=low, high=high):
+                self._enough(
+                    f"{n} of {planned} views are enough, the others would add {mean:.2f} dB ({low:.2f} to {high:.2f})"
+                )
+            case VolumeDone() | Done():
+                self._done = event.data
+                event = ReconDone(self._done)
+            case Failed(message=message):
+                event = Warned(f"{self._what.capitalize()}: {message}")
+        self._sink(replace(event, source="recon"))

@@ -11,17 +11,17 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from queue import Empty, Full, Queue
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, user_message
-from beamline.core.events import Emit
+from beamline.core.events import FrameFlagged, FrameStored, Sink, Warned
 from beamline.core.stop import PauseRequest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
@@ -92,12 +92,12 @@ class Recorder:
         timeline: Timeline,
         *,
         preview_bin: int,
-        emit: Emit,
+        sink: Sink,
         react: Callable[[tuple[Flag, ...]], None] = lambda flags: None,
         pause: PauseRequest | None = None,
     ) -> None:
         self._writer, self._monitor, self._preview_bin = writer, monitor, preview_bin
-        self._emit, self._react = emit, react
+        self._sink, self._react = sink, react
         self._progress = _Progress(timeline)
         self._active: set[tuple[str, Level]] = set()
         self._monitor_off = False
@@ -311,9 +311,8 @@ class Recorder:
         if frame.kind is FrameKind.INVALID or (frame.replaces >= 0 and not self._retaking):
             self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
         self._report(frame, flags)
-        data = self._progress.update(frame, self.n_frames)
-        if data is not None:
-            self._emit("frame", {**data, "mean": found.mean})
+        if (stored := self._progress.update(frame, self.n_frames, found.mean)) is not None:
+            self._sink(stored)
 
     def _look(self, frame: Frame, found: FrameDigest) -> tuple[Flag, ...]:
         """The monitor's flags. An error costs no frame: a check that raises is switched off, with a warning."""
@@ -324,16 +323,16 @@ class Recorder:
         except CheckError as failed:
             self._monitor = without(self._monitor, failed.name)
             message = f"{failed} at frame {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
-            self._emit("warning", {"message": message})
+            self._sink(Warned(message))
             return self._look(frame, found)
         except Exception as error:
             self._monitor_off = True
-            self._emit("warning", {"message": f"the monitor failed at frame {frame.index} and is off: {error!r}"})
+            self._sink(Warned(f"the monitor failed at frame {frame.index} and is off: {error!r}"))
             return ()
         return flags
 
     def _report(self, frame: Frame, flags: tuple[Flag, ...]) -> None:
-        """Count flags; emit a `flag` event where a check begins to flag or its level changes, not for every frame."""
+        """Count flags; say so where a check begins to flag or its level changes, not for every frame."""
         self._found += [replace(flag, advice="") for flag in flags]
         if frame.kind is FrameKind.PROJECTION:
             self._triggers[frame.index] = frame.trigger
@@ -343,7 +342,7 @@ class Recorder:
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:
-                self._emit("flag", asdict(flag))
+                self._sink(FrameFlagged(**vars(flag)))
         self._active = active
         self._react(flags)
 
@@ -365,7 +364,7 @@ class _Progress:
         self._ahead = np.concatenate([before, np.linspace(before[-1], after[0], n + 1)[1:-1], after])
         self.total += n
 
-    def update(self, frame: Frame, n: int) -> Mapping[str, Any] | None:
+    def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
         """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)
         now = time.monotonic()
@@ -374,11 +373,5 @@ class _Progress:
         self._last_event = now
         span = self._times[-1] - self._times[0]
         rate = (len(self._times) - 1) / span if span > 0 else 0.0
-        return {
-            "n": n,
-            "of": self.total,
-            "kind": frame.kind.name.lower(),
-            "frames_per_s": rate,
-            "mb_per_s": rate * self._bytes / 1e6,
-            "eta_s": float(self._ahead[min(n, self.total)]),
-        }
+        left = float(self._ahead[min(n, self.total)])
+        return FrameStored(n, self.total, frame.kind.name.lower(), rate, rate * self._bytes / 1e6, left, mean)

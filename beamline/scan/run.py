@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,11 @@ from beamline.core.errors import (
     leave_traceback,
     user_message,
 )
-from beamline.core.events import Announcer, Emit, JsonLines, Sink
+from beamline.core.events import Failed, RunDone, RunStarted, ScanDone, Sink, StateEntered, Warned
 from beamline.core.files import EVENTS
 from beamline.core.machine import free_memory
 from beamline.core.narration import UserLog
+from beamline.core.sinks import Announcer, JsonLines
 from beamline.core.stop import PauseRequest, ScanAborted, StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import ConnectedDevices, connect
@@ -157,13 +158,13 @@ def run_scan(
                 raise DataError(
                     f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
                 ) from error
-            emit = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
-            run = _Run(config, instrument, ready, folder, stop, emit, began, series)
-            stack.enter_context(verbs_taken(folder, stop, run.pause, emit))
-            guarded = stack.enter_context(ExitStack())  # held until the instrument is free for another scan
+            sink = stack.enter_context(Announcer([JsonLines(events), UserLog(log), *sinks], instrument.clock))
+            run = _Run(config, instrument, ready, folder, stop, sink, began, series)
+            stack.enter_context(verbs_taken(folder, stop, run.pause, sink))
+            guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
                 guarded.enter_context(
-                    watched(folder, emit, stop, run.pause if config.scan.without_watchdog == "pause" else None)
+                    watched(folder, sink, stop, run.pause if config.scan.without_watchdog == "pause" else None)
                 )
             guarded.callback(connected.close)
             return run.go(live, afterwards, release=guarded.close)
@@ -194,7 +195,7 @@ class _Run:
     ready: ReadyScan
     folder: Path
     stop: StopRequest
-    emit: Emit
+    sink: Sink
     began: float
     series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
@@ -203,7 +204,7 @@ class _Run:
 
     @cached_property
     def states(self) -> StateMachine:
-        return StateMachine(self.emit)
+        return StateMachine(self.sink)
 
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
@@ -216,22 +217,22 @@ class _Run:
             if is_defect(error):
                 leave_traceback(error, self.folder)
             self.states.enter(self._end_by(error), "Ended early")
-            self.emit("failed", {"message": user_message(error), "exit_code": exit_code(error), "folder": self.folder})
+            self.sink(Failed(user_message(error), exit_code(error), self.folder))
             raise
         self.states.enter(State.DONE, "Finished")
-        self.emit("done", {**asdict(result), "folder": self.folder})
+        self.sink(RunDone(self.folder, result))
         return result
 
     def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         path = self.folder / SCAN
         command = None if live is None else live(path, self.folder / RECON)
-        self.emit("run_started", self._facts(path))
+        self.sink(self._begun(path))
         self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
             follower = None
             if command is not None:
-                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.emit, self.stop.stop_as_enough)
+                follower = LiveReconstruction(command, self.folder / RECON_LOG, self.sink, self.stop.stop_as_enough)
                 ending.callback(follower.close)
             if self.config.simulation is None:
                 self._compiled(follower)
@@ -259,14 +260,14 @@ class _Run:
             said = f"{frames}, is ready" + (f"; the system may swap it out ({why})" if why else " and locked")
         except OSError as error:
             said = f"{frames}, cannot be had before they come ({error.strerror or error})"
-        self.emit("state", {"state": self.states.state, "message": said[0].upper() + said[1:]})
+        self.sink(StateEntered(self.states.state, said[0].upper() + said[1:]))
 
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
         began = time.monotonic()
         log = self.folder / RECON_LOG
         words = command(result.path, self.folder / RECON)
-        process = LiveReconstruction(words, log, self.emit, what="reconstruction", silence=math.inf, low_priority=False)
+        process = LiveReconstruction(words, log, self.sink, what="reconstruction", silence=math.inf, low_priority=False)
         try:
             recon = process.finish(lambda: self.stop.stopping, lambda: self.stop.aborting)
         finally:
@@ -296,7 +297,7 @@ class _Run:
             n = writer.committed
             error = self._worse(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
         for remark in writer.remarks:
-            self.emit("warning", {"message": remark})
+            self.sink(Warned(remark))
         error = self._worse(error, _failure_of(release))
         path, n_frames = writer.path, writer.committed
         if self.series is not None and n_frames and unfinished is None:
@@ -317,7 +318,7 @@ class _Run:
             bytes=writer.path.stat().st_size,
             recon=None,
         )
-        self.emit("scan_done", {**asdict(result), "status": status})
+        self.sink(ScanDone(**vars(result), status=status))
         if follower is not None:
             useless = unfinished is not None or isinstance(error, ReferencesError)
             recon = follower.finish(live_should_end(self.stop, useless), lambda: self.stop.aborting)
@@ -340,7 +341,7 @@ class _Run:
             return error or after
         if isinstance(error, ScanStopped | LedgerError):
             error, after = after, error
-        self.emit("warning", {"message": str(after)})
+        self.sink(Warned(str(after)))
         return error
 
     def _end_by(self, error: BaseException) -> State:
@@ -367,8 +368,8 @@ class _Run:
             self.ready.monitor,
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
-            emit=self.emit,
-            react=AlarmReaction(policy, self.stop, self.pause, self.emit),
+            sink=self.sink,
+            react=AlarmReaction(policy, self.stop, self.pause, self.sink),
             pause=self.pause,
         )
 
@@ -376,7 +377,7 @@ class _Run:
         ready, instrument = self.ready, self.instrument
         return Acquisition(
             instrument.devices, ready.timeline, ready.settings, ready.plan.settle, instrument.clock, self.stop,
-            self.emit,
+            self.sink,
             Supervision(
                 lambda: self._refusal(recorder, follower), self.pause, lambda: _wait_in_pause(recorder), self.states,
                 lambda missing: self._retakes(recorder, missing), lambda: self._wait_for_reading(beam),
@@ -425,7 +426,7 @@ class _Run:
                 f"{len(bad)} views have an alarm or gave no frame, and {most} may be taken again "
                 f"(monitor.retake_share): {len(bad) - len(chosen)} between them stay as they are."
             )
-            self.emit("warning", {"message": message})
+            self.sink(Warned(message))
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
@@ -435,7 +436,7 @@ class _Run:
         faults = recorder.references.faults(reference_limits(self.config.references), planned)
         for group in faults.keys() - self.told:
             self.told.add(group)
-            self.emit("warning", {"message": faults[group]})
+            self.sink(Warned(faults[group]))
         return faults
 
     def _tell_little_light(self, recorder: Recorder) -> None:
@@ -443,29 +444,22 @@ class _Run:
         said = recorder.references.too_little_light(reference_limits(self.config.references), self.ready.plan.exposure)
         if said is not None and _LITTLE_LIGHT not in self.told:
             self.told.add(_LITTLE_LIGHT)
-            self.emit("warning", {"message": said})
+            self.sink(Warned(said))
 
     def _beam_log(self) -> BeamLog:
         chosen = self.config.devices.beam_monitor
         if isinstance(chosen, NoBeamMonitor):
-            return BeamLog(None, math.inf, self.emit)
+            return BeamLog(None, math.inf, self.sink)
         guard = None
         if chosen.pause_below is not None:
             limits = BeamLimits(chosen.pause_below, chosen.resumes_at, chosen.settle_s)
             guard = BeamGuard(limits, self.pause)
-        return BeamLog(self.instrument.beam_monitor, chosen.period_s, self.emit, guard)
+        return BeamLog(self.instrument.beam_monitor, chosen.period_s, self.sink, guard)
 
-    def _facts(self, path: Path) -> Mapping[str, Any]:
+    def _begun(self, path: Path) -> RunStarted:
         timeline = self.ready.timeline
-        return {
-            "folder": self.folder,
-            "path": path,
-            "sample": self.config.sample.name,
-            "n_frames": timeline.n_frames,
-            "duration": timeline.duration,
-            "total_bytes": timeline.total_bytes,
-            "remarks": timeline.remarks,
-        }
+        planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
+        return RunStarted(self.folder, path, self.config.sample.name, *planned)
 
 
 def _wait_in_pause(recorder: Recorder) -> bool:

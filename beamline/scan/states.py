@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
 
-from beamline.core.events import Emit
+from beamline.core.events import Sink, StateEntered
 
 
 class State(StrEnum):
@@ -50,11 +50,11 @@ class StateMachine:
     """The state of one scan. Attribute `state`: the present one.
 
     Args:
-        emit: takes the event `state`.
+        sink: takes the event `state`.
     """
 
-    def __init__(self, emit: Emit = lambda event, data: None, state: State = State.IDLE) -> None:
-        self._emit, self.state = emit, state
+    def __init__(self, sink: Sink = lambda event: None, state: State = State.IDLE) -> None:
+        self._sink, self.state = sink, state
 
     def enter(self, state: State, message: str = "") -> None:
         """Go to a state, with a message; staying in a state without a message emits nothing.
@@ -66,4 +66,4 @@ class StateMachine:
             raise ValueError(f"a scan cannot go from {self.state} to {state}")
         if state is not self.state or message:
             self.state = state
-            self._emit("state", {"state": state, "message": message})
+            self._sink(StateEntered(state, message))

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from beamline.core.events import Emit
+from beamline.core.events import Sink, Warned
 from beamline.core.stop import Cause, PauseRequest, StopRequest
 from beamline.core.text import size
 from beamline.monitor.check import Flag, Level, Policy
@@ -187,8 +187,8 @@ class AlarmPolicy:
 class AlarmReaction:
     """Carries out the policy while frames come."""
 
-    def __init__(self, policy: AlarmPolicy, stop: StopRequest, pause: PauseRequest, emit: Emit) -> None:
-        self._policy, self._stop, self._pause, self._emit = policy, stop, pause, emit
+    def __init__(self, policy: AlarmPolicy, stop: StopRequest, pause: PauseRequest, sink: Sink) -> None:
+        self._policy, self._stop, self._pause, self._sink = policy, stop, pause, sink
         self._in_a_row: Counter[str] = Counter()
 
     def __call__(self, flags: tuple[Flag, ...]) -> None:
@@ -205,7 +205,7 @@ class AlarmReaction:
         reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
         match self._policy.policies.get(flag.check, Policy.LOG):
             case Policy.WARN:
-                self._emit("warning", {"message": f"{reason}."})
+                self._sink(Warned(f"{reason}."))
             case Policy.PAUSE:
                 self._pause.pause(reason)
             case Policy.STOP if not self._stop.stopping:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from beamline.config.load import Config, plan_of
 from beamline.config.references import reference_limits
 from beamline.core.errors import InstrumentError
-from beamline.core.events import Emit
+from beamline.core.events import Sink
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import ConnectedDevices, camera_settings
 from beamline.monitor.digest import digest
@@ -113,7 +113,7 @@ class Tuning:
 
 
 def tune(
-    config: Config, instrument: ConnectedDevices, stop: StopRequest, emit: Emit, angle: float | None = None
+    config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink, angle: float | None = None
 ) -> Tuning:
     """Take darks, flats and views at a few exposures and evaluate them. Nothing is written.
 
@@ -132,7 +132,7 @@ def tune(
     timing = camera.timing
     blocks = _blocks(exposures, angle)
     acquisition = Acquisition(
-        instrument.devices, _timeline(blocks, timing), settings, plan.settle, instrument.clock, stop, emit
+        instrument.devices, _timeline(blocks, timing), settings, plan.settle, instrument.clock, stop, sink
     )
     try:
         frames = list(acquisition.frames())

@@ -25,7 +25,7 @@ import psutil
 
 from beamline.config.devices import StageOutputShutter
 from beamline.config.load import Config, load
-from beamline.core.events import Emit
+from beamline.core.events import Sink, Warned
 from beamline.core.process import ChildProcess
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.instrument.connect import shutter_of
@@ -46,7 +46,7 @@ INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=be
 @contextmanager
 def watched(
     folder: Path,
-    emit: Emit,
+    sink: Sink,
     stop: StopRequest | None = None,
     pause: PauseRequest | None = None,
 ) -> Iterator[None]:
@@ -59,7 +59,7 @@ def watched(
         pause: requested after the last watchdog has ended; None: the scan goes on without one.
     """
     with Path(os.devnull).open("w") as nowhere, inhibited():
-        keeper = _Keeper(folder, emit, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
+        keeper = _Keeper(folder, sink, lambda command, ready: ChildProcess(command, nowhere, ready, tether=True))
         with closing(keeper):
             keeper.begin(stop or StopRequest(), pause)
             yield
@@ -86,10 +86,10 @@ class _Keeper:
     """
 
     def __init__(
-        self, folder: Path, emit: Emit, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
+        self, folder: Path, sink: Sink, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
     ) -> None:
         self._command = [*COMMAND, str(folder), str(os.getpid())]
-        self._emit, self._start = emit, start
+        self._sink, self._start = sink, start
         self._ready, self._over = threading.Event(), threading.Event()
         self._process = self._started()
         self._thread: threading.Thread | None = None
@@ -137,7 +137,7 @@ class _Keeper:
         return self._start(self._command, lambda line: self._ready.set())
 
     def _warn(self, message: str) -> None:
-        self._emit("warning", {"message": message})
+        self._sink(Warned(message))
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:

@@ -8,11 +8,11 @@ import shutil
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink
+from beamline.core.events import FrameStored, Sink
 from beamline.core.files import refuse_existing
 from beamline.core.text import size
 from beamline.monitor.digest import digest
@@ -59,12 +59,12 @@ def check_output(scan: Scan, out: Path) -> None:
 
 
 def write_scan(
-    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, check_stop: Callable[[], bool]
+    scene: SceneFile, scan: Scan, out: Path, sink: Sink, clock: Clock, should_stop: Callable[[], bool]
 ) -> SimulatedScan:
     """Compute every frame of `scan` and write it to `out`, and the labels beside it, also where it ends early.
 
     Args:
-        check_stop: called before each frame; true ends the scan with a valid file and labels.
+        should_stop: called before each frame; true ends the scan with a valid file and labels.
 
     Raises:
         DataError: a file exists or cannot be written, or the disk is too small.
@@ -79,7 +79,7 @@ def write_scan(
     try:
         with writer:
             for planned in scan:
-                if check_stop():
+                if should_stop():
                     writer.close("stopped")
                     break
                 log.add(n, _write(scan, planned, n, writer))
@@ -87,7 +87,7 @@ def write_scan(
                 now = time.monotonic() - start
                 if now - reported >= REPORT_EVERY or n == len(scan):
                     reported = now
-                    sink(Event("frame", clock.now(), _progress(n, len(scan), now, scan.detector.shape, planned.kind)))
+                    sink(replace(_progress(n, len(scan), now, scan.detector.shape, planned.kind), time=clock.now()))
     except BaseException:
         with suppress(DataError):  # the first error is the one to report
             write_labels(labels, log.runs(), n)
@@ -110,16 +110,10 @@ def _preview_bin(shape: tuple[int, int]) -> int:
     return min(PREVIEW_BIN, *shape)
 
 
-def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: FrameKind) -> dict[str, object]:
+def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: FrameKind) -> FrameStored:
     rate = n / seconds if seconds > 0 else 0.0
-    return {
-        "n": n,
-        "of": total,
-        "kind": kind.name.lower(),
-        "frames_per_s": rate,
-        "mb_per_s": rate * 2e-6 * math.prod(shape),
-        "eta_s": (total - n) / rate if rate > 0 else 0.0,
-    }
+    left = (total - n) / rate if rate > 0 else 0.0
+    return FrameStored(n, total, kind.name.lower(), rate, rate * 2e-6 * math.prod(shape), left)
 
 
 def _info(scene: SceneFile, scan: Scan) -> ScanInfo:

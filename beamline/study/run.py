@@ -8,15 +8,15 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.events import Emit, Event, Sink, Warnings
+from beamline.core.events import Done, Event, Sink, StudyStarted, TrialDone, TrialReached
 from beamline.core.files import named_on_failure, refuse_existing, result_folder
 from beamline.core.machine import machine
+from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth, regions
@@ -122,8 +122,8 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
             f"{options.source.path}: {geometry.n_views} views are too few for any row of {options.study.name}: "
             f"{table.cells[-1].said}. Take a scan with more views."
         )
-    counts = {"rows": len(todo), "left_out": len(table.cells) - len(todo), "study": options.study.name}
-    sink(Event("study_started", clock.now(), {"file": options.source.path, **counts}))
+    left_out = len(table.cells) - len(todo)
+    sink(StudyStarted(options.source.path, len(todo), left_out, options.study.name, time=clock.now()))
     for cell in table.cells:
         if cell.row.groups is None and cell.method == options.methods[0]:
             warn(f"{cell.row.label} is left out: {cell.message}")
@@ -147,10 +147,10 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
             rig.compile(options.methods)
             judge = _Judge(reference, truth, mask)
 
-            def say(event: str, data: Mapping[str, Any]) -> None:
-                sink(Event(event, clock.now(), data))
+            def stamped(event: Event) -> None:
+                sink(replace(event, time=clock.now()))
 
-            for grown in _each(table, rig, judge, slices, say, now):
+            for grown in _each(table, rig, judge, slices, stamped, now):
                 table = grown
                 write_table(folder, table)
         except KeyboardInterrupt:
@@ -161,7 +161,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     write_table(folder, table)
     write_page(folder, table, slices)
     summary = {"output": folder, "rows": len(todo), "done": len(table.done), "stopped": table.stopped}
-    sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))
+    sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
 
 
@@ -229,7 +229,7 @@ class _Rig:
 
 
 def _each(
-    table: StudyTable, rig: _Rig, judge: _Judge, slices: SliceSheet, say: Emit, now: Callable[[], float]
+    table: StudyTable, rig: _Rig, judge: _Judge, slices: SliceSheet, sink: Sink, now: Callable[[], float]
 ) -> Iterator[StudyTable]:
     """The table after each cell, and after one that Ctrl-C interrupted."""
     timed: list[Timed] = []
@@ -238,8 +238,7 @@ def _each(
     begin = now()
     for n, (index, cell) in enumerate(todo):
         eta, rate = seconds_left(timed, trials[n:]), 60 * n / max(now() - begin, 1e-9)
-        place = {"n": n, "of": len(todo), "label": cell.label}
-        say("progress", {"stage": "study", **place, "eta_s": eta, "per_min": rate})
+        sink(TrialReached("study", n, len(todo), cell.label, eta, rate))
         started = now()
         try:
             volume, outcome = rig.reconstructed(cell.row, cell.method)
@@ -256,6 +255,6 @@ def _each(
         timed.append(Timed.of(outcome, now() - started))
         table = table.with_cell(index, cell)
         yield table
-        quality = {"quality_db": figures.get("psnr_fbp", math.nan), "peak_bytes": outcome.peak_bytes}
-        state = {"status": cell.status, "seconds": cell.seconds, "message": cell.message}
-        say("trial", {**place, "n": n + 1, "method": cell.method, **state, **quality, **figures})
+        said, quality = (cell.status, cell.seconds, cell.message), figures.get("psnr_fbp", math.nan)
+        more = {"method": cell.method, **figures}
+        sink(TrialDone(n + 1, len(todo), cell.label, *said, quality, outcome.peak_bytes, more))

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.events import Event, Sink, Warnings
+from beamline.core.events import Done, Sink, StateEntered, TradeoffStarted, TrialReached
 from beamline.core.files import named_on_failure, result_folder
 from beamline.core.machine import machine
+from beamline.core.sinks import Warnings
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
 from beamline.projections.selection import Selection
@@ -102,7 +103,7 @@ def run_tradeoff(
         scan={**facts.table, "views used": str(data.geometry.n_views), "volume": " × ".join(map(str, grid.shape))},
         command=options.command,
     )
-    sink(Event("tradeoff_started", clock.now(), {"file": options.source.path, "trials": len(trials), "by": table.by}))
+    sink(TradeoffStarted(options.source.path, len(trials), table.by, time=clock.now()))
     slices = SliceSheet()
     if truth is not None:
         slices.add("truth", truth)
@@ -110,8 +111,7 @@ def run_tradeoff(
         try:
             with named_on_failure(work / "data.npz"):
                 data.save(work / "data.npz")
-            state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
-            sink(Event("state", clock.now(), state))
+            sink(StateEntered("compiling", "Compiling kernels that are not in the cache", time=clock.now()))
             compile_kernels(trials, work)
             for grown in _each(table, work, slices, options, sink, clock, now):
                 table = grown
@@ -124,7 +124,7 @@ def run_tradeoff(
     write_table(folder, table)
     write_figures(folder, table, slices)
     summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
-    sink(Event("done", clock.now(), {**summary, "seconds": clock.now() - started}))
+    sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
 
 
@@ -157,8 +157,8 @@ def _each(
         if left is not None and left <= 0:
             break
         eta = seconds_left(timed, [other.trial for other in table.outcomes[index:]])
-        progress = {"stage": "tradeoff", "n": index, "of": len(table.outcomes), "label": trial.label, "eta_s": eta}
-        sink(Event("progress", clock.now(), {**progress, "per_min": 60 * index / max(now() - begin, 1e-9)}))
+        n, rate = len(table.outcomes), 60 * index / max(now() - begin, 1e-9)
+        sink(TrialReached("tradeoff", index, n, trial.label, eta, rate, time=clock.now()))
         started, keep = now(), work / "volume.npy" if trial.group == "method" else None
         try:
             result = run_trial(trial, work, options.seed, left, keep=keep)
@@ -171,4 +171,4 @@ def _each(
         timed.append(Timed.of(result, now() - started))
         table = table.with_outcome(index, result)
         yield table
-        sink(Event("trial", clock.now(), {"n": index + 1, "of": len(table.outcomes), **table.event_data(result)}))
+        sink(replace(table.event(index, result), time=clock.now()))

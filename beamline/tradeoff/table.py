@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
+from beamline.core.events import TrialDone
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
 
@@ -91,16 +91,10 @@ class TrialTable:
         """
         return pareto.front([pareto.rounded(value) for value in self.costs(cost)], self.qualities)
 
-    def event_data(self, outcome: Outcome) -> dict[str, Any]:
-        """One trial, as the data of an event; `gaussians` are those at its start, as in its settings."""
-        return {
-            **outcome.trial.as_record(),
-            "status": outcome.status,
-            "seconds": outcome.seconds,
-            "cpu_seconds": outcome.cpu_seconds,
-            "gaussians_end": outcome.gaussians,
-            "peak_bytes": outcome.peak_bytes,
-            "quality_db": outcome.quality(self.by),
-            "message": outcome.message,
-            **outcome.metrics,
-        }
+    def event(self, index: int, outcome: Outcome) -> TrialDone:
+        """The trial of this index, as an event; `gaussians` are those at its start, as in its settings."""
+        figures = outcome.trial.as_record() | {
+            "cpu_seconds": outcome.cpu_seconds, "gaussians_end": outcome.gaussians, **outcome.metrics
+        }  # fmt: skip
+        said = figures.pop("label"), outcome.status, outcome.seconds, outcome.message, outcome.quality(self.by)
+        return TrialDone(index + 1, len(self.outcomes), *said, outcome.peak_bytes, figures)

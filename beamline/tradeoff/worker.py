@@ -158,13 +158,13 @@ def curve_of(result: Reconstruction) -> list[tuple[float, float]]:
 def _progress(say: Say, now: Callable[[], float]) -> Callable[[recon.Progress], None]:
     reported = -math.inf
 
-    def listen(progress: recon.Progress) -> None:
+    def on_progress(progress: recon.Progress) -> None:
         nonlocal reported
         if now() - reported >= _SAY_EVERY:
             reported = now()
             say({"event": "progress", "step": progress.step, "steps": progress.steps})
 
-    return listen
+    return on_progress
 
 
 def end_with(pipe: int) -> None:

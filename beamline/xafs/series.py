@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.events import Event, Sink
+from beamline.core.events import Counted, Sink
 from beamline.xafs.contrast import ContrastRegions, XafsCurve, contrast_of, curve_of
 from drivers.base.clock import Clock
 
@@ -44,12 +44,12 @@ class SeriesResult:
     stopped: bool = False
 
 
-def run_series(series: Series, sink: Sink, clock: Clock, check_stop: Callable[[], bool]) -> SeriesResult:
+def run_series(series: Series, sink: Sink, clock: Clock, should_stop: Callable[[], bool]) -> SeriesResult:
     """The curve of a series of radiographs.
 
     Args:
         sink: gets `progress` events (n, of, per_s, eta_s).
-        check_stop: called after each energy; true ends the series.
+        should_stop: called after each energy; true ends the series.
     """
     energies: list[float] = []
     points: list[tuple[float, float]] = []
@@ -61,9 +61,8 @@ def run_series(series: Series, sink: Sink, clock: Clock, check_stop: Callable[[]
         now, done = time.monotonic(), len(points)
         if now - reported >= REPORT_EVERY or done == series.n:
             reported, rate = now, done / max(now - start, 1e-9)
-            data = {"stage": "xafs", "n": done, "of": series.n, "per_s": rate, "eta_s": (series.n - done) / rate}
-            sink(Event("progress", clock.now(), data))
-        if done < series.n and check_stop():
+            sink(Counted("xafs", done, series.n, rate, (series.n - done) / rate, time=clock.now()))
+        if done < series.n and should_stop():
             stopped = True
             break
     return SeriesResult(curve_of(np.array(energies), points, series.regions), stopped)

@@ -47,7 +47,7 @@ class GlobalExposure(StrEnum):
     GLOBAL_RESET = "global_reset"
 
 
-class HotPixels(StrEnum):
+class HotPixelMode(StrEnum):
     """Sensitivity of the camera's own correction of hot pixels."""
 
     MINIMUM = "minimum"
@@ -81,7 +81,7 @@ class DcamOptions:
     global_exposure: GlobalExposure = GlobalExposure.DELAYED
     trigger_times: int = 1
     trigger_delay: float = 0.0
-    hot_pixels: HotPixels | None = None
+    hot_pixels: HotPixelMode | None = None
     exposure_tolerance: float = 0.01
     ring_bytes: int = 1 << 30
 

@@ -8,7 +8,7 @@ from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
 from drivers.dcam import codes
 from drivers.dcam.codes import Property
-from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixels, TriggerActive, TriggerMode, TriggerPolarity
+from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 from drivers.dcam.properties import Properties
 
 _TRIGGERS = MappingProxyType(
@@ -40,9 +40,9 @@ _GLOBAL = MappingProxyType(
 )
 _HOT_PIXELS = MappingProxyType(
     {
-        HotPixels.MINIMUM: codes.HOTPIXEL_MINIMUM,
-        HotPixels.STANDARD: codes.HOTPIXEL_STANDARD,
-        HotPixels.AGGRESSIVE: codes.HOTPIXEL_AGGRESSIVE,
+        HotPixelMode.MINIMUM: codes.HOTPIXEL_MINIMUM,
+        HotPixelMode.STANDARD: codes.HOTPIXEL_STANDARD,
+        HotPixelMode.AGGRESSIVE: codes.HOTPIXEL_AGGRESSIVE,
     }
 )
 PHOTON_NUMBER = "photon_number"

@@ -47,7 +47,7 @@ class CameraConformance:
 
     @pytest.fixture
     def bench(self) -> CameraBench:
-        raise NotImplementedError
+        pytest.fail("A subclass gives the fixture `bench`: a CameraBench with the camera, made anew for each test.")
 
     def _pulses(self, bench: CameraBench, n: int, period: float | None = None, delay: float = 0.05) -> list[float]:
         step = 1.05 * bench.camera.timing.min_period if period is None else period

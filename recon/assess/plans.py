@@ -14,7 +14,7 @@ _MOST_BINNED = 2  # of the measured curves
 
 
 @dataclass(frozen=True)
-class Curve:
+class QualityCurve:
     """Quality against steps of one kind of reconstruction, measured by tests/bench/test_quality_curves.py.
 
     Attributes:
@@ -62,18 +62,18 @@ class Curve:
 # pixel (48 rows of 160 pixels, 90 views, 5000 photons a pixel). The same in half the views with 100 000 photons.
 # Simulated spheres (48 rows of 96 pixels, 60 views, 10 000 photons). Fits with a finish of 8 sweeps. A curve begins
 # where its method is above FBP on all of them. Binning helps only where FBP of all pixels takes too long.
-CURVES: tuple[Curve, ...] = (
-    Curve("fbp", "", 1, 0.0, 0.0, 0.0, ((1, 0.0),)),
-    Curve("fbp", "", 2, 0.0, 0.0, 0.0, ((1, -3.88),)),
-    Curve("r2", "steps", 1, 1.0, 1.0, 16.4, ((125, 7.01), (250, 7.69), (500, 8.18), (1000, 8.32))),
-    Curve("r2", "steps", 1, 0.5, 0.67, 16.7, ((125, 6.94), (250, 7.54), (500, 8.09), (1000, 8.19))),
-    Curve("r2", "steps", 1, 0.25, 0.46, 13.4, ((125, 6.83), (250, 7.23), (500, 7.65), (1000, 7.86))),
-    Curve("r2", "steps", 1, 2.0, 1.63, 20.1, ((125, 7.11), (250, 7.75), (500, 8.25), (1000, 8.37))),
-    Curve("r2", "steps", 2, 0.25, 0.46, 21.4, ((125, -1.85), (250, -1.79), (500, -2.03), (1000, -1.91))),
-    Curve("fista-tv", "iterations", 1, 0.0, 0.99, 5.7, ((5, 3.92), (10, 6.44), (20, 7.36), (40, 8.06))),
-    Curve("fista-tv", "iterations", 2, 0.0, 1.22, 5.0, ((5, -2.36), (10, -1.95), (20, -1.98), (40, -2.0))),
-    Curve("os-sirt-tv", "iterations", 1, 0.0, 0.69, 4.9, ((10, 2.62), (20, 5.57), (40, 7.14))),
-    Curve("os-sirt-tv", "iterations", 2, 0.0, 0.86, 2.2, ((10, -2.33), (20, -1.8), (40, -1.73))),
+CURVES: tuple[QualityCurve, ...] = (
+    QualityCurve("fbp", "", 1, 0.0, 0.0, 0.0, ((1, 0.0),)),
+    QualityCurve("fbp", "", 2, 0.0, 0.0, 0.0, ((1, -3.88),)),
+    QualityCurve("r2", "steps", 1, 1.0, 1.0, 16.4, ((125, 7.01), (250, 7.69), (500, 8.18), (1000, 8.32))),
+    QualityCurve("r2", "steps", 1, 0.5, 0.67, 16.7, ((125, 6.94), (250, 7.54), (500, 8.09), (1000, 8.19))),
+    QualityCurve("r2", "steps", 1, 0.25, 0.46, 13.4, ((125, 6.83), (250, 7.23), (500, 7.65), (1000, 7.86))),
+    QualityCurve("r2", "steps", 1, 2.0, 1.63, 20.1, ((125, 7.11), (250, 7.75), (500, 8.25), (1000, 8.37))),
+    QualityCurve("r2", "steps", 2, 0.25, 0.46, 21.4, ((125, -1.85), (250, -1.79), (500, -2.03), (1000, -1.91))),
+    QualityCurve("fista-tv", "iterations", 1, 0.0, 0.99, 5.7, ((5, 3.92), (10, 6.44), (20, 7.36), (40, 8.06))),
+    QualityCurve("fista-tv", "iterations", 2, 0.0, 1.22, 5.0, ((5, -2.36), (10, -1.95), (20, -1.98), (40, -2.0))),
+    QualityCurve("os-sirt-tv", "iterations", 1, 0.0, 0.69, 4.9, ((10, 2.62), (20, 5.57), (40, 7.14))),
+    QualityCurve("os-sirt-tv", "iterations", 2, 0.0, 0.86, 2.2, ((10, -2.33), (20, -1.8), (40, -1.73))),
 )
 
 
@@ -197,8 +197,8 @@ def best_steps(method: str) -> int:
     return max(found, default=DEFAULT_STEPS)
 
 
-def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choice | None:
-    """The longest run of one kind within the time; None if the time is too short."""
+def _longest(curve: QualityCurve, further: int, budget: float, speeds: Speeds) -> Choice | None:
+    """The choice of one kind that the time suffices for; None: it does not."""
     left, step = budget - curve.fixed(speeds, further), curve.step(speeds, further)
     first, last = curve.points[0][0], max(curve.points, key=lambda point: point[1])[0]
     if not left >= first * step:
@@ -207,7 +207,7 @@ def _longest(curve: Curve, further: int, budget: float, speeds: Speeds) -> Choic
     return _choice(curve, further, int(min(left / step, last)) if step > 0 else last, speeds)
 
 
-def _choice(curve: Curve, further: int, steps: int, speeds: Speeds) -> Choice:
+def _choice(curve: QualityCurve, further: int, steps: int, speeds: Speeds) -> Choice:
     # Binning above 2 was not measured: each further factor of 2 is assumed to cost 3 dB, about as much as the first.
     gain = curve.gain(steps) - 3.0 * math.log2(further)
     seconds = curve.fixed(speeds, further) + steps * curve.step(speeds, further)

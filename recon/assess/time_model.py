@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.assess.plans import CURVES, Curve
+from recon.assess.plans import CURVES, QualityCurve
 
 _REACH = 10.0  # times the time covered: no extrapolation goes further
 _POINTS = 24  # groups of a record: neighbouring values share a running mean, so more groups are not more information
@@ -87,7 +87,7 @@ def next_decibel_of_fit(seconds: float, steps: int) -> NextDecibel:
     return NextDecibel(middle, low, high, "volume")
 
 
-def _further(curve: Curve, steps: int) -> float:
+def _further(curve: QualityCurve, steps: int) -> float:
     """Factor on the steps that gains a dB; inf if it is above ten."""
     steps = max(steps, curve.points[0][0])
     (before, gain), (last, most) = curve.points[-2:]

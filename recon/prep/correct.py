@@ -222,7 +222,7 @@ class Correction:
         counts: NDArray[np.generic],
         positions: NDArray[np.float64],
         view_ids: NDArray[np.int64] | None = None,
-        told: Callable[[int], None] = lambda done: None,
+        progress: Callable[[int], None] = lambda done: None,
     ) -> Transmission:
         """(counts - dark) / (flat - dark) with bad pixels filled from their neighbours.
 
@@ -230,7 +230,7 @@ class Correction:
             counts: [view, row, col], any real type, in the order of acquisition.
             positions: [view], number of the frame in the scan, as in the flats' positions.
             view_ids: int64 [view]; None: 0, 1, 2 ...
-            told: how many views are done, after each.
+            progress: how many views are done, after each.
 
         Raises:
             ValueError: for shapes that do not fit, positions or more than half of a view not finite.
@@ -256,7 +256,7 @@ class Correction:
                     f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
             fill(view, plan_fill(bad | self.masked) if repaired[v] else self._fill)
-            told(v + 1)
+            progress(v + 1)
         return Transmission(data, ids, repaired, beam)
 
     def _flat_of(self, view: Image, position: float) -> Image:
@@ -274,14 +274,14 @@ class Correction:
             self._profiles.append(edge_profiles(views.data))
 
     def line_integrals(
-        self, views: Transmission | None, last: bool = True, told: Callable[[int], None] = lambda done: None
+        self, views: Transmission | None, last: bool = True, progress: Callable[[int], None] = lambda done: None
     ) -> Projections:
         """Line integrals of these views and of the waiting one; without `last` the newest view then waits.
 
         Args:
             views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
             last: no view comes after these.
-            told: how many views are free of zingers, after each; the logarithm that follows takes little time.
+            progress: how many views are free of zingers, after each; the logarithm that follows takes little time.
 
         Raises:
             UnlitViewsError: the air columns of some views are dark; it has their numbers.
@@ -310,7 +310,7 @@ class Correction:
             if beam is not None and first.beam is not None:
                 beam = np.concatenate((first.beam, beam))
         n = len(data) if last else max(len(data) - 1, 0)
-        replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, told)
+        replaced = int(repaired[:n].sum()) + self._remove_zingers(data, n, progress)
         self._waiting = None
         if n < len(data):
             waits = None if beam is None else beam[n:].copy()
@@ -341,8 +341,8 @@ class Correction:
         view[...] = np.where(w > 0, p, 0)
         beam[...] = np.where(self.masked, 0, w)
 
-    def _remove_zingers(self, data: NDArray[np.float32], n: int, told: Callable[[int], None]) -> int:
-        """Remove zingers from the first `n` views; returns the number of pixels."""
+    def _remove_zingers(self, data: NDArray[np.float32], n: int, progress: Callable[[int], None]) -> int:
+        """Take zingers out of the first `n` views; how many pixels they hit."""
         if not np.isfinite(self._settings.zinger_threshold):
             return 0
         replaced = 0
@@ -353,7 +353,7 @@ class Correction:
             r, c, value = zingers(data[v], others, self._settings.zinger_threshold)
             data[v, r, c] = value
             replaced += r.size
-            told(v + 1)
+            progress(v + 1)
         return replaced
 
     def _check_views(self, counts: NDArray[np.generic], positions: NDArray[np.float64]) -> None:

@@ -153,7 +153,7 @@ def _weights() -> F32:
 
 
 @njit(parallel=True, boundscheck=False, cache=True)
-def _resample(view, row, row_phase, col, col_phase, table, out):  # type: ignore[no-untyped-def]
+def _resample(view, row, row_phase, col, col_phase, table, out):
     """out[i, j] = sum over 6 x 6 pixels of `view` about (row, col)[i, j], those beyond an edge as at the edge."""
     rows, cols = view.shape
     for i in prange(rows):

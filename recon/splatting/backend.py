@@ -25,7 +25,7 @@ from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
 Array = TypeVar("Array")
 
 
-class View(Protocol[Array]):
+class SplatView(Protocol[Array]):
     """One rendered view: its image [row, col] and its backward pass."""
 
     image: Array
@@ -34,7 +34,7 @@ class View(Protocol[Array]):
         """Back-propagate an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
 
 
-class Box(Protocol[Array]):
+class VoxelBox(Protocol[Array]):
     """One box of voxels: its density [z, y, x] and its backward pass."""
 
     density: Array
@@ -46,13 +46,13 @@ class Box(Protocol[Array]):
 class Pass(Protocol[Array]):
     """One pass over a model: physical parameters, and the gradients added by its views and boxes of voxels."""
 
-    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> View[Array]:
+    def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> SplatView[Array]:
         """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ.
 
         A view must have run `backward` before the next one is rendered: they share memory.
         """
 
-    def box(self, grid: Grid, faint: float, cut: float) -> Box[Array]:
+    def box(self, grid: Grid, faint: float, cut: float) -> VoxelBox[Array]:
         """Voxelise on a grid; `faint` is a density."""
 
     def gradients(self) -> tuple[Array, Array, Array, Array]:
@@ -233,7 +233,7 @@ class CpuLoss:
     """The fused loss with the numba kernels."""
 
     def __init__(self, shape: tuple[int, int], ssim_weight: float, term: DataTerm) -> None:
-        self._loss = losses_cpu.ProjectionLoss(shape, ssim_weight, term=term)
+        self._loss = losses_cpu.CpuProjectionLoss(shape, ssim_weight, term=term)
         self._slope = np.empty(shape, np.float32)
 
     def target_maps(self, target: F32, weights: F32 | None = None) -> F32:

@@ -44,7 +44,7 @@ _NS_A_RAY, _NS_A_POINT, _NS_A_CELL, _NS_OF_PLAN = 5, 85, 150, 20
 
 
 @njit(inline="always")
-def _line_of_lanes(n):  # type: ignore[no-untyped-def]
+def _line_of_lanes(n):
     """Zeros [n, 16] that begin at a cache line: sixteen lanes then never lie in two."""
     buffer = np.zeros((n + 1) * lanes.WIDTH, np.float32)
     begin = (-(buffer.ctypes.data // 4)) % lanes.WIDTH
@@ -84,7 +84,7 @@ def _ray_by_ray(columns: F32, cosines: F64, sines: F64, axis_cols: F64, x: F64, 
 
 
 @njit(inline="always")
-def _cell(frequency, n):  # type: ignore[no-untyped-def]
+def _cell(frequency, n):
     """Place in a period of n cells, 0 <= place < n, of a frequency in cycles a voxel."""
     place = (frequency - math.floor(frequency)) * n
     return place if place < n else 0.0

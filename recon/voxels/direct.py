@@ -43,12 +43,12 @@ class Fbp:
         filled = masked(problem.projections, problem.use.weights)[0]
         begin, views = control.now(), problem.geometry.n_views
 
-        def told(done: int, slices: int) -> None:
+        def progress(done: int, slices: int) -> None:
             if control.on_progress is not None:
                 nan = math.nan
                 control.on_progress(Progress(done, slices, control.now() - begin, nan, nan, 0, views, unit="slices"))
 
-        data = direct(filled, problem.geometry, problem.grid, self.filter, told)
+        data = direct(filled, problem.geometry, problem.grid, self.filter, progress)
         return MethodResult(Volume(data, problem.grid), {"filter": self.filter})
 
     def toy(self) -> Self:

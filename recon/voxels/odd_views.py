@@ -56,7 +56,7 @@ def odd_views(
     geometry: Geometry,
     weights: F32 | RayWeights | None = None,
     limit: float = LIMIT,
-    told: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[OddView, ...]:
     """Views in which something crossed the beam or the sample was displaced, found in the differences p - A x.
 
@@ -69,8 +69,8 @@ def odd_views(
     Args:
         projections: [view, row, col].
         weights: of the rays [view, row, col]; those of weight 0 were not measured.
-        limit: least score of an odd view.
-        told: how many of how many views were compared; bands of rows count by their share.
+        limit: score from which a view is odd.
+        progress: how many of how many views were compared, of bands of rows by their share.
 
     Returns:
         In the order of the views; empty for fewer than 25 views.
@@ -80,7 +80,7 @@ def odd_views(
         return ()
     order = np.argsort(geometry.angles, kind="stable")
     side = _side(geometry)
-    differences, edges = (each[order] for each in _differences(volume, projections, geometry, weights, side, told))
+    differences, edges = (each[order] for each in _differences(volume, projections, geometry, weights, side, progress))
     found = []
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
@@ -149,7 +149,7 @@ def _differences(
     geometry: Geometry,
     weights: F32 | RayWeights | None,
     side: int,
-    told: Callable[[int, int], None],
+    progress: Callable[[int, int], None],
 ) -> tuple[F32, F32]:
     """The difference of the views from the volume, and its part that edges explain.
 
@@ -170,7 +170,7 @@ def _differences(
         seen[there], light[there] = _cells(measured * bright, side), _cells(bright, side)
         left[there], edges[there] = _cells(difference * known, side), _cells(sharp * bright, side)
         compared += len(model) * model.shape[1]
-        told(compared * geometry.n_views // all_rows, geometry.n_views)
+        progress(compared * geometry.n_views // all_rows, geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
         third = np.diff(seen[view], 3, axis=1)  # noise of the view; the finest detail of the sample counts as noise
         noise = median_deviation(third) / math.sqrt(20.0)

@@ -9,7 +9,7 @@ A ray has no width: pixels should not be much larger than voxels, or voxels betw
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,11 +80,6 @@ class Projector:
     def __call__(self, volume: F32) -> F32:
         """A x, as `forward`."""
         return self.forward(volume)
-
-    @property
-    def T(self) -> Callable[[F32], F32]:  # noqa: N802 - the transpose, as numpy spells it
-        """Aᵀ: `A.T(p)` is `A.adjoint(p)`."""
-        return self.adjoint
 
     def forward_lines(self, volume: F32, out: F32 | None = None) -> F32:
         """A x: volume [y, x, z] to projections [view, col, row]."""

@@ -55,7 +55,7 @@ class TriggerSettings:
         return range(self.start, self.end + self.sign, self.sign * self.interval)
 
 
-class TriggerOutput:
+class MotorOutput:
     """The counter behind a trigger output: armed once, then each point fires once while the axis passes it forwards.
 
     After a stop between points, going on fires the rest; going back over fired points does not fire them again. A
@@ -160,7 +160,7 @@ class PulseMotor:
         fires_at_start: bool = True,
     ) -> None:
         self.stall_at, self.switch_at = stall_at, switch_at
-        self.trigger = TriggerOutput(lost, fires_at_start)
+        self.trigger = MotorOutput(lost, fires_at_start)
         self.limits: tuple[int, int] | None = None
         self.ended = Ended(0)
         self._clock, self._line = clock, line

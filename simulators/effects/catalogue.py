@@ -17,7 +17,7 @@ from simulators.frame.domain import Domain
 
 
 @dataclass(frozen=True)
-class Entry:
+class EffectRow:
     """An effect of the catalogue.
 
     Attributes:
@@ -37,77 +37,77 @@ FINAL = frozenset({"photon_noise", "read_noise", "adc"})
 """Effects that end their domain: nothing of that domain may follow."""
 _BEAM = frozenset({"beam_profile", "beam_bend", "narrow_field"})
 _CHARGE = frozenset({"dark_current", "hot_pixels", "zingers"})
-_OURS: Mapping[str, Entry] = MappingProxyType(
+_OURS: Mapping[str, EffectRow] = MappingProxyType(
     {
-        "motion_blur": Entry(Domain.MOTION, "the sample turns during the exposure"),
-        "rolling_shutter": Entry(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
-        "afterglow": Entry(Domain.MOTION, "the scintillator still emits light of earlier moments"),
-        "encoder_error": Entry(Domain.MOTION, "the stage's angle differs from its encoder's reading"),
-        "backlash": Entry(Domain.MOTION, "after turning backwards the stage lags behind its encoder"),
-        "stage_wobble": Entry(Domain.MOTION, "the rotation axis tilts as the stage turns"),
-        "runout": Entry(Domain.MOTION, "the rotation axis wanders as the stage turns"),
-        "jump": Entry(
+        "motion_blur": EffectRow(Domain.MOTION, "the sample turns during the exposure"),
+        "rolling_shutter": EffectRow(Domain.MOTION, "lower rows are exposed later, when the sample has turned further"),
+        "afterglow": EffectRow(Domain.MOTION, "the scintillator still emits light of earlier moments"),
+        "encoder_error": EffectRow(Domain.MOTION, "the stage's angle differs from its encoder's reading"),
+        "backlash": EffectRow(Domain.MOTION, "after turning backwards the stage lags behind its encoder"),
+        "stage_wobble": EffectRow(Domain.MOTION, "the rotation axis tilts as the stage turns"),
+        "runout": EffectRow(Domain.MOTION, "the rotation axis wanders as the stage turns"),
+        "jump": EffectRow(
             Domain.MOTION,
             "the sample slips on the stage once",
             frozenset({"encoder_error", "backlash", "stage_wobble", "runout"}),
             "errors of the stage depend on the stage's angle, and the sample slips on the stage",
         ),
-        "pixel_area": Entry(Domain.OPTICAL_DEPTH, "a pixel counts the light on its whole area"),
-        "floaters": Entry(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
-        "phase_fringes": Entry(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
-        "harmonics": Entry(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
-        "beam_hardening": Entry(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
-        "beam_profile": Entry(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
-        "beam_bend": Entry(Domain.PHOTONS, "the open beam of the views differs from the flats"),
-        "ring_current": Entry(Domain.PHOTONS, "the ring current decays and is topped up"),
-        "ghost": Entry(Domain.PHOTONS, "a fog-like change of the light crosses the frame in a few views"),
-        "black_band": Entry(Domain.PHOTONS, "a slit darkens a band at the left side"),
-        "narrow_field": Entry(Domain.PHOTONS, "the beam is narrower than the sample"),
-        "lost_beam": Entry(Domain.PHOTONS, "for a time there is no light, or less of it"),
-        "scatter": Entry(
+        "pixel_area": EffectRow(Domain.OPTICAL_DEPTH, "a pixel counts the light on its whole area"),
+        "floaters": EffectRow(Domain.OPTICAL_DEPTH, "crumbs far from the axis are in the field of view in a few views"),
+        "phase_fringes": EffectRow(Domain.OPTICAL_DEPTH, "edges get bright rims by propagation to the detector"),
+        "harmonics": EffectRow(Domain.OPTICAL_DEPTH, "some photons have three times the energy"),
+        "beam_hardening": EffectRow(Domain.OPTICAL_DEPTH, "soft energies of the beam are absorbed before hard ones"),
+        "beam_profile": EffectRow(Domain.PHOTONS, "the beam is brightest in the middle, striped, and wanders"),
+        "beam_bend": EffectRow(Domain.PHOTONS, "the open beam of the views is not that of the flats"),
+        "ring_current": EffectRow(Domain.PHOTONS, "the ring current decays and is topped up"),
+        "ghost": EffectRow(Domain.PHOTONS, "a fog-like change of the light crosses the frame in a few views"),
+        "black_band": EffectRow(Domain.PHOTONS, "a slit darkens a band at the left side"),
+        "narrow_field": EffectRow(Domain.PHOTONS, "the beam is narrower than the sample"),
+        "lost_beam": EffectRow(Domain.PHOTONS, "for a time there is no light, or less of it"),
+        "scatter": EffectRow(
             Domain.PHOTONS,
             "photons that the sample deflects arrive elsewhere",
             _BEAM,
             "the sample scatters the light that reaches it",
         ),
-        "scintillator_blur": Entry(
+        "scintillator_blur": EffectRow(
             Domain.PHOTONS,
             "scintillator and optics blur, and glare far away",
             _BEAM | {"black_band"},
             "the scintillator blurs all light that reaches it",
         ),
-        "flat_structure": Entry(Domain.PHOTONS, "dust and scratches on scintillator and optics"),
-        "quantum_efficiency": Entry(
+        "flat_structure": EffectRow(Domain.PHOTONS, "dust and scratches on scintillator and optics"),
+        "quantum_efficiency": EffectRow(
             Domain.PHOTONS,
             "the sensor detects a share of the photons",
             frozenset({"scatter"}),
             "stray light is detected like any other",
         ),
-        "prnu": Entry(
+        "prnu": EffectRow(
             Domain.PHOTONS,
             "pixels differ in how much light they detect",
             frozenset({"scatter", "scintillator_blur"}),
             "pixels differ in their response to light that is spread already",
         ),
-        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),
-        "dark_current": Entry(Domain.ELECTRONS, "electrons that arise without light"),
-        "hot_pixels": Entry(Domain.ELECTRONS, "a few pixels have a large dark current"),
-        "zingers": Entry(Domain.ELECTRONS, "stray X-rays hit the sensor"),
-        "saturation": Entry(
+        "photon_noise": EffectRow(Domain.PHOTONS, "photons arrive at random"),
+        "dark_current": EffectRow(Domain.ELECTRONS, "electrons that arise without light"),
+        "hot_pixels": EffectRow(Domain.ELECTRONS, "a few pixels have a large dark current"),
+        "zingers": EffectRow(Domain.ELECTRONS, "stray X-rays hit the sensor"),
+        "saturation": EffectRow(
             Domain.ELECTRONS,
             "a pixel holds no more than its full well",
             _CHARGE,
             "charge of any origin fills a pixel",
         ),
-        "dead_pixels": Entry(
+        "dead_pixels": EffectRow(
             Domain.ELECTRONS,
             "a few pixels do not respond to light",
             _CHARGE,
             "dead pixels hold a constant charge",
         ),
-        "read_noise": Entry(Domain.ELECTRONS, "noise of the readout"),
-        "offset": Entry(Domain.COUNTS, "the digital bias"),
-        "adc": Entry(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
+        "read_noise": EffectRow(Domain.ELECTRONS, "noise of the readout"),
+        "offset": EffectRow(Domain.COUNTS, "the digital bias"),
+        "adc": EffectRow(Domain.COUNTS, "a converter of fewer bits, or a nonlinear one"),
     }
 )
 
@@ -120,13 +120,13 @@ def _fitting(name: str, effect: type[Any]) -> type[Any]:
     return effect
 
 
-def _entry_of(effect: type[Any]) -> Entry:
+def _entry_of(effect: type[Any]) -> EffectRow:
     summary, follows = (effect.__doc__ or "").partition("\n")[0], frozenset(getattr(effect, "follows", ()))
-    return Entry(Domain(effect.domain), summary, follows, getattr(effect, "reason", "its package says so"))
+    return EffectRow(Domain(effect.domain), summary, follows, getattr(effect, "reason", "its package says so"))
 
 
 _PLUGGED: Mapping[str, type[Any]] = plugins("effect", _OURS, _fitting)
-CATALOGUE: Mapping[str, Entry] = MappingProxyType(
+CATALOGUE: Mapping[str, EffectRow] = MappingProxyType(
     {**_OURS, **{name: _entry_of(effect) for name, effect in _PLUGGED.items()}}
 )
 

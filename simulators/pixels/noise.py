@@ -27,11 +27,10 @@ LARGEST = 1e9
 
 
 @njit(cache=True, nogil=True, inline="always")
-def expansion(w, mean, root):  # type: ignore[no-untyped-def]
-    """x with Q(x, mean) = Φ(w), and a bound of its error. Q is the regularised upper incomplete gamma function.
-
-    The integer part of x is the Poisson quantile; `root` is √mean. The bound is twice Giles's for |w| <= 3, and
-    for |w| <= 5 from an expectation of 30 on. Elsewhere there is no bound."""
+def expansion(w, mean, root):
+    """x with Q(x, mean) = Φ(w), where Q is the regularised upper incomplete gamma function: the Poisson quantile is its
+    integer part; `root` is √mean. And a bound of its error: twice Giles's where |w| <= 3 (from an expectation of 30 on
+    where |w| <= 5), none elsewhere."""
     s = 1.0 / root
     ww = w * w
     x = mean + root * w + (1 / 3 + ww / 6) - s * w * (1 / 36 + ww / 72)
@@ -41,7 +40,7 @@ def expansion(w, mean, root):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def summed(w, mean):  # type: ignore[no-untyped-def]
+def summed(w, mean):
     """The Poisson quantile of Φ(w) by the sum of the distribution, from its nearer end. It is the lower tail for w < 0,
     the upper for w > 0, so that no digits are lost in either; `mean` >= LEAST."""
     tail = 0.5 * math.erfc(abs(w) / math.sqrt(2.0))
@@ -79,7 +78,7 @@ def summed(w, mean):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def searched(u, mean):  # type: ignore[no-untyped-def]
+def searched(u, mean):
     """The Poisson quantile of u in 0 ... 1 by sums from 0 up, for small expectations."""
     k, share = 0, math.exp(-mean)
     while u >= share and share > 0.0:
@@ -90,7 +89,7 @@ def searched(u, mean):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _poisson_rows(key, first, end, image):  # pragma: no cover
     """Replaces image[row, col] by a Poisson number of this expectation, for the rows of a band."""
     cols = image.shape[1]
     w, u, k = np.empty(cols), np.empty(cols), np.empty(cols)
@@ -114,7 +113,7 @@ def _poisson_rows(key, first, end, image):  # type: ignore[no-untyped-def]  # pr
 
 
 @njit(cache=True, nogil=True)
-def _small(state, mean, u, k):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _small(state, mean, u, k):  # pragma: no cover
     """Draws uniform numbers u [col] and sets k [col] to their quantiles for the small expectations of a row, or to -1
     where that exceeds EASY. Other columns of k are unchanged."""
     share = np.empty(mean.size)
@@ -132,7 +131,7 @@ def _small(state, mean, u, k):  # type: ignore[no-untyped-def]  # pragma: no cov
 
 
 @njit(cache=True, nogil=True)
-def _normal_rows(key, first, end, rms, stride, image):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _normal_rows(key, first, end, rms, stride, image):  # pragma: no cover
     """Add rms * normal. In rms [pixel] each row begins `stride[0]` further and each column `stride[1]`."""
     for row in range(first, end):
         state = begin(key, row)

@@ -16,7 +16,7 @@ from simulators.pixels.streams import STEP, begin, mix, normal
 
 
 @njit(cache=True, nogil=True)
-def _normal_rows(key, first, end, row0, col0, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _normal_rows(key, first, end, row0, col0, out):  # pragma: no cover
     for row in range(first, end):
         of_row = begin(key, row0 + row)
         for col in range(out.shape[1]):

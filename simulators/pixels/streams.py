@@ -37,7 +37,7 @@ _X, _HEIGHT = layers()
 
 
 @njit(cache=True, nogil=True, inline="always")
-def mix(state):  # type: ignore[no-untyped-def]
+def mix(state):
     """Hash of 64 bits to 64 bits, one to one."""
     z = (state ^ (state >> _30)) * _FIRST
     z = (z ^ (z >> _27)) * _SECOND
@@ -45,20 +45,20 @@ def mix(state):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline="always")
-def begin(key, number):  # type: ignore[no-untyped-def]
+def begin(key, number):
     """State of the stream `number` (a row, a pixel) among those of a key."""
     return mix(key ^ mix(np.uint64(number) * STEP + STEP))
 
 
 @njit(cache=True, nogil=True, inline="always")
-def uniform(state):  # type: ignore[no-untyped-def]
+def uniform(state):
     """A number in 0 ... 1 (excluded) with 53 bits, and the state after it."""
     state += STEP
     return (mix(state) >> _11) * 2.0**-53, state
 
 
 @njit(cache=True, nogil=True)
-def normal(state):  # type: ignore[no-untyped-def]
+def normal(state):
     """A number of mean 0 and variance 1 and the state after it. Ziggurat of Marsaglia & Tsang (2000), with separate
     bits for layer, sign and value (Doornik 2005)."""
     while True:

@@ -38,7 +38,7 @@ class Run:
             SETTLE,
             instrument.clock,
             stop or StopRequest(),
-            lambda event, data: self.events.append((event, data)),
+            lambda event: self.events.append((event.event, event.data)),
             supervision,
         )
         try:

@@ -72,7 +72,7 @@ def smooth(angles: NDArray[np.float64]) -> Scan:
 
 
 @dataclass(frozen=True)
-class Curve:
+class QualityCurve:
     """PSNR in dB after each quarter of a scan, at its end after the last round, and after the finish on voxels."""
 
     quarters: list[float]
@@ -85,7 +85,7 @@ class Curve:
         print(f"| {name} | {cells} | {self.seconds:.0f} |", flush=True)
 
 
-def streamed(scan: Scan, renders: int) -> Curve:
+def streamed(scan: Scan, renders: int) -> QualityCurve:
     """A stream that renders so many views while one is taken, and LAST in its last round."""
     data, geometry, truth = scan
     begin, grid = time.process_time(), Grid.matching(geometry)
@@ -103,10 +103,10 @@ def streamed(scan: Scan, renders: int) -> Curve:
     refined = finish(
         volume, gaussians, ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), settings=model.settings
     ).volume
-    return Curve(found, psnr(truth, volume.data), psnr(truth, refined.data), seconds)
+    return QualityCurve(found, psnr(truth, volume.data), psnr(truth, refined.data), seconds)
 
 
-def from_scratch(scan: Scan, renders: int) -> Curve:
+def from_scratch(scan: Scan, renders: int) -> QualityCurve:
     """Fits to the views so far, each with all that a stream could have rendered until then."""
     data, geometry, truth = scan
 
@@ -118,7 +118,7 @@ def from_scratch(scan: Scan, renders: int) -> Curve:
     begin = time.process_time()
     end = quality(VIEWS, LAST)
     seconds = time.process_time() - begin
-    return Curve(found, end, quality(VIEWS, LAST, None), seconds)
+    return QualityCurve(found, end, quality(VIEWS, LAST, None), seconds)
 
 
 def direct(scan: Scan) -> list[float]:

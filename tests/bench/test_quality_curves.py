@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import recon
 from recon.assess.metrics import psnr
-from recon.assess.plans import CURVES, Curve
+from recon.assess.plans import CURVES, QualityCurve
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
@@ -143,7 +143,7 @@ def test_the_curves_that_budgets_are_planned_by(shared_data: Path) -> None:
         sweeps = float(np.mean(np.median(rows[:, :, 1], axis=1)))
         gains = rows[:, :, 2].mean(axis=0)
         points = tuple((steps, round(float(gain), 2)) for steps, gain in zip(numbers, gains, strict=True))
-        found.append(Curve(name, counted, binning, share, round(pace, 2), round(sweeps, 1), points))
+        found.append(QualityCurve(name, counted, binning, share, round(pace, 2), round(sweeps, 1), points))
         print(f"    {found[-1]},")
     # The table need not be that of this very machine, but it must still say the truth.
     by_kind = {(c.method, c.binning, c.share): c for c in CURVES}

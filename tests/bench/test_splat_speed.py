@@ -29,7 +29,7 @@ from recon.kernels.cpu.activation import OPTIONS, activation_backward
 from recon.kernels.cpu.adam import adam_all
 from recon.kernels.cpu.engine import Active, Gradients, grid_layout, render_view, view_table
 from recon.kernels.cpu.footprints import HU, HV, KV, SHEAR, K, U, V, W
-from recon.kernels.cpu.losses import ProjectionLoss, total_variation
+from recon.kernels.cpu.losses import CpuProjectionLoss, total_variation
 from recon.kernels.cpu.project import moments, render, render_layers
 from recon.splatting import optimise as fit
 from recon.splatting.density_control import DensityPolicy
@@ -163,7 +163,7 @@ def test_a_whole_step_and_its_parts() -> None:
     image, layers = np.empty((SIDE, SIDE), np.float32), render_layers(SIDE, SIDE)
     slope, into, centres = np.empty_like(image), Gradients.zeros(n), np.empty((n, 2), np.float32)
     seen = render_view(active, views, 2, cut.faint, cut.sigmas, settings.rays, image=image)
-    loss = ProjectionLoss((SIDE, SIDE), 0.25)
+    loss = CpuProjectionLoss((SIDE, SIDE), 0.25)
     loss(image, problem.images[2], problem.target_maps[2], slope)
     box = Grid((32, 32, 32))
     layout = grid_layout(active, box, 1e-7, cut.sigmas)

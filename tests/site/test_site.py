@@ -35,7 +35,8 @@ from tests.site.site_of_an_instrument.wires import SiteBuild
 
 HERE = Path(__file__).parent
 GROUPS = [
-    f"splatline.{kind}" for kind in ("method", "reader", "volume_format", "stage", "wire", "camera", "check", "effect")
+    f"splatline.{kind}"
+    for kind in ("method", "correction", "reader", "volume_format", "stage", "wire", "camera", "check", "effect")
 ]
 NAMES = (f"site-{number}" for number in itertools.count())
 FIGURES = {
@@ -106,12 +107,15 @@ with warnings.catch_warnings(record=True) as told:
     from simulators.scenes.scene import load_scene
     names = methods.names()
     text = suffixes_text()
+    from beamline.projections.steps.registry import all_steps
+    steps = [step.name for step in all_steps()]
     from simulators.wires.registry import WIRES
 
 left_out = {str(one.message).split(" was left out")[0] for one in told if "left out" in str(one.message)}
 package = "of the package site-of-an-instrument"
-kinds = ("method", "reader", "volume format", "stage", "wire", "camera", "check", "effect")
+kinds = ("method", "correction", "reader", "volume format", "stage", "wire", "camera", "check", "effect")
 assert left_out == {f"The {kind} 'wrong' {package} (math:pi)" for kind in kinds} | {
+    f"The correction 'air' {package} (site_of_an_instrument.corrections:Lift)",
     f"The effect 'gone' {package} (no_such_module:Gone)",
     f"The method 'fbp' {package} (site_of_an_instrument.methods:Mean)",
     f"The volume format 'taken' {package} (beamline.storage.volumes.plain:Npy)",
@@ -121,6 +125,11 @@ grid = recon.Grid((2, 8, 8), 1.0)
 volume = recon.Volume(np.arange(128, dtype=np.float32).reshape(grid.shape), grid)
 assert names[-1] == "mean" and "fbp" in names
 assert methods.by_name("mean").label == "Mean of two" and not methods.streams("mean")
+
+assert steps.index("lift") > steps.index("hardening")
+from click.testing import CliRunner
+from beamline.cli.main import main
+assert "--lift BY" in CliRunner().invoke(main, ["recon", "--help-all"]).output
 
 np.save("scan.npy", np.arange(24, dtype=np.uint16).reshape(2, 3, 4))
 with open_scan(SourceOptions("scan.npy", angles=[0.0, 1.0])) as source:
@@ -186,6 +195,7 @@ def test_one_of_each_kind_is_found_by_its_entry_point_and_what_does_not_fit_is_n
         [
             *((group, "wrong = math:pi") for group in GROUPS),
             ("splatline.method", "fbp = site_of_an_instrument.methods:Mean"),
+            ("splatline.correction", "air = site_of_an_instrument.corrections:Lift"),
             ("splatline.effect", "gone = no_such_module:Gone"),
             ("splatline.volume_format", "taken = beamline.storage.volumes.plain:Npy"),
         ],

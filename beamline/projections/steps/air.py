@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from beamline.projections.steps.step import Done, option
+from beamline.projections.steps.step import StepDone, option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,7 +73,7 @@ class Air:
         """See `beamline.projections.background`."""
         return _parts(self.model)[1]
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         from beamline.projections.background import without_background
         from recon.base.masks import areas
 
@@ -81,4 +81,4 @@ class Air:
             views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked)
         )
         parameters: dict[str, Any] = {"surface": self.surface, "background": said or "none taken off"}
-        return Done(said, parameters if terms is None else {**parameters, "background_terms": terms})
+        return StepDone(said, parameters if terms is None else {**parameters, "background_terms": terms})

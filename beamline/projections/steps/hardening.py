@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import Done, option
+from beamline.projections.steps.step import StepDone, option
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,9 +63,9 @@ class Hardening:
     def needs_finished(self) -> str:
         return "" if self.wanted is None else "--hardening is for a finished scan: its curve is of all views."
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         if self.wanted is None:
-            return Done("", {"hardening": "not corrected"})
+            return StepDone("", {"hardening": "not corrected"})
         from beamline.projections.hardening import curve_of
 
         curve, said = curve_of(views.projections.data, views.geometry, self)
@@ -73,4 +73,4 @@ class Hardening:
             curve.linearise(views.projections.data, views.projections.weights)
             if views.held_out is not None:
                 curve.linearise(views.held_out[0])
-        return Done(said, {"hardening": said})
+        return StepDone(said, {"hardening": said})

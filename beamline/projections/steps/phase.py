@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.step import Done, ViewFilter, option, positive
+from beamline.projections.steps.step import StepDone, ViewFilter, option, positive
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -98,18 +98,19 @@ class Phase:
 
         return delta_beta(str(self.material), energy_kev)
 
-    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         from beamline.projections.steps.defects import Defects
 
         if self.material is None:
-            return None, Done("", {"phase": "not retrieved"})
+            return None, StepDone("", {"phase": "not retrieved"})
         found, said = self.filter_of(source, selection)
 
         def apply(views: Projections, first: int) -> Projections:
             found.retrieve(views.data, selection.step(Defects).floor)
             return views
 
-        return ViewFilter(apply, found.reach, "--phase mixes"), Done(said, {"phase": said})
+        copies = 7 if self.unsharp is None else 9
+        return ViewFilter(apply, found.reach, "--phase mixes", copies), StepDone(said, {"phase": said})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
         """The filter for the pixels that the selection makes, and a sentence about it.

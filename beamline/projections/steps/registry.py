@@ -1,4 +1,4 @@
-"""The registry of steps: one line a step. Adding a correction takes its file and its line here."""
+"""The registry of steps: one line a step. A new correction takes its file and its line here; a plug-in none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.steps.step import Done, PrepStep, options_of
+from beamline.projections.steps.step import PrepStep, ScanStep, StepDone, ViewStep, options_of
+from drivers.plugins import plugins
 
 if TYPE_CHECKING:
     from beamline.storage.writers.recon_file import Value
@@ -30,10 +31,23 @@ REGISTRY: dict[str, str] = {
 
 @cache
 def registered() -> tuple[type[PrepStep], ...]:
-    """Every step, in the order of the registry."""
-    return tuple(
+    """Every step, in the order of the registry; those of other packages come last."""
+    ours: list[type[PrepStep]] = [
         getattr(import_module(f"beamline.projections.steps.{module}"), cls) for module, cls in REGISTRY.items()
-    )
+    ]
+    names = {step.name for step in ours}
+    taken = {option.name for step in ours for option in options_of(step).values()}
+
+    def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
+        own = {option.name for option in options_of(step).values()}
+        if step.name != name or not isinstance(step(), ViewStep | ScanStep):
+            raise ValueError(f"{step.__name__} is no ViewStep or ScanStep of the entry point's name")
+        if own & taken or not names.issuperset(step.follows):
+            raise ValueError(f"it has an option of another step ({own & taken}), or follows none of {sorted(names)}")
+        taken.update(own)
+        return step
+
+    return (*ours, *plugins("correction", names, fitting).values())
 
 
 @cache
@@ -61,11 +75,11 @@ def key_of(option: str) -> str:
     return option.lstrip("-").replace("-", "_")
 
 
-def recorded(steps: Sequence[PrepStep], done: Mapping[str, Done]) -> dict[str, Value]:
+def recorded(steps: Sequence[PrepStep], done: Mapping[str, StepDone]) -> dict[str, Value]:
     """What the file of a volume records of the steps, by name."""
     found: dict[str, Value] = {}
     for step in steps:
-        did = done.get(step.name, Done())
+        did = done.get(step.name, StepDone())
         said = {f"{step.name}_said": did.said} if did.said else {}
         found |= _options(step) | said if did.parameters is None else did.parameters
     return found

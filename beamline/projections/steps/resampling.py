@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from beamline.core.errors import ConfigError
 from beamline.core.files import text_in
-from beamline.projections.steps.step import Done, ViewFilter, option
+from beamline.projections.steps.step import StepDone, ViewFilter, option
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -88,7 +88,7 @@ class TiltAndLens:
         said = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
         return said if self.sought else ""
 
-    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         found, turned = self.of(source, selection), f"Views are turned by {self.tilt_deg:g} degrees."
         if found is None:
             return None, self.done("")
@@ -97,14 +97,15 @@ class TiltAndLens:
             found.apply(views.data, first)
             return replace(views, masked=found.nearest(views.masked, first))
 
-        mixes = "--tilt and --distortion mix"
-        return ViewFilter(apply, found.reach, mixes), self.done(turned if self.tilt_deg else "")
+        copies = 17 if self.distortion is None else 26
+        taken = ViewFilter(apply, found.reach, "--tilt and --distortion mix", copies)
+        return taken, self.done(turned if self.tilt_deg else "")
 
-    def done(self, said: str) -> Done:
+    def done(self, said: str) -> StepDone:
         """What it did, with what is recorded where nothing was asked, too."""
         lens = {} if self.distortion is None else asdict(self.distortion)
         parameters: dict[str, Any] = {"tilt_deg": self.tilt_deg, **({"tilt": said} if said else {})}
-        return Done(said, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
+        return StepDone(said, parameters | {f"distortion_{name}": _plain(value) for name, value in lens.items()})
 
     def of(self, source: ScanSource, selection: Selection) -> resample.Resampling | None:
         """How views are resampled; None where they are used as they are.

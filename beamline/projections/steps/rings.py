@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
-from beamline.projections.steps.step import Done, option
+from beamline.projections.steps.step import StepDone, option
 from recon.base.choices import Rings as Way
 
 if TYPE_CHECKING:
@@ -37,10 +37,10 @@ class Rings:
     def needs_finished(self) -> str:
         return "" if self.way == "none" else "--rings is for a finished scan: it needs all views."
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         from recon.prep.rings import remove_rings_in_place
 
         taken, said = remove_rings_in_place(views.projections.data, angles, self.way)
         if views.held_out is not None:
             views.held_out[0][...] -= taken
-        return Done(said, {"rings": self.way, **({"rings_removed": said} if said else {})})
+        return StepDone(said, {"rings": self.way, **({"rings_removed": said} if said else {})})

@@ -65,7 +65,7 @@ def positive(text: str) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Done:
+class StepDone:
     """What a step did.
 
     Attributes:
@@ -102,18 +102,20 @@ class ViewFilter:
             changed in place.
         reach: rows, binned, beside a row from which it takes something.
         mixes: the subject and verb that say who mixes neighbouring pixels.
+        copies: memory that it takes, as float32 views; it does not grow with the views in a batch.
     """
 
     apply: Callable[[Projections, int], Projections]
     reach: int
     mixes: str
+    copies: int
 
 
 @runtime_checkable
 class ViewStep(PrepStep, Protocol):
     """A step on each view alone, also of a scan that still runs."""
 
-    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, Done]:
+    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         """The filter of a scan, None where nothing is to be done; and what it does.
 
         Raises:
@@ -125,7 +127,7 @@ class ViewStep(PrepStep, Protocol):
 class ScanStep(PrepStep, Protocol):
     """A step on all views of a scan."""
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> Done:
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         """Change line integrals, weights and views held out in place.
 
         Args:

@@ -86,23 +86,23 @@ def reconstruction_blockers(source: ScanSource) -> list[Finding]:
     return [finding for finding in source_findings(source) if finding.severity == "error"]
 
 
-def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Finding]:
+def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator[Finding]:
     """Every frame can be read, and has the checksum that was written with it, where the file has checksums.
 
     Args:
-        told: how many of how many frames were read; None: only those that other rules have read are judged.
+        progress: how many of how many frames were read; None: only those that other rules have read are judged.
     """
     n, unreadable, why = int(source.image_key.size), list[int](), ""
     if source.altered:
         yield Finding("error", "records", altered_said(source))
-    for row in range(n) if told is not None else ():
+    for row in range(n) if progress is not None else ():
         try:
             source.read([row])
         except DataError as error:
             unreadable.append(row)
             why = why or str(error)
-        if told is not None:
-            told(row + 1, n)
+        if progress is not None:
+            progress(row + 1, n)
     if unreadable:
         said = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
         yield Finding("error", "unreadable", said)
@@ -112,9 +112,9 @@ def frames_as_written(source: ScanSource, told: Progress | None) -> Iterator[Fin
             "checksums",
             f"{len(source.damaged)} of {n} frames differ from the checksums that were written with them: "
             f"{spans(sorted(source.damaged))}. Look for a good copy; `beamline recon` leaves them out."
-            + ("" if told else " `validate --deep` compares all frames."),
+            + ("" if progress else " `validate --deep` compares all frames."),
         )
-    elif told and not source.checksummed:
+    elif progress and not source.checksummed:
         yield Finding("info", "checksums", "The file holds no checksums: it is only known that its frames can be read.")
 
 

@@ -22,8 +22,8 @@ RATE_AGREES = Fraction(1, 100)
 
 
 @dataclass(frozen=True)
-class AxisStatus:
-    """State of the axis. `raw`: the replies, for errors."""
+class PiAxisStatus:
+    """What the axis says. `raw`: the replies, for errors."""
 
     counts: int
     moving: bool
@@ -92,14 +92,14 @@ class PiGcsAxis:
     def on_target(self) -> bool:
         return self._line.flag("ONT?")
 
-    def status(self) -> AxisStatus:
-        """State and place of the axis; the error register becomes `fault`."""
+    def status(self) -> PiAxisStatus:
+        """Where it is and how; what the error register has becomes `fault`."""
         moving = self.moving()
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
         said = f"moving {moving:d}, counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
-        return AxisStatus(counts, moving, homed, servo, said)
+        return PiAxisStatus(counts, moving, homed, servo, said)
 
     def limit_switch(self) -> str:
         """Which limit switch is on, in words; "" without one, or for a model with an unknown register."""

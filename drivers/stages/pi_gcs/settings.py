@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from drivers.base.protocols import StageLimits
-from drivers.stages.pi_gcs.train import FirstPulse
+from drivers.stages.pi_gcs.train import PiFirstPulse
 from drivers.stages.settings import StageFigures, Wiring, key
 
 SLOWEST = 1e-6
@@ -49,8 +49,8 @@ class PiGcsSettings:
     axis: str = key("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
     trigger_line: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
     reference: Reference = key(Reference.SWITCH, "What the search for the reference goes to.")
-    first_pulse: FirstPulse = key(
-        FirstPulse.AT_THRESHOLD,
+    first_pulse: PiFirstPulse = key(
+        PiFirstPulse.AT_THRESHOLD,
         "Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md).",
     )
     firmware_pulse: float = key(50e-6, "How long the firmware holds a pulse.", unit="s", gt=0)
@@ -77,5 +77,5 @@ class PiGcsSettings:
         figures = self.figures
         if min(math.degrees(figures.max_speed), math.degrees(figures.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
-        run_up = 1 if self.first_pulse is FirstPulse.STEP_AFTER else 0
+        run_up = 1 if self.first_pulse is PiFirstPulse.STEP_AFTER else 0
         return figures.limits(figures.acceleration, 2 * self.firmware_pulse, run_up=run_up)

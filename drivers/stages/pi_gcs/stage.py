@@ -14,7 +14,7 @@ from fractions import Fraction
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pi_gcs.axis import STOP_ALL, AxisStatus, PiGcsAxis
+from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
@@ -213,8 +213,8 @@ class PiGcsStage:
     def _away(self, counts: int) -> bool:
         return self._target is not None and abs(counts - self._target) > self._settings.tolerance
 
-    def _fault(self, status: AxisStatus) -> str:
-        """Why the last move ended early, or a standing fault, in words; "" without one."""
+    def _fault(self, status: PiAxisStatus) -> str:
+        """Why the last move ended early, or what stands, in words; "" for nothing."""
         code, words = self._line.fault, []
         early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
         if code and code != STOPPED:
@@ -227,7 +227,7 @@ class PiGcsStage:
             words.append("the servo is off")
         return ", ".join(words)
 
-    def _stopped_short(self, problem: str, status: AxisStatus, expected: str) -> DeviceError:
+    def _stopped_short(self, problem: str, status: PiAxisStatus, expected: str) -> DeviceError:
         code, why = self._line.fault, self._fault(status) or "no reason given"
         return DeviceError(
             self.name,

@@ -1,9 +1,9 @@
 """Trigger trains by PI GCS 2.0's mode 0 (PositionDistance): step and window of a train, and when a train ends.
 
 The controller gives a pulse at each step between the thresholds, if the stage entered through the start threshold. The
-stop threshold lies half an interval behind the last pulse, so that a pulse at the threshold itself makes no
-difference. No manual says where the first pulse comes. We assume the start threshold, from memory, see
-`FirstPulse`.
+stop threshold lies half an interval behind the last pulse, so that it does not matter whether the threshold itself
+fires. No manual says where the first pulse comes. We take it to come at the start threshold, from memory, see
+`PiFirstPulse`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ the rounded step cannot be seen; a smaller error spoils no image.
 """
 
 
-class FirstPulse(StrEnum):
-    """Behaviour of the firmware, to be found once: arm 3 pulses, pass them, and look at their number and places."""
+class PiFirstPulse(StrEnum):
+    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
 
     AT_THRESHOLD = "at_threshold"
     """At the start threshold: it is put on the first pulse."""
@@ -45,7 +45,7 @@ class TriggerWindow:
     step_tolerance: Fraction
 
 
-def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
+def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     """The window for a train of at least one pulse and an interval that is not 0.
 
     Raises:
@@ -53,13 +53,13 @@ def window_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerWindow:
     """
     sign = 1 if train.interval > 0 else -1
     # Thresholds that a controller rounds to the same count would switch the window of a single pulse off.
-    alone = train.n == 1 and first_pulse is not FirstPulse.GRID
+    alone = train.n == 1 and first_pulse is not PiFirstPulse.GRID
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
-    if first_pulse is FirstPulse.GRID and train.start % step:
+    if first_pulse is PiFirstPulse.GRID and train.start % step:
         raise ValueError(
             f"this controller gives pulses at whole multiples of {step} counts only, which {train.start} is not"
         )
-    before = {FirstPulse.AT_THRESHOLD: Fraction(0), FirstPulse.STEP_AFTER: Fraction(step)}
+    before = {PiFirstPulse.AT_THRESHOLD: Fraction(0), PiFirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))
     tolerance = min(Fraction(1, 2), PULLED_APART * step / max(train.n - 1, 1))
     return TriggerWindow(Fraction(step), train.start - sign * lead, train.end + Fraction(sign * step, 2), tolerance)

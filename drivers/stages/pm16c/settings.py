@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits
-from drivers.stages.pm16c.train import FirstPulse, PulseWidths
+from drivers.stages.pm16c.train import Pm16cFirstPulse, PulseWidths
 from drivers.stages.settings import StageFigures, Wiring, key
 
 MAX_SPEED = 5_000_000
@@ -52,8 +52,8 @@ class PM16CSettings:
     figures: StageFigures
     wiring: Wiring = field(default=Wiring(baudrate=9600))
     channel: int = key(0, ge=0, le=15)
-    first_pulse: FirstPulse = key(
-        FirstPulse.AT_START,
+    first_pulse: Pm16cFirstPulse = key(
+        Pm16cFirstPulse.AT_START,
         "Where the firmware puts a train's first pulse: at its start point (from memory), or an interval behind it.",
     )
     home: float | None = key(None, "Where its home switch is; null: it has none, and no search is made.", unit="deg")
@@ -107,5 +107,5 @@ class PM16CSettings:
             speed = math.degrees(figures.max_speed)
             raise ValueError(f"{speed:g} deg/s are {fastest} pulses/s, the controller gives 1 to {MAX_SPEED}")
         acceleration = 1e6 / RATES[self.rate_code] * radians
-        run_up = 1 if self.first_pulse is FirstPulse.INTERVAL_AFTER else 0
+        run_up = 1 if self.first_pulse is Pm16cFirstPulse.INTERVAL_AFTER else 0
         return figures.limits(acceleration, self.widths.spacing, run_up=run_up)

@@ -49,8 +49,8 @@ class PulseWidths:
         return next(fits, self.narrowest)
 
 
-class FirstPulse(StrEnum):
-    """Behaviour of the firmware, to be found once: arm 3 pulses, pass them, and look at their number and places."""
+class Pm16cFirstPulse(StrEnum):
+    """What the firmware does, to be found out once: arm 3 pulses, pass them, and look where how many came."""
 
     AT_START = "at_start"
     """The start point itself fires."""
@@ -67,7 +67,7 @@ class TriggerPoints:
     interval: int
 
 
-def points_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerPoints:
+def points_of(train: TriggerTrain, first_pulse: Pm16cFirstPulse) -> TriggerPoints:
     """The points for a train of at least one pulse and an interval that is not 0.
 
     The end point lies half an interval behind the last pulse, so that a pulse at the end point itself makes no
@@ -75,5 +75,5 @@ def points_of(train: TriggerTrain, first_pulse: FirstPulse) -> TriggerPoints:
     """
     sign = 1 if train.interval > 0 else -1
     interval = max(abs(train.interval), 2) if train.n == 1 else abs(train.interval)
-    lead = interval if first_pulse is FirstPulse.INTERVAL_AFTER else 0
+    lead = interval if first_pulse is Pm16cFirstPulse.INTERVAL_AFTER else 0
     return TriggerPoints(train.start - sign * lead, train.end + sign * (interval // 2), interval)

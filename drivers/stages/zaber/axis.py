@@ -52,7 +52,7 @@ class Identity:
 
 
 @dataclass(frozen=True)
-class AxisStatus:
+class ZaberAxisStatus:
     """Position in microsteps, motion, and every warning flag, the gravest first."""
 
     counts: int
@@ -130,16 +130,16 @@ class ZaberAxis:
     def set(self, setting: str, value: str | int) -> None:
         self.ask_axis(f"set {setting} {value}")
 
-    def status(self) -> AxisStatus:
+    def status(self) -> ZaberAxisStatus:
         reply = self.ask_axis("get pos", WHOLE)
         flags = self._flags("warnings") if reply.flag else ()
-        return AxisStatus(int(reply.data), reply.busy, flags, reply.raw)
+        return ZaberAxisStatus(int(reply.data), reply.busy, flags, reply.raw)
 
     def forget_flags(self) -> None:
         """Clear the flags of past events."""
         self.ask_axis("warnings clear", TEXT)
 
-    def standing(self, purpose: str) -> AxisStatus:
+    def standing(self, purpose: str) -> ZaberAxisStatus:
         """The status; refuses `purpose` while the axis moves."""
         status = self.status()
         if status.moving:

@@ -16,7 +16,7 @@ from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
 from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel
-from drivers.stages.zaber.axis import AxisStatus, ZaberAxis
+from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
 from drivers.stages.zaber.packet import meaning_of
 from drivers.stages.zaber.pulses import ZaberOutput, ZaberPulses
 from drivers.stages.zaber.settings import ZaberSettings
@@ -248,6 +248,6 @@ class ZaberStage:
             )
         self._travel.refuse_narrower(*self._axis.travel(), advice="widen the controller's limits")
 
-    def _until_standing(self, timeout: float) -> AxisStatus:
+    def _until_standing(self, timeout: float) -> ZaberAxisStatus:
         """The status once the stage stands, or when the time is over."""
         return until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)

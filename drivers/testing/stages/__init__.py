@@ -9,25 +9,26 @@ import pytest
 from drivers.testing.stages.bench import Build, StageBench, StageKind
 from drivers.testing.stages.moves import Moves
 from drivers.testing.stages.pulses import Pulses
-from drivers.testing.stages.reference import Reference
-from drivers.testing.stages.stops import Stops
+from drivers.testing.stages.reference import ReferenceTests
+from drivers.testing.stages.stops import StopTests
 from drivers.testing.stages.trains import Trains
 
 __all__ = ["Build", "StageBench", "StageConformance", "StageKind"]
 
 
-class StageConformance(Moves, Stops, Trains, Pulses, Reference):
+class StageConformance(Moves, StopTests, Trains, Pulses, ReferenceTests):
     """A subclass gives the fixtures `kind` and `build`; the stage of `build` stands at angle 0."""
 
     @pytest.fixture
     def kind(self) -> StageKind:
-        """The facts about the stage that the suite needs."""
-        raise NotImplementedError
+        pytest.fail("A subclass gives the fixture `kind`: a StageKind, what the suite has to know of the stage.")
 
     @pytest.fixture
     def build(self, kind: StageKind) -> Build:
-        """Called with settings of the driver that differ from the usual ones it opens the stage on a fresh wire."""
-        raise NotImplementedError
+        pytest.fail(
+            "A subclass gives the fixture `build`: a function of settings of the driver "
+            "that opens the stage on a fresh wire."
+        )
 
     @pytest.fixture
     def bench(self, build: Build) -> Iterator[StageBench]:

@@ -16,8 +16,8 @@ FARTHEST = 1e9
 """rad; no stage goes further."""
 
 
-class Pulse(Protocol):
-    """A pulse on the cable: the time of its rising edge, s, and the stage's true angle, rad."""
+class EmittedPulse(Protocol):
+    """A pulse on the cable: when it rose, s, and where the stage was in fact, rad."""
 
     @property
     def time(self) -> float: ...
@@ -29,8 +29,8 @@ class Pulse(Protocol):
 class Cable(Protocol):
     """The trigger cable, with a measurement of the true angle: a simulated line, or a counter card."""
 
-    def next_after(self, time: float) -> Pulse | None:
-        """The first pulse strictly later than `time`, even in the future; None without one."""
+    def next_after(self, time: float) -> EmittedPulse | None:
+        """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
         ...
 
     def angle_at(self, time: float) -> float:
@@ -71,8 +71,8 @@ class StageBench:
     clock: Clock
     line: Cable
 
-    def pulses(self) -> list[Pulse]:
-        """The pulses emitted so far."""
+    def pulses(self) -> list[EmittedPulse]:
+        """Those that have been emitted by now."""
         return emitted(self.line, self.clock)
 
     def go(self, degrees: float) -> float:
@@ -97,9 +97,9 @@ Build = Callable[..., StageBench]
 """Opens the stage anew, with settings of its driver that differ from the usual ones."""
 
 
-def emitted(line: Cable, clock: Clock) -> list[Pulse]:
-    """The pulses that a cable has carried so far, in order."""
-    found: list[Pulse] = []
+def emitted(line: Cable, clock: Clock) -> list[EmittedPulse]:
+    """The pulses that have come out of a cable by now, in their order."""
+    found: list[EmittedPulse] = []
     after = -math.inf
     while (pulse := line.next_after(after)) is not None and pulse.time <= clock.now():
         found.append(pulse)

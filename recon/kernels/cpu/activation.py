@@ -24,7 +24,7 @@ _TASK = 1024  # Gaussians
 
 
 @njit(inline="always", fastmath=True)
-def _softplus(r):  # type: ignore[no-untyped-def]
+def _softplus(r):
     """log(1 + e^r) a lane, without overflow for large r and without cancellation for small r.
 
     log(1 + t) = 2 artanh(t / (2 + t)) for t = e^-|r|; the series of artanh is cut at a relative error of 1e-8.
@@ -39,14 +39,14 @@ def _softplus(r):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def _sigmoid(r):  # type: ignore[no-untyped-def]
+def _sigmoid(r):
     """Derivative of softplus, 1 / (1 + e^-r) = e^min(r, 0) / (1 + e^-|r|), accurate also for very negative r."""
     size = r * lanes.sign(r)
     return lanes.exp((r - size) * _f(0.5)) / (lanes.exp(lanes.zero() - size) + _f(1))
 
 
 @njit(inline="always", fastmath=True)
-def _rescaled(quaternions, i):  # type: ignore[no-untyped-def]
+def _rescaled(quaternions, i):
     """Quaternion i scaled to float32's range, its squared length then, and the factor (0 if it is too short)."""
     w, x, y, z = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
     length2, factor = w * w + x * x + y * y + z * z, _f(1)

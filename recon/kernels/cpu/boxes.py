@@ -15,7 +15,7 @@ DEEPEST = 60.0  # largest -E of an upright enough footprint, E = -1/2 δᵀ K δ
 
 
 @njit(inline="always", fastmath=True)
-def box_of(table, i, rows, cols, height):  # type: ignore[no-untyped-def]
+def box_of(table, i, rows, cols, height):
     """Pixel box of footprint i, clipped to the image: (row0, row1, col0, col1), ends excluded; empty if outside.
 
     The number of rows is a multiple of `GROUP`; they stay within `height`, which is such a multiple and >= `rows`.
@@ -38,7 +38,7 @@ def box_of(table, i, rows, cols, height):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def is_upright(table, i, row0):  # type: ignore[no-untyped-def]
+def is_upright(table, i, row0):
     """Whether sums over the rows of a column are accurate: -E stays below DEEPEST at all pixels of the box."""
     down = max(table[i, V] - _f(row0), table[i, HV])
     across = table[i, HU] + abs(table[i, SHEAR]) * down
@@ -46,7 +46,7 @@ def is_upright(table, i, row0):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def span_of(table, i, dy, col0, col1):  # type: ignore[no-untyped-def]
+def span_of(table, i, dy, col0, col1):
     """Columns of one row that lie within the footprint: (first, last + 1), inside its box."""
     reach = table[i, HV] * np.sqrt(table[i, KV])
     half = np.sqrt(max(reach * reach - table[i, KV] * dy * dy, _f(0)) / table[i, K]) + _f(0.5)

@@ -22,7 +22,7 @@ _PAD = 2  # zeros at both ends of a line of slices
 
 
 @njit(inline="always", fastmath=True)
-def _rows(height, climb, middle, n, rows):  # type: ignore[no-untyped-def]
+def _rows(height, climb, middle, n, rows):
     """Rows first..end (excluded) that are less than one slice outside the line of n slices.
 
     `climb`: slices a row; `height`: the slice at z = 0; `middle`: the row at z = 0.
@@ -84,7 +84,7 @@ def _forward(
 
 
 @njit(inline="always", fastmath=True)
-def _lengthen(source, out, path, reach, middle, pitch):  # type: ignore[no-untyped-def]
+def _lengthen(source, out, path, reach, middle, pitch):
     """out = source times the ray's path from plane to plane, which is longer for rays inclined to the mid-plane."""
     for row in range(out.size):
         slope = (row - middle) * pitch / reach

@@ -16,9 +16,9 @@ from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32, activate, activation_backward
-from recon.kernels.cpu.footprints import HU, INEXACT, Camera, footprint_table, footprints, footprints_backward
+from recon.kernels.cpu.footprints import HU, INEXACT, RayCamera, footprint_table, footprints, footprints_backward
 from recon.kernels.cpu.project import moments, render, render_layers
-from recon.kernels.cpu.rays import Rays
+from recon.kernels.cpu.rays import CpuRays
 from recon.kernels.cpu.voxelize import Layout
 
 
@@ -64,14 +64,14 @@ class Gradients:
         return self.means, self.log_scales, d_quaternions, d_raw
 
 
-def camera(geometry: Geometry, view: int) -> Camera:
-    """One view of a geometry as the kernels' Camera."""
+def camera(geometry: Geometry, view: int) -> RayCamera:
+    """One view of a geometry as a camera of the kernels."""
     axes = geometry.axes(view).astype(np.float32)
     col, row = geometry.origin(view)
     if geometry.is_cone:
-        return Camera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, straight=False)
+        return RayCamera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, straight=False)
     straight = bool(geometry.roll[view] == 0 and geometry.tilt[view] == 0)
-    return Camera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
+    return RayCamera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
 
 
 def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
@@ -119,11 +119,11 @@ class RenderedView:
 
     image: F32
     active: Active
-    camera: Camera
+    camera: RayCamera
     length: float
     scratch: Scratch
     exact: NDArray[np.intp]
-    rays: Rays | None
+    rays: CpuRays | None
 
     def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
         """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
@@ -174,7 +174,7 @@ def render_view(
         exact = np.flatnonzero(buffers.table[:, HU] == INEXACT)
     if exact.size:
         some = (a.means[exact], a.scales[exact], a.rotations[exact], a.densities[exact])
-        rays = Rays(*some, projection, shape, faint, sigmas, a.kernel)
+        rays = CpuRays(*some, projection, shape, faint, sigmas, a.kernel)
         rays.add_to(picture)
     return RenderedView(picture, active, projection, length, buffers, exact, rays)
 

@@ -60,7 +60,7 @@ NEAREST = 0.01  # of sod: Gaussians nearer to the source plane are hidden
 _NEVER = 1e30  # an error that no affine footprint reaches (the kernels' arithmetic has no infinities)
 
 
-class Camera(NamedTuple):
+class RayCamera(NamedTuple):
     """One view, in the form that the kernels need.
 
     Attributes:
@@ -80,13 +80,13 @@ class Camera(NamedTuple):
 
 
 @njit(inline="always", fastmath=True)
-def _turned(x, y, z, r):  # type: ignore[no-untyped-def]
+def _turned(x, y, z, r):
     """Rᵀ times a vector."""
     return x * r[0] + y * r[3] + z * r[6], x * r[1] + y * r[4] + z * r[7], x * r[2] + y * r[5] + z * r[8]
 
 
 @njit(inline="always", fastmath=True)
-def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations):  # type: ignore[no-untyped-def]
+def add_shape(i, scales, rotations, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations):
     """Add the gradients that follow from T, the gradient on a deformation in the Gaussian's own axes (see above)."""
     d_log_scales[i, 0] += t00
     d_log_scales[i, 1] += t11
@@ -283,7 +283,7 @@ def footprints(
     scales: F32,
     rotations: F32,
     densities: F32,
-    camera: Camera,
+    camera: RayCamera,
     faint: float,
     cut: float,
     table: F32,
@@ -314,7 +314,7 @@ def footprints_backward(
     scales: F32,
     rotations: F32,
     densities: F32,
-    camera: Camera,
+    camera: RayCamera,
     d_means: F32,
     d_log_scales: F32,
     d_rotations: F32,

@@ -76,7 +76,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
 
 
 @njit(cache=True, boundscheck=False, error_model="numpy")
-def _samples(first, step, low0, low1, j0, j1, across, along, at, share):  # type: ignore[no-untyped-def]
+def _samples(first, step, low0, low1, j0, j1, across, along, at, share):
     """Samples of the ray first + step j, in planes j0..j1 (excluded), whose lower line is low0..low1 (excluded).
 
     Fills at [sample], the row of the tile that has this line, and share [sample], of the next line; returns how many.
@@ -108,7 +108,7 @@ def _samples(first, step, low0, low1, j0, j1, across, along, at, share):  # type
 
 
 @njit(cache=True, boundscheck=False, error_model="numpy")
-def _columns(rays, v, low0, low1, j0, j1):  # type: ignore[no-untyped-def]
+def _columns(rays, v, low0, low1, j0, j1):
     """Columns first..end (excluded) beyond which no ray of a parallel view has samples there (see `_samples`)."""
     cols, step = rays.shape[1], rays[v, 0, STEP]
     per_col = (rays[v, cols - 1, AT] - rays[v, 0, AT]) / max(cols - 1, 1)
@@ -122,7 +122,7 @@ def _columns(rays, v, low0, low1, j0, j1):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always")
-def _tile(axis, y0, y1, x0, x1):  # type: ignore[no-untyped-def]
+def _tile(axis, y0, y1, x0, x1):
     """How rays cross a tile. Planes are j0..j1 (excluded), lower lines of samples that touch it low0..low1 (excluded).
     Then rows of the tile from plane to plane and from line to line, and the row of the first sample."""
     if axis == 0:

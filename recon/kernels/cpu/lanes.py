@@ -62,8 +62,8 @@ def _vector_function(builder: Any, name: str, arity: int) -> Any:
 
 def _binary(instruction: str) -> Any:
     @intrinsic
-    def call(typing_context, x, y):  # type: ignore[no-untyped-def]
-        def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def call(typing_context, x, y):
+        def code(context, builder, signature, args):
             kinds = signature.args
             left, right = (_as_lanes(builder, k, a) for k, a in zip(kinds, args, strict=True))
             return getattr(builder, instruction)(left, right, flags=_FAST)
@@ -75,10 +75,10 @@ def _binary(instruction: str) -> Any:
 
 def _register(symbol: Callable[..., Any], implementation: Any) -> None:
     @overload(symbol, inline="always")
-    def operation(x, y):  # type: ignore[no-untyped-def]
+    def operation(x, y):
         if isinstance(x, LanesType) or isinstance(y, LanesType):
 
-            def apply(x, y):  # type: ignore[no-untyped-def]
+            def apply(x, y):
                 return implementation(x, y)
 
             return apply
@@ -91,20 +91,20 @@ for _symbol, _instruction in _OPERATORS:
 
 
 @intrinsic
-def iota(typing_context):  # type: ignore[no-untyped-def]
+def iota(typing_context):
     """Lanes 0, 1, ..., 15."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         return ir.Constant(_VF, [float(i) for i in range(WIDTH)])
 
     return LANES(), code
 
 
 @intrinsic
-def zero(typing_context):  # type: ignore[no-untyped-def]
+def zero(typing_context):
     """All lanes 0."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         return _constant(0.0)
 
     return LANES(), code
@@ -119,20 +119,20 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, 
 
 
 @intrinsic
-def load(typing_context, array, row, col):  # type: ignore[no-untyped-def]
+def load(typing_context, array, row, col):
     """Sixteen neighbours array[row, col:col + 16] of a float32 array [row, col], contiguous in the last axis."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         return builder.load(_address(context, builder, signature.args[0], *args), align=4)
 
     return LANES(array, types.intp, types.intp), code
 
 
 @intrinsic
-def store(typing_context, array, row, col, lanes):  # type: ignore[no-untyped-def]
+def store(typing_context, array, row, col, lanes):
     """array[row, col:col + 16] = lanes."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         builder.store(args[3], _address(context, builder, signature.args[0], *args[:3]), align=4)
         return context.get_dummy_value()
 
@@ -140,10 +140,10 @@ def store(typing_context, array, row, col, lanes):  # type: ignore[no-untyped-de
 
 
 @intrinsic
-def between(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
+def between(typing_context, lanes, low, high):
     """The lanes low, ..., high - 1; zero in the others."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         numbers = ir.Constant(_VI, list(range(WIDTH)))
         low, high = (_broadcast(builder, builder.trunc(bound, _I32), _VI) for bound in args[1:])
         inside = builder.and_(builder.icmp_signed(">=", numbers, low), builder.icmp_signed("<", numbers, high))
@@ -153,10 +153,10 @@ def between(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def sign(typing_context, lanes):  # type: ignore[no-untyped-def]
+def sign(typing_context, lanes):
     """-1, 0 or 1 a lane."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         below = builder.select(builder.fcmp_ordered("<", args[0], _constant(0.0)), _constant(-1.0), _constant(0.0))
         return builder.select(builder.fcmp_ordered(">", args[0], _constant(0.0)), _constant(1.0), below)
 
@@ -164,20 +164,20 @@ def sign(typing_context, lanes):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def root(typing_context, lanes):  # type: ignore[no-untyped-def]
+def root(typing_context, lanes):
     """The square root a lane."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         return builder.call(_vector_function(builder, "sqrt", 1), args, fastmath=_FAST)
 
     return LANES(LANES), code
 
 
 @intrinsic
-def quarter_turn(typing_context, lanes):  # type: ignore[no-untyped-def]
+def quarter_turn(typing_context, lanes):
     """i times eight complex numbers: (a, b) becomes (-b, a) in each pair of lanes."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         swapped = ir.Constant(_VI, [lane ^ 1 for lane in range(WIDTH)])
         signs = ir.Constant(_VF, [-1.0, 1.0] * (WIDTH // 2))
         return builder.fmul(builder.shuffle_vector(args[0], _constant(0.0), swapped), signs)
@@ -186,20 +186,20 @@ def quarter_turn(typing_context, lanes):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def positive(typing_context, lanes):  # type: ignore[no-untyped-def]
+def positive(typing_context, lanes):
     """max(x, 0) a lane."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         return builder.call(_vector_function(builder, "maxnum", 2), [args[0], _constant(0.0)], fastmath=_FAST)
 
     return LANES(LANES), code
 
 
 @intrinsic
-def clamp(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
+def clamp(typing_context, lanes, low, high):
     """min(max(x, low), high) a lane, with float32 bounds."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         value, low, high = args[0], _broadcast(builder, args[1]), _broadcast(builder, args[2])
         value = builder.call(_vector_function(builder, "maxnum", 2), [value, low], fastmath=_FAST)
         return builder.call(_vector_function(builder, "minnum", 2), [value, high], fastmath=_FAST)
@@ -208,20 +208,20 @@ def clamp(typing_context, lanes, low, high):  # type: ignore[no-untyped-def]
 
 
 @intrinsic
-def lowest(typing_context, lanes):  # type: ignore[no-untyped-def]
+def lowest(typing_context, lanes):
     """Lane 0."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         return builder.extract_element(args[0], ir.Constant(_I32, 0))
 
     return types.float32(LANES), code
 
 
 @intrinsic
-def total(typing_context, lanes):  # type: ignore[no-untyped-def]
+def total(typing_context, lanes):
     """The sum of the lanes."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         kind = ir.FunctionType(_F32, [_F32, _VF])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.fadd.v16f32")
         return builder.call(function, [ir.Constant(_F32, 0.0), args[0]], fastmath=_FAST)
@@ -245,11 +245,11 @@ def _halve(builder: Any, x: tuple[Any, list[int]], y: tuple[Any, list[int]], wid
 
 
 @intrinsic
-def totals(typing_context, vectors):  # type: ignore[no-untyped-def]
+def totals(typing_context, vectors):
     """Sums of up to sixteen Lanes at once, lane j for vectors[j], with about half the shuffles of single sums."""
     count = len(vectors)
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         level = [(builder.extract_value(args[0], j), [j] * WIDTH) for j in range(count)]
         for width in (8, 4, 2, 1):
             pairs = [(level[j], level[min(j + 1, len(level) - 1)]) for j in range(0, len(level), 2)]
@@ -268,10 +268,10 @@ def _first(builder: Any, count: Any) -> Any:
 
 
 @intrinsic
-def load_first(typing_context, array, row, col, count):  # type: ignore[no-untyped-def]
+def load_first(typing_context, array, row, col, count):
     """array[row, col:col + count], then zeros; memory beyond is not read."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         mask, pointer = _first(builder, args[3]), _VF.as_pointer()
         kind = ir.FunctionType(_VF, [pointer, _I32, mask.type, _VF])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.load.v16f32.p0")
@@ -282,10 +282,10 @@ def load_first(typing_context, array, row, col, count):  # type: ignore[no-untyp
 
 
 @intrinsic
-def store_first(typing_context, array, row, col, lanes, count):  # type: ignore[no-untyped-def]
+def store_first(typing_context, array, row, col, lanes, count):
     """array[row, col:col + count] = the first lanes."""
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
         mask, pointer = _first(builder, args[4]), _VF.as_pointer()
         kind = ir.FunctionType(ir.VoidType(), [_VF, pointer, _I32, mask.type])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.masked.store.v16f32.p0")
@@ -297,17 +297,17 @@ def store_first(typing_context, array, row, col, lanes, count):  # type: ignore[
 
 
 @intrinsic
-def exp(typing_context, lanes):  # type: ignore[no-untyped-def]
+def exp(typing_context, lanes):
     """e^x a lane, to 2e-7 + 1.2e-7 |x| (relative); exponents are clamped to +-87, so no finite x gives inf or NaN.
 
     x = (k + f) ln 2 with k whole and |f| <= 1/2; 2^f by a polynomial, 2^k by writing k into the exponent bits.
     """
 
-    def code(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        def multiply(x, y):  # type: ignore[no-untyped-def]
+    def code(context, builder, signature, args):
+        def multiply(x, y):
             return builder.fmul(x, y, flags=_FAST)
 
-        def add(x, y):  # type: ignore[no-untyped-def]
+        def add(x, y):
             return builder.fadd(x, y, flags=_FAST)
 
         t = multiply(args[0], _constant(1.4426950408889634))

@@ -42,14 +42,14 @@ def gaussian_window(sigma: float = 1.5) -> F32:
 
 
 @njit(inline="always", fastmath=True)
-def _columns(start, cols, width):  # type: ignore[no-untyped-def]
+def _columns(start, cols, width):
     """Sixteen columns for the block at `start`: the first, and the lanes (low, high) not in the block before."""
     first = min(start, width - lanes.WIDTH)
     return first, start - first, cols - first
 
 
 @njit(inline="always", fastmath=True)
-def _down(plane, row, first, window):  # type: ignore[no-untyped-def]
+def _down(plane, row, first, window):
     """The window applied down the columns of plane [row, col], zeros outside, for sixteen columns."""
     amount = lanes.zero()
     for other in range(max(0, row - RADIUS), min(plane.shape[0], row + RADIUS + 1)):
@@ -58,7 +58,7 @@ def _down(plane, row, first, window):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def _across(half, k, first, window):  # type: ignore[no-untyped-def]
+def _across(half, k, first, window):
     """The window applied along line k of half (column 0 at index MARGIN, zeros on both sides), for sixteen columns."""
     amount = lanes.zero()
     for tap in range(2 * RADIUS + 1):
@@ -172,7 +172,7 @@ def _combine(
             sums[row] = lanes.total(amount)
 
 
-class ProjectionLoss:
+class CpuProjectionLoss:
     """mean D(x, y) + λ (1 - SSIM(x, y)) and its gradient, for many images x against few targets y; D a `DataTerm`.
 
     Two passes over the rows: blurs of x, x², xy and the SSIM map's partial derivatives; blurs of these and the

@@ -50,7 +50,7 @@ _COMPACT_SLOPE = np.float32(2 * Kernel.COMPACT.exponent / Kernel.COMPACT.radius*
 
 
 @njit(inline="always", fastmath=True)
-def _start(table, i, dx, dy):  # type: ignore[no-untyped-def]
+def _start(table, i, dx, dy):
     """G, Q and q of a row, for the lanes at column offsets dx."""
     k, shear, kv = _f(-0.5) * table[i, K], table[i, SHEAR], _f(-0.5) * table[i, KV]
     across = dx - shear * dy
@@ -60,14 +60,14 @@ def _start(table, i, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def _compact(t, profile):  # type: ignore[no-untyped-def]
+def _compact(t, profile):
     """Two factors of G of a compact kernel, for t before it is cut off at 0; the second is D without 2 p / R²."""
     t = lanes.positive(t)
     return t, t if profile == SHADOW else lanes.root(t)
 
 
 @njit(inline="always", fastmath=True)
-def _start_compact(table, i, dx, dy):  # type: ignore[no-untyped-def]
+def _start_compact(table, i, dx, dy):
     """t of a row, its first and its second difference along the column, for the lanes at column offsets dx."""
     k, shear, kv = -_PER * table[i, K], table[i, SHEAR], -_PER * table[i, KV]
     across = dx - shear * dy
@@ -77,7 +77,7 @@ def _start_compact(table, i, dx, dy):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def _at(table, i, first, dy, profile):  # type: ignore[no-untyped-def]
+def _at(table, i, first, dy, profile):
     """τ of the lanes from `first` on, and G and D there (D of a compact kernel without its factor)."""
     dx = lanes.iota() + (_f(first) - table[i, U])
     across = dx - table[i, SHEAR] * dy
@@ -90,7 +90,7 @@ def _at(table, i, first, dy, profile):  # type: ignore[no-untyped-def]
 
 
 @njit(fastmath=True, error_model="numpy")
-def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):  # type: ignore[no-untyped-def]
+def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):
     """Add footprint i to the image, each pixel by itself."""
     for row in range(row0, row1):
         dy = _f(row) - table[i, V]
@@ -103,7 +103,7 @@ def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):  # type: i
 
 
 @njit(inline="always", fastmath=True)
-def _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile):  # type: ignore[no-untyped-def]
+def _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile):
     """Fill moments [i] from the lanes' sums; with Σ g D as a seventh for a compact kernel in a slice."""
     if profile == GAUSSIAN:
         lanes.store_first(moments, i, 0, lanes.totals((m0, mt, mv, mtt, mtv, mvv)), 6)
@@ -116,7 +116,7 @@ def _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile):  # type: ignore[
 
 
 @njit(fastmath=True, error_model="numpy")
-def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments, profile):  # type: ignore[no-untyped-def]
+def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments, profile):
     """Moments of the gradient under footprint i, each pixel by itself."""
     m0, d0, mt, mv = lanes.zero(), lanes.zero(), lanes.zero(), lanes.zero()
     mtt, mtv, mvv = lanes.zero(), lanes.zero(), lanes.zero()
@@ -135,7 +135,7 @@ def _gather_by_pixels(table, i, row0, row1, col0, col1, gradient, moments, profi
 
 
 @njit(inline="always", fastmath=True)
-def _add_gaussian(table, i, first, low, high, row0, row1, image):  # type: ignore[no-untyped-def]
+def _add_gaussian(table, i, first, low, high, row0, row1, image):
     """Add the lanes low, ..., high - 1 from column `first` on, by the recurrence."""
     dx = lanes.iota() + (_f(first) - table[i, U])
     for anchor in range(row0, row1, ANCHOR):
@@ -150,7 +150,7 @@ def _add_gaussian(table, i, first, low, high, row0, row1, image):  # type: ignor
 
 
 @njit(inline="always", fastmath=True)
-def _add_compact(table, i, first, low, high, row0, row1, image, profile):  # type: ignore[no-untyped-def]
+def _add_compact(table, i, first, low, high, row0, row1, image, profile):
     """Add the lanes low, ..., high - 1 from column `first` on, of a compact kernel."""
     dx = lanes.iota() + (_f(first) - table[i, U])
     weight = lanes.between(lanes.zero() + table[i, W], low, high)
@@ -166,7 +166,7 @@ def _add_compact(table, i, first, low, high, row0, row1, image, profile):  # typ
 
 
 @njit(inline="always", fastmath=True)
-def add_footprint(table, i, rows, cols, image, profile):  # type: ignore[no-untyped-def]
+def add_footprint(table, i, rows, cols, image, profile):
     """Add footprint i to an image of rows x cols in an array of its `padded_shape`; returns the rows of its box."""
     height, width = image.shape
     row0, row1, col0, col1 = box_of(table, i, rows, cols, height)
@@ -183,7 +183,7 @@ def add_footprint(table, i, rows, cols, image, profile):  # type: ignore[no-unty
 
 
 @njit(inline="always", fastmath=True)
-def _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient):  # type: ignore[no-untyped-def]
+def _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient):
     """Σ g G, and Σ g D times 1, δv, δv² over the rows, for the lanes low, ..., high - 1, by the recurrence."""
     s0, s1, s2 = lanes.zero(), lanes.zero(), lanes.zero()
     for anchor in range(row0, row1, ANCHOR):
@@ -201,7 +201,7 @@ def _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient):  # t
 
 
 @njit(inline="always", fastmath=True)
-def _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profile):  # type: ignore[no-untyped-def]
+def _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profile):
     """As `_column_gaussian`, of a compact kernel, D without its factor."""
     m0, s0, s1, s2 = lanes.zero(), lanes.zero(), lanes.zero(), lanes.zero()
     for anchor in range(row0, row1, ANCHOR):
@@ -222,7 +222,7 @@ def _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profil
 
 
 @njit(inline="always", fastmath=True)
-def gather_footprint(table, i, rows, cols, gradient, moments, profile):  # type: ignore[no-untyped-def]
+def gather_footprint(table, i, rows, cols, gradient, moments, profile):
     """Fill moments [i] of a gradient of rows x cols in an array of its `padded_shape`, with G of weight 1."""
     height, width = gradient.shape
     row0, row1, col0, col1 = box_of(table, i, rows, cols, height)
@@ -249,7 +249,7 @@ def gather_footprint(table, i, rows, cols, gradient, moments, profile):  # type:
 
 
 @njit(inline="always", fastmath=True)
-def _join(fresh, image, row0, row1):  # type: ignore[no-untyped-def]
+def _join(fresh, image, row0, row1):
     """Add rows of `fresh` to the image and set them to zero."""
     for row in range(row0, row1):
         for col in range(image.shape[1]):

@@ -35,8 +35,8 @@ from recon.kernels.cpu.footprints import (
     HU,
     KV,
     SHEAR,
-    Camera,
     K,
+    RayCamera,
     U,
     V,
     W,
@@ -56,7 +56,7 @@ A, BT, BV, BTT, BTV, BVV, L, LU, LV, N = range(10)
 
 
 @njit(inline="always", fastmath=True)
-def _decay(x):  # type: ignore[no-untyped-def]
+def _decay(x):
     """e^x for x <= 0, to 4e-6: e^(x / 32) by its series, squared five times. np.exp would prevent vectorisation."""
     t = max(x, _f(-40)) * _f(1 / 32)
     p = _f(1 / 120) + t * _f(1 / 720)
@@ -69,7 +69,7 @@ def _decay(x):  # type: ignore[no-untyped-def]
 
 
 @njit(inline="always", fastmath=True)
-def _profile(x, compact):  # type: ignore[no-untyped-def]
+def _profile(x, compact):
     """G and D of `cpu.project` where N / Q = x."""
     if compact:
         t = max(_f(1) - x * _PER, _f(0))
@@ -141,7 +141,7 @@ def _terms(
 
 
 @njit(inline="always", fastmath=True)
-def _span(table, terms, i, row):  # type: ignore[no-untyped-def]
+def _span(table, terms, i, row):
     """Columns first..last (excluded) of a row that lie within the conic."""
     au, av, c2 = terms[i, AU], terms[i, AV], terms[i, CUT]
     dv = row - float(table[i, V])
@@ -312,7 +312,7 @@ def _bend(
             d_means[i, j] += _f((axes[0, j] * gax + axes[1, j] * gay) / tz + axes[2, j] * gz)
 
 
-class Rays:
+class CpuRays:
     """Gaussians in one view of a cone, integrated ray by ray, with forward and backward pass."""
 
     def __init__(
@@ -321,7 +321,7 @@ class Rays:
         scales: F32,
         rotations: F32,
         densities: F32,
-        camera: Camera,
+        camera: RayCamera,
         shape: tuple[int, int],
         faint: float,
         cut: float,

@@ -22,7 +22,7 @@ _NO_FLOOR = -3.0e38
 Weights = tuple[float, float, float]
 
 
-class Scratch(NamedTuple):
+class DualScratch(NamedTuple):
     """One plane [run, b, c + 1], and two [run, 2, b, c + 1], for each run of planes that one thread makes."""
 
     plane: F32
@@ -30,7 +30,7 @@ class Scratch(NamedTuple):
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
-def _primal_plane(x, p, i, threshold, w0, w1, w2, floor, zero, out):  # type: ignore[no-untyped-def]
+def _primal_plane(x, p, i, threshold, w0, w1, w2, floor, zero, out):
     """Plane i of max(x - threshold Dᵀ p, floor) into out [b, c + 1]; the last column is repeated."""
     nb, nc = x.shape[1], x.shape[2]
     for j in range(nb):
@@ -91,7 +91,7 @@ def _primal(x: F32, p: F32, threshold: float, weights: Weights, floor: float, pl
                     out[i, j, k] = planes[run, 0, j, k]
 
 
-def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: Scratch) -> None:
+def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch) -> None:
     """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or none.
 
     Projected gradient ascent of the dual of min ½|y - x|² + threshold TV(y) (Chambolle 2004; with P: Beck & Teboulle
@@ -105,19 +105,21 @@ def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: b
     _dual_step(x, p, threshold, pace, weights, floor, *scratch)
 
 
-def primal(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: Scratch, out: F32) -> None:
+def primal(
+    x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch, out: F32
+) -> None:
     """out = P(x - threshold Dᵀ p); `out` may be `x`."""
     _primal(x, p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch.planes, out)
 
 
-def dual_scratch(shape: tuple[int, int, int]) -> Scratch:
+def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:
     """Scratch for `dual_step` and `primal`.
 
     Two arrays, each without gaps: from parts of one the compiler makes code that gathers single numbers, at a third of
     the speed.
     """
     runs, (_, b, c) = _runs(shape), shape
-    return Scratch(np.empty((runs, b, c + 1), np.float32), np.empty((runs, 2, b, c + 1), np.float32))
+    return DualScratch(np.empty((runs, b, c + 1), np.float32), np.empty((runs, 2, b, c + 1), np.float32))
 
 
 def _runs(shape: tuple[int, int, int]) -> int:

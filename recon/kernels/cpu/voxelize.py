@@ -134,7 +134,7 @@ def _place(
 
 
 @njit(inline="always", fastmath=True)
-def _cut(table, j, z, weight, piece, profile):  # type: ignore[no-untyped-def]
+def _cut(table, j, z, weight, piece, profile):
     """Slice z of Gaussian j as a footprint, piece [1, 9 or more]; returns δz."""
     dz = _f(z) - table[j, _Z]
     down = table[j, _KZ] * dz * dz

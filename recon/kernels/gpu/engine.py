@@ -20,7 +20,7 @@ from recon.kernels.gpu import losses, require
 from recon.kernels.gpu.footprints import HU, footprints, footprints_backward
 from recon.kernels.gpu.images import moments, render
 from recon.kernels.gpu.parameters import activate, activation_backward, adam
-from recon.kernels.gpu.rays import Rays
+from recon.kernels.gpu.rays import GpuRays
 from recon.kernels.gpu.voxels import fill, fill_backward, place
 
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]  # means, scales (or their logarithms), rotations, densities
@@ -71,12 +71,12 @@ class GpuView:
             *run.active, geometry, view, faint, cut, self._length, model.exact_above, run.kernel
         )  # fmt: skip
         self.image = render(self.footprints, geometry.detector_shape, run.kernel)
-        self._rays: tuple[Tensor, Rays] | None = None
+        self._rays: tuple[Tensor, GpuRays] | None = None
         if geometry.is_cone and model.exact_above < math.inf:  # their number is only known after waiting for the device
             exact = torch.nonzero(self.footprints.table[:, HU.value] == INEXACT)[:, 0]
             if exact.numel() > 0:
                 means, scales, rotations, densities = (array[exact] for array in run.active)
-                rays = Rays(means, scales, rotations, densities, geometry, view, faint, cut, run.kernel)
+                rays = GpuRays(means, scales, rotations, densities, geometry, view, faint, cut, run.kernel)
                 rays.add_to(self.image)
                 self._rays = (exact, rays)
 
@@ -134,9 +134,9 @@ class Gpu:
 
     def projection_loss(
         self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
-    ) -> losses.ProjectionLoss:
+    ) -> losses.GpuProjectionLoss:
         """The loss on images of one shape."""
-        return losses.ProjectionLoss(shape, ssim_weight, self.device, term)
+        return losses.GpuProjectionLoss(shape, ssim_weight, self.device, term)
 
     def misfit(self, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
         """||w (image - target)|| / ||w target|| (float64 scalar on the device); 0 for a target of zeros."""

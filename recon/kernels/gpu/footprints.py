@@ -45,13 +45,13 @@ class Footprints:
 
 
 @triton.jit
-def scaled(k, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
+def scaled(k, COMPACT: tl.constexpr):
     """A factor of the quadratic form, as `shadow` and `body` take it."""
     return k * _PER if COMPACT else k * _HALF_LOG2_E
 
 
 @triton.jit
-def shadow(x, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
+def shadow(x, COMPACT: tl.constexpr):
     """G and D of `cpu.project` in an image, x the scaled quadratic form."""
     if COMPACT:
         t = tl.maximum(1.0 + x, 0.0)
@@ -63,7 +63,7 @@ def shadow(x, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def body(x, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
+def body(x, COMPACT: tl.constexpr):
     """G and D in a volume, x the scaled quadratic form."""
     if COMPACT:
         t = tl.maximum(1.0 + x, 0.0)
@@ -76,9 +76,7 @@ def body(x, COMPACT: tl.constexpr):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def along_ray(  # type: ignore[no-untyped-def]
-    means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr
-):
+def along_ray(means, i, live, ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, CONE: tl.constexpr):
     """Position of a Gaussian in the view and the ray through it: (across, up, px/mm, a, b, depth, length of ray)."""
     x, y = tl.load(means + 3 * i, live, 0.0), tl.load(means + 3 * i + 1, live, 0.0)
     z = tl.load(means + 3 * i + 2, live, 0.0)
@@ -95,13 +93,13 @@ def along_ray(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def turned(x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8):  # type: ignore[no-untyped-def]
+def turned(x, y, z, r0, r1, r2, r3, r4, r5, r6, r7, r8):
     """Rᵀ times a vector."""
     return x * r0 + y * r3 + z * r6, x * r1 + y * r4 + z * r7, x * r2 + y * r5 + z * r8
 
 
 @triton.jit
-def shape_of(scales, rotations, i, live):  # type: ignore[no-untyped-def]
+def shape_of(scales, rotations, i, live):
     """The three scales and nine numbers of the rotation; unit scales and rotation where not `live`."""
     s, r = scales + 3 * i, rotations + 9 * i
     return (
@@ -113,7 +111,7 @@ def shape_of(scales, rotations, i, live):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):  # type: ignore[no-untyped-def]
+def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):
     """The pixels within hu, hv of (u, v): the whole image where not `bounded`, an empty box where not `hit`."""
     # Clip as floats: a box far outside exceeds int32.
     row_low, row_high = tl.maximum(tl.ceil(v - hv), 0.0), tl.minimum(tl.floor(v + hv) + 1.0, rows * 1.0)
@@ -129,13 +127,13 @@ def store_box(boxes, i, live, hit, bounded, u, v, hu, hv, rows, cols):  # type: 
 
 
 @triton.jit
-def add_to(at, value, live):  # type: ignore[no-untyped-def]
+def add_to(at, value, live):
     """*at += value, for lanes that are `live`."""
     tl.store(at, tl.load(at, live, 0.0) + value, live)
 
 
 @triton.jit
-def add_shape(  # type: ignore[no-untyped-def]
+def add_shape(
     i, live, s0, s1, s2, r0, r1, r2, r3, r4, r5, r6, r7, r8, t00, t01, t02, t11, t12, t22, d_log_scales, d_rotations
 ):
     """Add the gradients that follow from T, the gradient on a deformation in the Gaussian's axes (`cpu.footprints`)."""
@@ -158,7 +156,7 @@ def add_shape(  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["n"])
-def _footprints(  # type: ignore[no-untyped-def]
+def _footprints(
     means, scales, rotations, densities, table, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz, col0, row0,
     focal, sod, near, faint, cut, fixed, worst, unit, e0, e1, e2, e3, CONE: tl.constexpr, COMPACT: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -220,7 +218,7 @@ def _footprints(  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["n"])
-def _footprints_backward(  # type: ignore[no-untyped-def]
+def _footprints_backward(
     means, scales, rotations, table, moments, d_means, d_log_scales, d_rotations, d_densities, d_centres, n,
     ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, fixed, unit, CONE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

@@ -24,7 +24,7 @@ _BLOCK = (8, 16)  # pixels of a footprint at once, (rows, cols)
 
 
 @triton.jit
-def _render(  # type: ignore[no-untyped-def]
+def _render(
     table, owners, starts, layers, rows, cols, tile_cols, shares,
     EDGE: tl.constexpr, GROUP: tl.constexpr, MANY: tl.constexpr, COMPACT: tl.constexpr,
 ):  # fmt: skip
@@ -66,9 +66,7 @@ def render(found: Footprints, shape: tuple[int, int], kernel: Kernel = Kernel.GA
 
 
 @triton.jit
-def _moments(  # type: ignore[no-untyped-def]
-    table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl.constexpr, COMPACT: tl.constexpr
-):
+def _moments(table, boxes, gradient, moments, cols, HIGH: tl.constexpr, WIDE: tl.constexpr, COMPACT: tl.constexpr):
     i = tl.program_id(0)
     f, box = table + 8 * i, boxes + 4 * i
     u, v, shear = tl.load(f + U), tl.load(f + V), tl.load(f + SHEAR)

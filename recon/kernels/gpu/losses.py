@@ -16,7 +16,7 @@ _LARGEST = tl.constexpr(1.0e38)
 
 
 @triton.jit
-def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: tl.constexpr):
     """One axis of the window over each map [k, row, col], zeros outside; the map is the second axis of the grid."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -34,9 +34,7 @@ def _blur(source, out, window, rows, cols, pixels, ACROSS: tl.constexpr, BLOCK: 
 
 
 @triton.jit
-def _products_across(  # type: ignore[no-untyped-def]
-    image, target, weights, out, window, cols, pixels, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr
-):
+def _products_across(image, target, weights, out, window, cols, pixels, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr):
     """x, x² and xy blurred along the rows, out [3, row, col]; pixels of weight 0 count as 0."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < pixels
@@ -56,7 +54,7 @@ def _products_across(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _ssim_terms(  # type: ignore[no-untyped-def]
+def _ssim_terms(
     half, target_maps, weights, partials, sums, window, rows, cols, pixels, c1, c2, WEIGHTED: tl.constexpr,
     BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -92,7 +90,7 @@ def _ssim_terms(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _combine(  # type: ignore[no-untyped-def]
+def _combine(
     image, target, half, weights, gradient, sums, window, rows, cols, pixels, soft, depth, share, ssim,
     KIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -128,8 +126,8 @@ def _combine(  # type: ignore[no-untyped-def]
     tl.store(sums + block, tl.sum(cost))
 
 
-class ProjectionLoss:
-    """mean w (D(x, y) + λ (1 - SSIM(x, y))) and its gradient, see `cpu.losses.ProjectionLoss`."""
+class GpuProjectionLoss:
+    """mean w (D(x, y) + λ (1 - SSIM(x, y))) and its gradient, see `cpu.losses.CpuProjectionLoss`."""
 
     def __init__(
         self, shape: tuple[int, int], ssim_weight: float, device: torch.device, term: DataTerm = ABSOLUTE,
@@ -186,7 +184,7 @@ class ProjectionLoss:
 
 
 @triton.jit
-def _slope(here, other, ok):  # type: ignore[no-untyped-def]
+def _slope(here, other, ok):
     """|other - here| and its derivative by `here`; 0 without a neighbour."""
     step = other - here
     sign = tl.where(step > 0.0, 1.0, tl.where(step < 0.0, -1.0, 0.0))
@@ -194,7 +192,7 @@ def _slope(here, other, ok):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _total_variation(volume, gradient, sums, weight, nz, ny, nx, voxels, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _total_variation(volume, gradient, sums, weight, nz, ny, nx, voxels, BLOCK: tl.constexpr):
     block = tl.program_id(0)
     i = block.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = i < voxels

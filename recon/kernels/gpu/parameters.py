@@ -18,7 +18,7 @@ _FARTHEST = tl.constexpr(87.0)  # largest |x| for which e^x is a normal float32 
 
 
 @triton.jit
-def _softplus(r):  # type: ignore[no-untyped-def]
+def _softplus(r):
     """log(1 + e^r), without overflow or cancellation, see `cpu.activation`."""
     t = tl.exp(-tl.minimum(tl.abs(r), _FARTHEST))
     z = t / (t + 2.0)
@@ -28,14 +28,14 @@ def _softplus(r):  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _sigmoid(r):  # type: ignore[no-untyped-def]
+def _sigmoid(r):
     """Derivative of softplus, accurate also for very negative r."""
     t = tl.exp(-tl.minimum(tl.abs(r), _FARTHEST))
     return tl.where(r >= 0.0, 1.0, t) / (1.0 + t)
 
 
 @triton.jit
-def _unit_quaternion(quaternions, i, live):  # type: ignore[no-untyped-def]
+def _unit_quaternion(quaternions, i, live):
     w, x = tl.load(quaternions + 4 * i, live, 1.0), tl.load(quaternions + 4 * i + 1, live, 0.0)
     y, z = tl.load(quaternions + 4 * i + 2, live, 0.0), tl.load(quaternions + 4 * i + 3, live, 0.0)
     # Scale by the largest component first: the square of 1e-30 underflows in float32.
@@ -52,7 +52,7 @@ def _unit_quaternion(quaternions, i, live):  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["n"])
-def _activate(log_scales, quaternions, raw, scales, rotations, densities, unit, n, BLOCK: tl.constexpr):  # type: ignore[no-untyped-def]
+def _activate(log_scales, quaternions, raw, scales, rotations, densities, unit, n, BLOCK: tl.constexpr):
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
     for k in tl.static_range(3):
@@ -82,7 +82,7 @@ def activate(log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float) 
 
 
 @triton.jit(do_not_specialize=["n"])
-def _activation_backward(  # type: ignore[no-untyped-def]
+def _activation_backward(
     quaternions, raw, d_rotations, d_densities, d_quaternions, d_raw, unit, n, BLOCK: tl.constexpr
 ):
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -121,9 +121,7 @@ def activation_backward(
 
 
 @triton.jit
-def _adam_one(  # type: ignore[no-untyped-def]
-    parameter, gradient, first, second, rate, low, high, scale2, eps, b1, b2, size, BLOCK: tl.constexpr
-):
+def _adam_one(parameter, gradient, first, second, rate, low, high, scale2, eps, b1, b2, size, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     live = i < size
     g = tl.load(gradient + i, live, 0.0)
@@ -136,7 +134,7 @@ def _adam_one(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _adam(  # type: ignore[no-untyped-def]
+def _adam(
     p0, g0, m0, v0, rate0, low0, high0, size0, p1, g1, m1, v1, rate1, low1, high1, size1,
     p2, g2, m2, v2, rate2, low2, high2, size2, p3, g3, m3, v3, rate3, low3, high3, size3,
     scale2, eps, b1, b2, BLOCK: tl.constexpr,

@@ -46,7 +46,7 @@ _A, _BT, _BV, _BTT, _BTV, _BVV, _L, _LU, _LV, _N = (tl.constexpr(column) for col
 
 
 @triton.jit(do_not_specialize=["n"])
-def _terms(  # type: ignore[no-untyped-def]
+def _terms(
     means, scales, rotations, densities, table, terms, boxes, n, rows, cols, ux, uy, uz, vx, vy, vz, dx, dy, dz,
     focal, sod, faint, cut, unit, COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -92,9 +92,7 @@ def _terms(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _at_pixels(  # type: ignore[no-untyped-def]
-    du, dv, over, up, k, shear, kv, au, av, eta, c2, COMPACT: tl.constexpr
-):
+def _at_pixels(du, dv, over, up, k, shear, kv, au, av, eta, c2, COMPACT: tl.constexpr):
     """(N / Q <= c², τ, N, 1 + α·δ, 1 / Q, V / (W / |D₀|), the same with D for G) at offsets δ of pixels.
 
     The pixels are at (over, up) from the axis, over f; G and D as in `cpu.project`.
@@ -111,7 +109,7 @@ def _at_pixels(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _render(  # type: ignore[no-untyped-def]
+def _render(
     table, terms, boxes, owners, starts, layers, rows, cols, tile_cols, shares, per, col0, row0, EDGE: tl.constexpr,
     GROUP: tl.constexpr, COMPACT: tl.constexpr,
 ):  # fmt: skip
@@ -143,7 +141,7 @@ def _render(  # type: ignore[no-untyped-def]
 
 
 @triton.jit
-def _sums(  # type: ignore[no-untyped-def]
+def _sums(
     table, terms, boxes, gradient, sums, cols, per, col0, row0, HIGH: tl.constexpr, WIDE: tl.constexpr,
     COMPACT: tl.constexpr,
 ):  # fmt: skip
@@ -190,7 +188,7 @@ def _sums(  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["n"])
-def _bend(  # type: ignore[no-untyped-def]
+def _bend(
     means, scales, rotations, table, terms, boxes, sums, moments, d_means, d_log_scales, d_rotations, n,
     ux, uy, uz, vx, vy, vz, dx, dy, dz, focal, sod, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -239,7 +237,7 @@ def _bend(  # type: ignore[no-untyped-def]
     add_to(d_means + 3 * i + 2, uz * ga + vz * gb + dz * far, hit)
 
 
-class Rays:
+class GpuRays:
     """Gaussians (one or more) in one view of a cone, integrated ray by ray, with forward and backward pass."""
 
     def __init__(

@@ -44,7 +44,7 @@ class Placed:
 
 
 @triton.jit(do_not_specialize=["n"])
-def _placed(  # type: ignore[no-untyped-def]
+def _placed(
     means, scales, rotations, densities, table, boxes, n, x0, y0, z0, per_x, per_z, nx, ny, nz, faint, cut,
     COMPACT: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
@@ -127,7 +127,7 @@ def place(
 
 
 @triton.jit
-def _fill(  # type: ignore[no-untyped-def]
+def _fill(
     table, owners, starts, layers, nz, ny, nx, bricks_y, bricks_x, shares, EDGE: tl.constexpr, GROUP: tl.constexpr,
     COMPACT: tl.constexpr,
 ):  # fmt: skip
@@ -169,7 +169,7 @@ def fill(placed: Placed) -> Tensor:
 
 
 @triton.jit
-def _moments(  # type: ignore[no-untyped-def]
+def _moments(
     table, boxes, gradient, moments, ny, nx, DEEP: tl.constexpr, HIGH: tl.constexpr, WIDE: tl.constexpr,
     COMPACT: tl.constexpr,
 ):  # fmt: skip
@@ -217,7 +217,7 @@ def _moments(  # type: ignore[no-untyped-def]
 
 
 @triton.jit(do_not_specialize=["n"])
-def _backward(  # type: ignore[no-untyped-def]
+def _backward(
     table, moments, boxes, scales, rotations, densities, d_means, d_log_scales, d_rotations, d_densities, n, per_x,
     per_z, MEANS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip

@@ -32,7 +32,7 @@ _KERNEL = {"nogil": True, "error_model": "numpy", "_nrt": False}
 outside."""
 
 
-class Rays(NamedTuple):
+class ChordRays(NamedTuple):
     """The rays of one row through the neighbourhood of one body; see the module's docstring.
 
     Attributes:
@@ -117,7 +117,7 @@ def _add_body(row: Reals, view: View, j: int, p: Packed, b: int, axes: Reals, or
     part, offset = row[first:stop], spare[0, first:stop]
     for i in range(part.size):
         offset[i] = view.u[first + i] - across
-    rays = Rays(offset, _sum(near * v - up, V, 0.0, V, 0.0, V), D0, U, near, turn, scale)
+    rays = ChordRays(offset, _sum(near * v - up, V, 0.0, V, 0.0, V), D0, U, near, turn, scale)
     if p.kind[b] == CYLINDER and view.upright:
         if abs(v - up) <= p.size[b, 1] + 1e-9 * view.pitch:
             _add_circle(part, offset, p.size[b, 0], p.attenuation[b])
@@ -139,7 +139,7 @@ def _add_circle(part: Reals, offset: Reals, radius: float, attenuation: float) -
 
 
 @njit(**_KERNEL)
-def _add_cylinder(part: Reals, rays: Rays, radius: float, half: float, attenuation: float) -> None:
+def _add_cylinder(part: Reals, rays: ChordRays, radius: float, half: float, attenuation: float) -> None:
     """Inside the round wall and between the ends."""
     offset, R0, D0, U, near, turn, scale = rays
     size = EDGE_ON * EDGE_ON * scale * scale
@@ -166,8 +166,8 @@ def _add_cylinder(part: Reals, rays: Rays, radius: float, half: float, attenuati
 
 
 @njit(**_KERNEL)
-def _add_ellipsoid(part: Reals, rays: Rays, matrix: Reals, attenuation: float) -> None:
-    """With the ellipsoid scaled to the unit ball, half a chord squared is (|D|² - |R x D|²) / |D|⁴."""
+def _add_ellipsoid(part: Reals, rays: ChordRays, matrix: Reals, attenuation: float) -> None:
+    """In the space where the ellipsoid is the unit ball half a chord squared is |D|² - |R x D|² over |D|⁴."""
     R, M, U = _times(matrix, rays.R0), _times(matrix, rays.D0), _times(matrix, rays.U)
     x0 = _cross(R, M)
     x1 = _sum(rays.near, _cross(U, M), rays.turn, _cross(R, U), 0.0, U)
@@ -180,9 +180,9 @@ def _add_ellipsoid(part: Reals, rays: Rays, matrix: Reals, attenuation: float) -
 
 
 @njit(**_KERNEL)
-def _add_polyhedron(part: Reals, rays: Rays, faces: Reals, attenuation: float, enter: Reals, leave: Reals) -> None:
-    """The chord lies behind all faces that the ray enters, and before all that it leaves (Cyrus & Beck, Computers &
-    Graphics 3, 23, 1978). The loop goes face by face, for the processor's vector lanes."""
+def _add_polyhedron(part: Reals, rays: ChordRays, faces: Reals, attenuation: float, enter: Reals, leave: Reals) -> None:
+    """Behind all faces at which a ray enters and before those at which it leaves (Cyrus & Beck, Computers & Graphics
+    3, 23, 1978); face by face, for the processor's vector lanes."""
     enter[:], leave[:] = -np.inf, np.inf
     least = EDGE_ON * rays.scale
     for f in range(faces.shape[0]):

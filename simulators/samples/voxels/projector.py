@@ -33,7 +33,7 @@ class Lattice(NamedTuple):
     first: Reals
 
 
-class Rays(NamedTuple):
+class VoxelRays(NamedTuple):
     """(u, v) of pixel (0, 0), the pitch, and the distance from the source to the axis, all in mm."""
 
     u0: float
@@ -58,7 +58,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
     out = np.zeros(detector.shape)
     lattice = Lattice(volume, spacing, first)
     pitch = float(detector.pitch)
-    rays = Rays(-detector.axis_col * pitch, -detector.axis_row * pitch, pitch, float(detector.sod))
+    rays = VoxelRays(-detector.axis_col * pitch, -detector.axis_row * pitch, pitch, float(detector.sod))
 
     if pose.tilt is None and math.isinf(detector.sod):
         shift = np.zeros((detector.shape[0], 3)) if pose.shift is None else pose.shift
@@ -86,7 +86,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
 
 @njit(cache=True, nogil=True)
 def _upright(
-    lattice: Lattice, rays: Rays, cosine: Reals, sine: Reals, shift: Reals, low: int, high: int, out: Reals
+    lattice: Lattice, rays: VoxelRays, cosine: Reals, sine: Reals, shift: Reals, low: int, high: int, out: Reals
 ) -> None:
     """Rows low ... high - 1 of a parallel beam across z: in each, x = u cos θ - t sin θ and y = u sin θ + t cos θ."""
     volume, spacing, first = lattice
@@ -141,7 +141,7 @@ def _columns(at: float, step: float, n: int, cols: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def _any(lattice: Lattice, rays: Rays, axes: Reals, origin: Reals, low: int, high: int, out: Reals) -> None:
+def _any(lattice: Lattice, rays: VoxelRays, axes: Reals, origin: Reals, low: int, high: int, out: Reals) -> None:
     """Rows low ... high - 1 for any pose and source; coordinates in voxels of the padded volume."""
     volume, spacing, first = lattice
     u0, v0, pitch, sod = rays

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.output import Firmware, Output, WiredOutput
+from simulators.wires.pi_gcs.output import Firmware, PiOutput, WiredOutput
 from simulators.wires.pi_gcs.trigger import FirstPulse
 
 MOVES_REMEMBERED = 4096
@@ -30,8 +30,8 @@ class GcsError(Exception):
 
 
 @dataclass(frozen=True)
-class AxisBuild:
-    """How this axis is built, and its faults.
+class PiAxisBuild:
+    """How this specimen is built, and its faults.
 
     Attributes:
         low, high: travel range and limit switches, degrees.
@@ -80,7 +80,7 @@ class AxisBuild:
 class GcsAxis:
     """Not safe from several threads. `line` is the cable in the output that has the settings `wired`."""
 
-    def __init__(self, clock: Clock, line: TriggerLine, build: AxisBuild, wired: Output) -> None:
+    def __init__(self, clock: Clock, line: TriggerLine, build: PiAxisBuild, wired: PiOutput) -> None:
         self.build = build
         self.per_degree = build.counts_per_turn / 360.0
         self.error = 0
@@ -188,7 +188,7 @@ class GcsAxis:
             self._stand_at(self._counts(self._clock.now()))
         self.error = 10
 
-    def switch_trigger(self, output: Output, on: bool) -> None:
+    def switch_trigger(self, output: PiOutput, on: bool) -> None:
         """TRO."""
         self.catch_up()
         if output is self._wired.settings:

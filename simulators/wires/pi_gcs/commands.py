@@ -9,8 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from simulators.wires.pi_gcs.axis import AxisBuild, GcsAxis, GcsError
-from simulators.wires.pi_gcs.output import Output
+from simulators.wires.pi_gcs.axis import GcsAxis, GcsError, PiAxisBuild
+from simulators.wires.pi_gcs.output import PiOutput
 
 IDENTITY = "(c)2026 Physik Instrumente (PI) GmbH & Co. KG, C-863.12-SIMULATED, 0, 1.2.1.0"
 DECIMALS = 6
@@ -20,7 +20,7 @@ MODES = (0, 2, 5, 6, 7, 8)
 class PiGcsBox:
     """One axis with its identifier, and the output lines by number. Not safe from several threads."""
 
-    def __init__(self, name: str, axis: GcsAxis, outputs: dict[int, Output]) -> None:
+    def __init__(self, name: str, axis: GcsAxis, outputs: dict[int, PiOutput]) -> None:
         self.name, self.axis, self.outputs = name, axis, outputs
         self.levels = dict.fromkeys(outputs, False)
         """As DIO has put the output lines."""
@@ -35,7 +35,7 @@ class PiGcsBox:
             raise GcsError(15)
         return arguments[1:]
 
-    def output_of(self, arguments: list[str], more: int) -> tuple[Output, list[str]]:
+    def output_of(self, arguments: list[str], more: int) -> tuple[PiOutput, list[str]]:
         if len(arguments) != more + 1:
             raise GcsError(24)
         number = _integer(arguments[0])
@@ -98,7 +98,7 @@ def _switch(act: Callable[[PiGcsBox, bool], None]) -> Action:
     return do
 
 
-def _rate(attribute: str, highest: Callable[[AxisBuild], float], error: int = 17) -> Action:
+def _rate(attribute: str, highest: Callable[[PiAxisBuild], float], error: int = 17) -> Action:
     """A velocity or acceleration in degrees, above 0."""
 
     def do(box: PiGcsBox, arguments: list[str]) -> None:

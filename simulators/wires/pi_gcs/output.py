@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.pi_gcs.trigger import Crossing, FirstPulse, Progress, Window, crossings, switched_on
+from simulators.wires.pi_gcs.trigger import Crossing, FirstPulse, TrainProgress, Window, crossings, switched_on
 
 
 @dataclass
-class Output:
+class PiOutput:
     """The CTO settings of one output line, in the units of the wire, and TRO. Only mode 0 gives pulses."""
 
     axis: str = "1"
@@ -64,10 +64,10 @@ class WiredOutput:
         per_degree: counts.
     """
 
-    def __init__(self, settings: Output, line: TriggerLine, firmware: Firmware, per_degree: float) -> None:
+    def __init__(self, settings: PiOutput, line: TriggerLine, firmware: Firmware, per_degree: float) -> None:
         self.settings = settings
         self._line, self._firmware, self._per_degree = line, firmware, per_degree
-        self._progress, self._coming = Progress(), list[_Coming]()
+        self._progress, self._coming = TrainProgress(), list[_Coming]()
         self._done_until, self._zero = 0.0, 0.0
         self._high_until, self._pulses = -math.inf, 0
 

@@ -42,8 +42,9 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """State of a line: inside its window or not, and the place of its last (or virtual) pulse: anchor + index steps."""
+class TrainProgress:
+    """How far a line is: inside its window or not, and the last pulse (or where it would have been): anchor + index
+    steps."""
 
     inside: bool = False
     anchor: float = 0.0
@@ -56,16 +57,16 @@ class Crossing:
 
     position: float
     pulse: bool
-    after: Progress
+    after: TrainProgress
 
 
-def switched_on(window: Window, position: float) -> Progress:
-    """State of a line that TRO switches on with the axis at `position` (counts)."""
-    return Progress() if window.sign else Progress(True, position, 0)
+def switched_on(window: Window, position: float) -> TrainProgress:
+    """What a line knows when TRO switches it on with the axis at `position` (counts)."""
+    return TrainProgress() if window.sign else TrainProgress(True, position, 0)
 
 
-def crossings(window: Window, progress: Progress, begin: float, end: float) -> Iterator[Crossing]:
-    """The crossings between `begin` (not included) and `end` (included), in order."""
+def crossings(window: Window, progress: TrainProgress, begin: float, end: float) -> Iterator[Crossing]:
+    """What happens on the straight way from `begin` (not included) to `end` (included), in order."""
     if begin == end:
         return
     sign, reach = (1 if end > begin else -1), abs(end - begin)
@@ -93,12 +94,12 @@ def crossings(window: Window, progress: Progress, begin: float, end: float) -> I
         progress = replace(progress, index=progress.index + sign)
         yield Crossing(end if ahead(at) > reach else at, True, progress)
     if room < reach:
-        yield Crossing(edge, False, Progress())
+        yield Crossing(edge, False, TrainProgress())
 
 
-def _entered(window: Window, position: float, sign: int) -> Progress:
+def _entered(window: Window, position: float, sign: int) -> TrainProgress:
     if window.rule is not FirstPulse.GRID:
-        return Progress(True, position, 0)
+        return TrainProgress(True, position, 0)
     steps = (position - window.zero) / window.step
     nearest = math.ceil(sign * steps - SLACK / window.step)
-    return Progress(True, window.zero, sign * (nearest - 1))
+    return TrainProgress(True, window.zero, sign * (nearest - 1))

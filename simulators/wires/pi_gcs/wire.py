@@ -17,9 +17,9 @@ from typing import Self
 from drivers.base.clock import Clock
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.axis import AxisBuild, GcsAxis, GcsError
+from simulators.wires.pi_gcs.axis import GcsAxis, GcsError, PiAxisBuild
 from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
-from simulators.wires.pi_gcs.output import Output
+from simulators.wires.pi_gcs.output import PiOutput
 from simulators.wires.pi_gcs.trigger import FirstPulse
 
 OUTPUTS = 4
@@ -58,7 +58,7 @@ class PiGcsBuild:
     latency: float = 0.0
     unknown: Set[str] = frozenset()
     spoil: Spoil = _as_sent
-    specimen: AxisBuild = field(default=AxisBuild())
+    specimen: PiAxisBuild = field(default=PiAxisBuild())
 
     def __post_init__(self) -> None:
         if not 1 <= self.output <= OUTPUTS:
@@ -72,7 +72,7 @@ class PiGcsBuild:
                 f"trigger_line: the simulated controller has no digital output {settings.trigger_line}; it has 1 to "
                 f"{OUTPUTS}"
             )
-        specimen = AxisBuild(
+        specimen = PiAxisBuild(
             counts_per_turn=figures.counts_per_turn,
             low=_degrees(figures.low) - 1,
             high=_degrees(figures.high) + 1,
@@ -98,7 +98,7 @@ class PiGcsController:
     def __init__(self, clock: Clock, line: TriggerLine, build: PiGcsBuild) -> None:
         self.clock = clock
         self.replies = 0
-        outputs = {number: Output(axis=build.axis) for number in range(1, OUTPUTS + 1)}
+        outputs = {number: PiOutput(axis=build.axis) for number in range(1, OUTPUTS + 1)}
         self.box = PiGcsBox(build.axis, GcsAxis(clock, line, build.specimen, outputs[build.output]), outputs)
         self._latency, self._unknown, self._spoil = build.latency, build.unknown, build.spoil
         self._in = bytearray()

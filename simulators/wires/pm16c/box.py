@@ -40,7 +40,7 @@ def ms_per_1000_pps(code: int) -> float:
     return float(f"{_E24[23 - step]}e{2 - decade}")
 
 
-class Error(IntFlag):
+class Pm16cError(IntFlag):
     """ERRF? flags; the lowest one set names the text of ERR?."""
 
     COMMAND = 1
@@ -51,7 +51,7 @@ class Error(IntFlag):
 class Refused(Exception):  # noqa: N818 - not an error of this program
     """A refused command, which only sets an error flag."""
 
-    def __init__(self, flag: Error) -> None:
+    def __init__(self, flag: Pm16cError) -> None:
         super().__init__(flag)
         self.flag = flag
 
@@ -128,7 +128,7 @@ class PM16CBox:
     def __init__(self, clock: Clock, line: TriggerLine, build: BoxBuild) -> None:
         self.clock, self.version = clock, build.version
         self.remote = False
-        self.errors = Error(0)
+        self.errors = Pm16cError(0)
         self.mapped = "0123"
         sample, turn = f"{build.channel:X}", build.counts_per_turn
         self.channels = {
@@ -156,18 +156,18 @@ class PM16CBox:
     def standing(self, c: str) -> Channel:
         """The channel; raises Refused if it moves."""
         if self.channels[c].motor.moving():
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         return self.channels[c]
 
     def set_remote(self, remote: bool) -> None:
         if self.moving():
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         self.remote = remote
 
     def map(self, wanted: str) -> None:
         """Channels to position controllers A..D; `-` leaves one as it is. A channel that sat elsewhere swaps places."""
         if any(self.channels[c].motor.moving() for c in (*wanted.replace("-", ""), *self.mapped)):
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         places = list(self.mapped)
         for at, c in enumerate(wanted):
             if c in places:
@@ -184,14 +184,14 @@ class PM16CBox:
     def find_home(self, c: str) -> None:
         """Search for the home switch with the selected speed."""
         if self.channels[c].home.at is None:
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         channel = self._ready_to_move(c, 0)
         channel.home.search(channel.speeds[channel.selected], channel.acceleration)
 
     def go_home(self, c: str) -> None:
         home = self.channels[c].home.found()
         if home is None:
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         self.start(c, home)
 
     def home(self, c: str) -> str:
@@ -203,16 +203,16 @@ class PM16CBox:
         """Set the count of the present position to `count`."""
         motor = self.standing(c).motor
         if abs(count) > MAX_COUNT or motor.trigger.ready(self.clock.now()):
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         self.channels[c].home.forget_search()
         motor.preset(count)
 
     def _ready_to_move(self, c: str, target: int) -> Channel:
         channel = self.channels[c]
         if abs(target) > MAX_COUNT:
-            raise Refused(Error.BAD_ABS)
+            raise Refused(Pm16cError.BAD_ABS)
         if channel.motor.moving() or self.moving() >= 4:
-            raise Refused(Error.BUSY)
+            raise Refused(Pm16cError.BUSY)
         channel.home.forget_search()
         channel.motor.limits = (channel.soft["B"], channel.soft["F"]) if channel.switches[0] == "1" else None
         return channel
@@ -233,12 +233,12 @@ class PM16CBox:
         elif 1 <= int(value) <= MAX_SPEED:
             channel.speeds[level] = int(value)
         else:
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
 
     def set_rate(self, c: str, code: int) -> None:
         channel = self.standing(c)
         if code > 115:
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         channel.rate = code
 
     def set_trigger(self, c: str, change: Callable[[TriggerSettings], TriggerSettings]) -> None:
@@ -246,14 +246,14 @@ class PM16CBox:
         trigger = self.standing(c).motor.trigger
         settings = change(trigger.settings)
         if trigger.ready(self.clock.now()) or settings.interval < 1:
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         trigger.settings = settings
 
     def arm(self, c: str) -> None:
         motor = self.standing(c).motor
         too_many = len(motor.trigger.settings.points) > MAX_PULSES
         if c not in self.mapped or motor.trigger.refusal(motor.position()) or too_many:
-            raise Refused(Error.COMMAND)
+            raise Refused(Pm16cError.COMMAND)
         motor.trigger.arm()
 
     def mode(self, c: str) -> int:

@@ -14,13 +14,17 @@ from typing import Self, TypeVar
 
 from drivers.base.clock import Clock
 from drivers.stages.pm16c.settings import PM16CSettings
-from drivers.stages.pm16c.train import FirstPulse
+from drivers.stages.pm16c.train import Pm16cFirstPulse
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.box import MODES, BoxBuild, Error, PM16CBox, Refused
+from simulators.wires.pm16c.box import MODES, BoxBuild, PM16CBox, Pm16cError, Refused
 
 END = b"\r\n"
 LONGEST_LINE = 256
-ERROR_TEXT = {Error.COMMAND: "COMMAND ERROR", Error.BUSY: "MCC06 BUSY ERROR", Error.BAD_ABS: "BAD ABS COMMAND"}
+ERROR_TEXT = {
+    Pm16cError.COMMAND: "COMMAND ERROR",
+    Pm16cError.BUSY: "MCC06 BUSY ERROR",
+    Pm16cError.BAD_ABS: "BAD ABS COMMAND",
+}
 
 _C = "([0-9A-F])"
 _D = r"([+-]?\d{1,12})"
@@ -34,7 +38,7 @@ def _error_text(box: PM16CBox) -> str:
 
 
 def _clear_errors(box: PM16CBox) -> None:
-    box.errors = Error(0)
+    box.errors = Pm16cError(0)
 
 
 def _set_limit(box: PM16CBox, side: str, c: str, value: str) -> None:
@@ -122,7 +126,7 @@ class PM16CBuild:
 
     @classmethod
     def matching(cls, settings: PM16CSettings) -> Self:
-        at_start = settings.first_pulse is FirstPulse.AT_START
+        at_start = settings.first_pulse is Pm16cFirstPulse.AT_START
         return cls(BoxBuild(settings.channel, settings.figures.counts_per_turn, fires_at_start=at_start))
 
     def controller(self, clock: Clock, line: TriggerLine) -> PM16CController:
@@ -155,7 +159,7 @@ class PM16CController:
                 self._do(line)
             if len(self._in) > LONGEST_LINE:
                 self._in.clear()
-                self.box.errors |= Error.COMMAND
+                self.box.errors |= Pm16cError.COMMAND
 
     def transmit(self) -> bytes:
         """Bytes for the host that are not yet taken."""
@@ -178,7 +182,7 @@ class PM16CController:
             except Refused as refusal:
                 self.box.errors |= refusal.flag
         else:
-            self.box.errors |= Error.COMMAND
+            self.box.errors |= Pm16cError.COMMAND
 
     def _reply(self, text: str) -> None:
         at, self.queries = self.queries, self.queries + 1

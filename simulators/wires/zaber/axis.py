@@ -30,7 +30,7 @@ class Rejected(Exception):  # noqa: N818 - not an error of this program
 
 
 @dataclass(frozen=True)
-class AxisBuild:
+class ZaberAxisBuild:
     """How the axis is built, and its faults.
 
     Attributes:
@@ -49,13 +49,13 @@ class AxisBuild:
     switch_at: int | None = None
 
 
-class ZaberAxis:
+class SimulatedZaberAxis:
     """One axis. Times are s on the device's clock, positions whole microsteps.
 
     `stall_at` and `switch_at` may be changed while it stands, as if a person clears the way.
     """
 
-    def __init__(self, now: float, build: AxisBuild) -> None:
+    def __init__(self, now: float, build: ZaberAxisBuild) -> None:
         self.settings: dict[str, int] = {
             "maxspeed": round(build.counts_per_turn / 36 * SPEED_UNIT),
             "motion.accelonly": 100,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from drivers.base.clock import Clock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber.axis import AxisBuild, Rejected, ZaberAxis
+from simulators.wires.zaber.axis import Rejected, SimulatedZaberAxis, ZaberAxisBuild
 from simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in
 
 LOOK_AHEAD = 10.0
@@ -47,7 +47,7 @@ class DeviceBuild:
     latency: float = 0.0
     fires_when_enabled: bool = False
     lost: Set[int] = frozenset()
-    axis: AxisBuild = field(default=AxisBuild())
+    axis: ZaberAxisBuild = field(default=ZaberAxisBuild())
 
     def __post_init__(self) -> None:
         if not 1 <= self.output <= OUTPUTS:
@@ -59,7 +59,7 @@ class ZaberDevice:
 
     def __init__(self, clock: Clock, line: TriggerLine, build: DeviceBuild) -> None:
         now, counts_per_turn = clock.now(), build.axis.counts_per_turn
-        self.axis = ZaberAxis(now, build.axis)
+        self.axis = SimulatedZaberAxis(now, build.axis)
         self.triggers = Triggers(self.axis.move, build.latency, build.fires_when_enabled, now)
         self.alerts, self.checksums = False, False
         self._clock, self._line, self._lost = clock, line, build.lost

@@ -15,7 +15,7 @@ from typing import Self
 from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.axis import AxisBuild, Rejected
+from simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
 from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
 from simulators.wires.zaber.packets import Command, Malformed, PacketReader, frame
 from simulators.wires.zaber.triggers import OUTPUTS
@@ -61,7 +61,7 @@ class ZaberBuild:
             can_schedule=not settings.toggle,
             can_chain=settings.triggers.chained,
             fires_when_enabled=settings.triggers.fires_when_enabled,
-            axis=AxisBuild(settings.figures.counts_per_turn),
+            axis=ZaberAxisBuild(settings.figures.counts_per_turn),
         )
         return cls(settings.device, device=device)
 

@@ -49,7 +49,7 @@ def connected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: list[Fake
             "beamline.instrument.connect.connect",
             lambda config, ask=None: replace(fake.connected(), close=lambda: closed.append(fake)),
         )
-        return api.connect(SIMULATED, set={**SMALL, "storage.folder": str(tmp_path), **values}, tell=None)
+        return api.connect(SIMULATED, set={**SMALL, "storage.folder": str(tmp_path), **values}, say=None)
 
     return connect
 
@@ -186,7 +186,7 @@ def test_the_simulated_instrument_on_a_virtual_clock(tmp_path: Path) -> None:
         "storage.folder": tmp_path,
         "devices.camera.roi": [1144, 2024, 16, 48],
     }
-    with api.connect(SIMULATED, set=values, tell=None) as instrument:
+    with api.connect(SIMULATED, set=values, say=None) as instrument:
         results = [instrument.scan(sample=f"cell-{n}") for n in (1, 2)]
     assert [result.frames for result in results] == [50, 50]
     first, second = (list(api.stream(result.path)) for result in results)
@@ -208,7 +208,7 @@ print(json.dumps({"event": "done", "output": "recon.h5"}))"""
 def test_one_scan_connects_and_closes(connected: Connected, closed: list[FakeInstrument], tmp_path: Path) -> None:
     connected()  # the fake instrument stands in from now on
     values = {**SMALL, "devices.stage.max_speed_deg_s": 20}
-    result = api.scan(SIMULATED, set=values, sample="one", output=tmp_path / "elsewhere", tell=None)
+    result = api.scan(SIMULATED, set=values, sample="one", output=tmp_path / "elsewhere", say=None)
     assert result.sample == "one" and result.folder.parent.name == "elsewhere" and len(closed) == 1
 
 

@@ -136,7 +136,7 @@ def left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_a_volume_and_figures_without_a_file(scan: Path, left: Path, tmp_path: Path) -> None:
     before = {*tmp_path.iterdir()}
-    result = api.reconstruct(scan, "fbp", rows=slice(0, 1), tell=None)
+    result = api.reconstruct(scan, "fbp", rows=slice(0, 1), say=None)
     assert result.volume.data.shape == (1, 40, 40) and result.volume.data.dtype == np.float32
     assert result.method == "fbp" and 0 < result.figures["residual"] < 1
     assert result.settings["rows"] == "0:1" and result.units == "1/mm"
@@ -147,20 +147,20 @@ def test_a_volume_and_figures_without_a_file(scan: Path, left: Path, tmp_path: P
 
 def test_a_method_with_settings_and_a_selection(scan: Path, left: Path) -> None:
     chosen = api.Selection(axis_col=19.5, views="fixed:15")
-    result = api.reconstruct(scan, recon.Sirt(iterations=2), selection=chosen, binning=2, tell=None)
+    result = api.reconstruct(scan, recon.Sirt(iterations=2), selection=chosen, binning=2, say=None)
     assert (result.axis_col, result.settings["n_views"], result.settings["binning"]) == (19.5, 15, 2)
     assert result.volume.data.shape == (1, 20, 20)
 
 
 def test_with_an_output_the_files_of_the_command(scan: Path, tmp_path: Path) -> None:
-    result = api.reconstruct(scan, "fbp", output=tmp_path / "out.h5", tell=None)
+    result = api.reconstruct(scan, "fbp", output=tmp_path / "out.h5", say=None)
     command = beamline("recon", str(scan), "-m", "fbp", "-o", str(tmp_path / "cli.h5"))
     assert command.exit_code == 0
     again = replace(result, output=tmp_path / "cli.h5").volume
     assert np.array_equal(result.volume.data, again.data) and result.volume.grid == again.grid
     assert result.report == tmp_path / "out.html" and result.report.is_file()
     with pytest.raises(api.DataError, match="never overwritten"):
-        api.reconstruct(scan, "fbp", output=tmp_path / "out.h5", tell=None)
+        api.reconstruct(scan, "fbp", output=tmp_path / "out.h5", say=None)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_what_cannot_be_is_refused(
     scan: Path, left: Path, arguments: dict[str, object], error: type[Exception], said: str
 ) -> None:
     with pytest.raises(error, match=said):
-        api.reconstruct(scan, tell=None, **{"method": "fbp", **arguments})  # type: ignore[arg-type]
+        api.reconstruct(scan, say=None, **{"method": "fbp", **arguments})  # type: ignore[arg-type]
 
 
 def test_no_scan_is_the_projects_own_error(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from beamline.cli.demo import run_demo
 from beamline.cli.main import main
 from beamline.config.load import Config, config_folder, load
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event
+from beamline.core.events import Event, VolumeDone
 from beamline.core.stop import StopRequest
 from beamline.storage.writers.recon_file import read_reconstruction
 
@@ -113,18 +113,12 @@ def test_the_command_runs_the_demo_configuration(here: Path, monkeypatch: pytest
     def fake(config: Config, runs: Path | None, sinks: list, stop: StopRequest, command: str) -> None:
         asked.append((config, runs))
         assert threading.current_thread() is threading.main_thread()
-        data = {
-            "output": "runs/x/recon.h5",
-            "report": "runs/x/report.html",
-            "method": "r2",
-            "shape": (2, 3, 4),
-            "units": "1/mm",
-            "axis_col": 17.0,
-            "psnr": 30.0,
-            "fbp": {"psnr": 25.0},
-        }
+        done = VolumeDone(
+            Path("runs/x/recon.h5"), Path("runs/x/report.html"), "r2", 17.0, 9, (2, 3, 4), "1/mm", 1.0, {},
+            {"psnr": 30.0}, fbp={"psnr": 25.0}, time=0.0,
+        )  # fmt: skip
         for sink in sinks:
-            sink(Event("done", 0.0, data))
+            sink(done)
 
     monkeypatch.setattr("beamline.cli.demo.run_demo", fake)
     result = CliRunner().invoke(main, ["demo", "-o", "elsewhere", "--seconds", "7"])

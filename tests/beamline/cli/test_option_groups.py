@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from beamline.cli.main import main
 from beamline.cli.option_groups import GROUPS, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.terminal import Terminal
-from beamline.core.events import Event
+from beamline.core.events import FitReached
 from beamline.core.process import with_our_path
 
 CONTEXT = click.Context(main)
@@ -107,5 +107,5 @@ def test_no_color_is_respected(monkeypatch: pytest.MonkeyPatch, no_color: str, c
     monkeypatch.setenv("TERM", "xterm-256color")
     stream = io.StringIO()
     with Terminal(stream) as terminal:
-        terminal(Event("progress", 0.0, {"step": 5, "steps": 9, "n_views": 4, "n_gaussians": 2, "residual": 0.1}))
+        terminal(FitReached("recon", 5, 9, 1.0, 0.1, 0.1, 2, 4, None, "", None, None))
     assert bool(re.search(r"\x1b\[[\d;]*(?:3\d|9\d|38;5;\d+)m", stream.getvalue())) == coloured

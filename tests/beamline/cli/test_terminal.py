@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from beamline.cli.terminal import Terminal, fit, rates
-from beamline.core.events import Event
+from beamline.core.events import FitReached, FrameStored, Warned, event_of
 from beamline.core.narration import UserLog, sentence
 
-FRAME = {
+FRAME: dict[str, Any] = {
     "n": 90,
     "of": 360,
     "kind": "projection",
@@ -24,6 +24,12 @@ FRAME = {
     "eta_s": 3725.4,
     "mean": 1.0,
 }
+
+
+FIT: dict[str, Any] = {
+    "stage": "recon", "step": 5, "steps": 0, "seconds": 1.0, "loss": 0.1, "residual": 0.1, "n_gaussians": 2,
+    "n_views": 4, "held_out": None, "unit": "", "per_s": None, "eta_s": None,
+}  # fmt: skip
 
 
 class Tty(io.StringIO):
@@ -42,7 +48,7 @@ def _plain_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def shown(stream: io.StringIO, *events: tuple[str, dict[str, Any]]) -> str:
     with Terminal(stream) as terminal:
         for event, data in events:
-            terminal(Event(event, 0.0, data))
+            terminal(event_of({"event": event, **data}))
     return stream.getvalue()
 
 
@@ -65,7 +71,7 @@ def test_a_terminal_that_closes_does_not_end_the_work() -> None:
 
 
 def test_the_figures_an_operator_watches() -> None:
-    assert rates(FRAME) == "90/360  10.0 frames/s  188.2 MB/s  1:02:05 left"
+    assert rates(FrameStored(**FRAME)) == "90/360  10.0 frames/s  188.2 MB/s  1:02:05 left"
 
 
 def test_without_a_terminal_there_are_plain_lines_and_not_too_many() -> None:
@@ -89,22 +95,22 @@ def test_a_terminal_gets_a_bar_that_is_gone_at_the_end() -> None:
 def test_a_question_is_asked_with_the_bar_out_of_the_way() -> None:
     stream = Tty()
     with Terminal(stream) as terminal:
-        terminal(Event("frame", 0.0, FRAME))
+        terminal(FrameStored(**FRAME))
 
         def put(request: str) -> None:
             assert "\x1b[2K" in stream.getvalue()[stream.getvalue().rindex("frames/s") :]  # the bar's line is erased
             before = stream.getvalue()
-            terminal(Event("progress", 0.0, {"step": 5, "steps": 0, "n_views": 4, "n_gaussians": 2, "residual": 0.1}))
+            terminal(FitReached(**FIT))
             assert stream.getvalue() == before  # and nothing overwrites the question
             stream.write(f"{request}\n")
 
         terminal.ask("Open the beam shutter.", put)
-        terminal(Event("frame", 0.0, {**FRAME, "n": 91}))
+        terminal(FrameStored(**{**FRAME, "n": 91}))
     assert "91/360" in stream.getvalue().split("Open the beam shutter.")[1]
 
 
 def test_the_fit_has_a_bar_of_its_own() -> None:
-    progress = {"step": 5, "steps": 0, "n_views": 40, "n_gaussians": 2000, "residual": None}
+    progress = {**FIT, "n_views": 40, "n_gaussians": 2000, "residual": None}
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown(Tty(), ("frame", FRAME), ("progress", progress)))
     assert "40 views, 2000 Gaussians" in text
     assert "90/360" in text
@@ -118,17 +124,17 @@ def test_compilation_is_told_with_its_time() -> None:
 
 def test_a_fit_with_an_end_says_how_far_it_is() -> None:
     progress = {
-        "step": 500, "steps": 2000, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344, "held_out": None,
+        **FIT, "step": 500, "steps": 2000, "n_views": 91, "n_gaussians": 2000, "residual": 0.12344, "held_out": None,
         "per_s": 20.0, "eta_s": 75.0,
     }  # fmt: skip
     said = "500/2000 steps, 20 steps/s, 91 views, 2000 Gaussians, residual 0.1234, 0:01:15 left"
-    assert fit(progress) == said
+    assert fit(FitReached(**progress)) == said
     assert shown(io.StringIO(), ("progress", progress)) == f"volume: {said}\n"
-    assert "residual 0.1234, held out 0.2000, 0:01" in fit({**progress, "held_out": 0.2})
+    assert "residual 0.1234, held out 0.2000, 0:01" in fit(FitReached(**{**progress, "held_out": 0.2}))
 
 
 def test_the_end_is_said_once() -> None:
-    progress = {"step": 9, "steps": 9, "n_views": 9, "n_gaussians": 9, "residual": 0.1}
+    progress = {**FIT, "step": 9, "steps": 9, "n_views": 9, "n_gaussians": 9}
     again = ("progress", {**progress, "residual": 0.2})
     text = shown(io.StringIO(), ("progress", {**progress, "step": 8}), ("progress", progress), again)
     assert [line[:11] for line in text.splitlines()] == ["volume: 8/9", "volume: 9/9"]
@@ -136,52 +142,69 @@ def test_the_end_is_said_once() -> None:
 
 def test_iterations_are_told_as_such() -> None:
     progress = {
-        "step": 3, "steps": 40, "n_views": 60, "n_gaussians": 0, "residual": 0.2, "held_out": math.nan,
+        **FIT, "step": 3, "steps": 40, "n_views": 60, "n_gaussians": 0, "residual": 0.2, "held_out": math.nan,
         "per_s": 0.5, "eta_s": 74.0,
     }  # fmt: skip
-    assert fit(progress) == "3/40 iterations, 0.5 iterations/s, 60 views, residual 0.2000, 0:01:14 left"
+    assert fit(FitReached(**progress)) == "3/40 iterations, 0.5 iterations/s, 60 views, residual 0.2000, 0:01:14 left"
 
 
 def test_slices_are_told_as_such() -> None:
     progress = {
-        "step": 32, "steps": 128, "n_views": 900, "n_gaussians": 0, "residual": math.nan, "held_out": math.nan,
+        **FIT, "step": 32, "steps": 128, "n_views": 900, "n_gaussians": 0, "residual": math.nan, "held_out": math.nan,
         "per_s": 2.0, "eta_s": 48.0, "unit": "slices",
     }  # fmt: skip
-    assert fit(progress) == "32/128 slices, 2 slices/s, 900 views, 0:00:48 left"
+    assert fit(FitReached(**progress)) == "32/128 slices, 2 slices/s, 900 views, 0:00:48 left"
+
+
+SNAPSHOT = {"path": "v.h5", "picture": "p.html", "n_views": 40, "seconds": 1.0, "unlearnt": None}
 
 
 def test_the_same_snapshot_is_said_once() -> None:
-    snapshot = ("snapshot", {"n_views": 40, "path": "v.h5"})
-    text = shown(io.StringIO(), snapshot, ("frame", FRAME), snapshot, ("snapshot", {"n_views": 60, "path": "v.h5"}))
+    snapshot = ("snapshot", SNAPSHOT)
+    text = shown(io.StringIO(), snapshot, ("frame", FRAME), snapshot, ("snapshot", {**SNAPSHOT, "n_views": 60}))
     assert text.count("from 40 views") == 1
     assert text.count("from 60 views") == 1
 
 
+BLOCK = {
+    "n": 9, "kind": "flat", "mode": "static", "first_row": 0, "frames": 7, "missing": [], "lost": 0, "ignored": 0,
+    "extra": 0,
+}  # fmt: skip
+FLAG = {"check": "beam", "level": "alarm", "frame": 7, "score": 1.0, "limit": 0.5, "region": None, "first": None}
+RUN = {"folder": "runs/x", "path": "s.h5", "sample": "x", "n_frames": 390, "total_bytes": 18e6, "duration": 44.5}
+SCAN = {
+    "status": "complete", "n_frames": 3, "bytes": 2e3, "seconds": 1, "path": "s.h5", "missing": [], "flags": {},
+    "alarmed_frames": 0, "alarmed_views": 0, "retaken": 0, "reference_faults": [], "recon": None,
+}  # fmt: skip
 EVENTS = [
-    ("run_started", {"folder": "runs/x", "n_frames": 390, "total_bytes": 18e6, "duration": 44.5}, "390 frames, 18 MB"),
+    ("run_started", {**RUN, "remarks": []}, "390 frames, 18 MB"),
     ("state", {"state": "done", "message": "Finished"}, "Finished"),
-    ("state", {"message": "Waiting"}, "Waiting"),
-    ("block_started", {"n": 10, "kind": "dark", "mode": "static", "exposure": 0.05}, "10 dark frames (static, 0.05 s"),
-    ("block_done", {"n": 9, "kind": "flat", "missing": [], "extra": 0}, None),
-    ("block_done", {"n": 9, "kind": "flat", "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
+    ("state", {"state": "waiting", "message": "Waiting"}, "Waiting"),
+    (
+        "block_started",
+        {"n": 10, "kind": "dark", "mode": "static", "first_row": 0, "exposure": 0.05, "period": 0.1},
+        "10 dark frames (static, 0.05 s",
+    ),
+    ("block_done", BLOCK, None),
+    ("block_done", {**BLOCK, "missing": [3, 4], "extra": 1}, "2 missing (3-4), 1 without a trigger"),
     ("frame", FRAME, None),
-    ("progress", {}, None),
-    ("flag", {"check": "beam", "level": "alarm", "frame": 7, "advice": "The beam is lost."}, "Alarm (beam, frame 7)"),
+    ("progress", FIT, None),
+    ("flag", {**FLAG, "advice": "The beam is lost."}, "Alarm (beam, frame 7)"),
     ("warning", {"message": "hot"}, "Warning: hot"),
     (
         "recon_started",
-        {"method": "r2", "n_views": 26, "axis_col": 81.987, "source": "recon"},
+        {"file": "s.h5", "method": "r2", "n_views": 26, "axis_col": 81.987, "source": "recon"},
         "r2: 26 views, rotation axis at column 81.99",
     ),
     (
         "recon_started",
-        {"method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
+        {"file": "s.h5", "method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
         "r2 again, from the start: 40 views, rotation axis at column 82.50",
     ),
-    ("snapshot", {"n_views": 40, "path": "v.h5"}, "Volume from 40 views so far: v.h5"),
+    ("snapshot", SNAPSHOT, "Volume from 40 views so far: v.h5"),
     (
         "scan_done",
-        {"status": "complete", "n_frames": 3, "bytes": 2e3, "seconds": 1, "path": "s.h5"},
+        SCAN,
         "Scan complete: 3",
     ),
     ("recon_done", {"output": "recon.h5"}, "Volume: recon.h5"),
@@ -192,7 +215,7 @@ EVENTS = [
 
 @pytest.mark.parametrize(("event", "data", "words"), EVENTS)
 def test_events_in_words(event: str, data: dict[str, Any], words: str | None) -> None:
-    text = sentence(Event(event, 0.0, data))
+    text = sentence(event_of({"event": event, **data}))
     if words is None:
         assert text is None
     else:
@@ -203,6 +226,6 @@ def test_events_in_words(event: str, data: dict[str, Any], words: str | None) ->
 def test_the_user_log_has_a_line_and_a_time_for_each_sentence() -> None:
     stream = io.StringIO()
     log = UserLog(stream)
-    log(Event("warning", 1_795_152_000.5, {"message": "hot"}))
-    log(Event("frame", 1_795_152_001.0, FRAME))
+    log(Warned("hot", time=1_795_152_000.5))
+    log(FrameStored(**FRAME, time=1_795_152_001.0))
     assert stream.getvalue() == "2026-11-20T05:20:00Z  Warning: hot\n"

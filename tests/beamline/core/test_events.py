@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 
-from beamline.core.events import Announcer, Event
+from beamline.core.events import Event, KernelsCompiled, StateEntered
+from beamline.core.sinks import Announcer
 from simulators.devices.clock import VirtualClock
 
 
@@ -12,11 +13,11 @@ def test_all_sinks_hear_all_events_in_order_with_their_time() -> None:
     clock = VirtualClock(start=100.0)
     first: list[Event] = []
     second: list[Event] = []
-    with Announcer([first.append, second.append], clock) as emit:
+    with Announcer([first.append, second.append], clock) as sink:
         for i in range(50):
-            emit("frame", {"n": i})
+            sink(KernelsCompiled("kernels", i, 0.0))
             clock.sleep(1.0)
-    assert [(e.event, e.time, e.data["n"]) for e in first] == [("frame", 100.0 + i, i) for i in range(50)]
+    assert [(e.event, e.time, e.data["n"]) for e in first] == [("progress", 100.0 + i, i) for i in range(50)]
     assert first == second
 
 
@@ -29,9 +30,9 @@ def test_a_sink_that_breaks_is_given_up_and_the_others_are_told() -> None:
         calls += 1
         raise BrokenPipeError("reader is gone")
 
-    with Announcer([broken, heard.append], VirtualClock()) as emit:
-        emit("state", {"message": "a"})
-        emit("state", {"message": "b"})
+    with Announcer([broken, heard.append], VirtualClock()) as sink:
+        sink(StateEntered("idle", "a"))
+        sink(StateEntered("idle", "b"))
     assert calls == 1
     assert [e.event for e in heard] == ["warning", "state", "state"]
     assert "reader is gone" in heard[0].data["message"]
@@ -45,9 +46,9 @@ def test_a_sink_that_hangs_does_not_hold_up_who_speaks() -> None:
         go_on.wait(30)
         heard.append(event.data["n"])
 
-    with Announcer([slow], VirtualClock()) as emit:
+    with Announcer([slow], VirtualClock()) as sink:
         for i in range(1000):
-            emit("frame", {"n": i})
+            sink(KernelsCompiled("kernels", i, 0.0))
         assert heard == []  # everything was said before the sink did anything
         go_on.set()
     assert heard == list(range(1000))
@@ -55,9 +56,9 @@ def test_a_sink_that_hangs_does_not_hold_up_who_speaks() -> None:
 
 def test_threads_may_speak_at_once() -> None:
     heard: list[Event] = []
-    with Announcer([heard.append], VirtualClock()) as emit:
+    with Announcer([heard.append], VirtualClock()) as sink:
         threads = [
-            threading.Thread(target=lambda t=t: [emit("frame", {"thread": t, "n": n}) for n in range(100)])
+            threading.Thread(target=lambda t=t: [sink(KernelsCompiled(f"{t}", n, 0.0)) for n in range(100)])
             for t in range(4)
         ]
         for thread in threads:
@@ -66,7 +67,7 @@ def test_threads_may_speak_at_once() -> None:
             thread.join()
     assert len(heard) == 400
     for t in range(4):
-        assert [e.data["n"] for e in heard if e.data["thread"] == t] == list(range(100))
+        assert [e.data["n"] for e in heard if e.data["stage"] == f"{t}"] == list(range(100))
 
 
 def test_two_sinks_that_break_at_once_are_each_given_up_once() -> None:
@@ -82,9 +83,9 @@ def test_two_sinks_that_break_at_once_are_each_given_up_once() -> None:
             raise OSError(28, "No space left on device")
 
     logs = [Full(), Full()]
-    with Announcer([*logs, heard.append], VirtualClock()) as emit:
-        emit("state", {"message": "a"})
-        emit("state", {"message": "b"})
+    with Announcer([*logs, heard.append], VirtualClock()) as sink:
+        sink(StateEntered("idle", "a"))
+        sink(StateEntered("idle", "b"))
     assert [log.calls for log in logs] == [1, 1]
     assert [e.data["message"] for e in heard if e.event == "state"] == ["a", "b"]
     assert sum("gets no further events" in e.data["message"] for e in heard) == 2

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +10,8 @@ from numpy.typing import NDArray
 
 from beamline.config.models import Config
 from beamline.core.errors import ConfigError, DataError, ScanStopped
-from beamline.core.events import Announcer
+from beamline.core.events import BlockStarted, Event
+from beamline.core.sinks import Announcer
 from beamline.core.stop import StopRequest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
@@ -72,11 +71,11 @@ def test_no_anomaly_is_said_too_and_a_stopped_scan_has_labels_of_its_frames(
     assert _labels(run_scan(_config(BALL), tmp_path / "none").path.parent) == {}
     stop, announce = StopRequest(), Announcer.__call__
 
-    def stop_at_the_views(self: Announcer, event: str, data: Mapping[str, Any]) -> None:
+    def stop_at_the_views(self: Announcer, event: Event) -> None:
         # In the scan's own thread: a sink runs in another, and a scan on a virtual clock may be over before it stops.
-        if event == "block_started" and data["kind"] == "projection":
+        if isinstance(event, BlockStarted) and event.kind == "projection":
             stop.stop("enough")
-        announce(self, event, data)
+        announce(self, event)
 
     monkeypatch.setattr(Announcer, "__call__", stop_at_the_views)
     with pytest.raises(ScanStopped):

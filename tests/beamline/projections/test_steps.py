@@ -11,7 +11,7 @@ from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.phase import Phase
 from beamline.projections.steps.registry import all_steps, key_of, recorded, registered, steps_of
 from beamline.projections.steps.rings import Rings
-from beamline.projections.steps.step import Done, options_of
+from beamline.projections.steps.step import StepDone, options_of
 
 
 def test_each_comes_after_those_that_it_follows_and_no_two_share_a_name() -> None:
@@ -41,7 +41,7 @@ def test_a_selection_takes_one_step_of_a_kind() -> None:
 
 def test_the_file_records_what_a_step_says_or_its_options() -> None:
     steps = [Flags("ignore"), CountModel("counts", 2.0), Rings("vo")]
-    done = {"rings": Done("none seen", {"rings_removed": "none seen"}), "noise": Done("counted")}
+    done = {"rings": StepDone("none seen", {"rings_removed": "none seen"}), "noise": StepDone("counted")}
     expected = {
         "flags": "ignore",
         "noise": "counts",

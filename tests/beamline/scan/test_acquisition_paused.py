@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import ScanStopped
+from beamline.core.events import Event
 from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.states import State, StateMachine
@@ -50,9 +51,9 @@ class Paused:
         self.at_rest: list[bool] = []
         self.machine = StateMachine(self._told, State.PREPARING)
 
-    def _told(self, event: str, data: Mapping[str, Any]) -> None:
-        self.states.append(data["state"])
-        if data["state"] is State.PAUSED:
+    def _told(self, event: Event) -> None:
+        self.states.append(event.data["state"])
+        if event.data["state"] is State.PAUSED:
             self.at_rest.append(not self.instrument.is_open and not self.instrument.stage.moving())
             self.pause.resume()
             self.pause.beam_back()

@@ -52,7 +52,7 @@ def test_readings_are_told_and_an_outage_is_told_once(monkeypatch: pytest.Monkey
     monkeypatch.setattr(beam_log, "LAST_WAIT", 0.01)
     monitor = Scripted(1.5, SILENT, SILENT, SILENT, 2.5, ZeroDivisionError("a defect"), 3.5)
     told: list[tuple[str, Mapping[str, Any]]] = []
-    with BeamLog(monitor, 0.0, lambda event, data: told.append((event, data))) as log:
+    with BeamLog(monitor, 0.0, lambda event: told.append((event.event, event.data))) as log:
         assert monitor.over.wait(30)
     monitor.let_go.set()  # a reading that ends after the scan is nobody's
     log._thread.join(30)
@@ -68,7 +68,7 @@ def test_readings_are_told_and_an_outage_is_told_once(monkeypatch: pytest.Monkey
 
 def test_no_monitor_is_no_thread() -> None:
     before = threading.active_count()
-    with BeamLog(None, 1.0, lambda event, data: pytest.fail(event)) as log:
+    with BeamLog(None, 1.0, lambda event: pytest.fail(event.event)) as log:
         assert threading.active_count() == before
     assert log.readings == ()
 

@@ -143,7 +143,7 @@ def test_nobody_else_may_put_a_folder_in_the_place_of_ours(tmp_path: Path, umask
 @pytest.mark.parametrize("how", ["another folder", "a link", "a mode"])
 def test_a_folder_that_others_can_write_to_tells_a_scan_nothing(tmp_path: Path, how: str) -> None:
     stop, told, place = StopRequest(), list[str](), tmp_path / "control"
-    with verbs_taken(tmp_path, stop, PauseRequest(), lambda event, data: told.append(data["message"])):
+    with verbs_taken(tmp_path, stop, PauseRequest(), lambda event: told.append(event.data["message"])):
         if how == "a mode":
             place.chmod(0o777)
         else:

@@ -63,7 +63,7 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     assert words[words.index("--follow") :][:5] == ["--follow", "--earlier", "a.h5", "--earlier", "b.h5"]
 
 
-READY = """print('{"event": "state", "state": "ready"}', flush=True)\n"""
+READY = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""
 
 
 def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
@@ -73,7 +73,8 @@ def script(code: str) -> Callable[[Path, Path], Sequence[str]]:
 def test_live_reconstruction_tells_its_story_among_ours(tmp_path: Path) -> None:
     code = """
 import json, pathlib, sys
-print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "n_views": 5}))
+print(json.dumps({"event": "snapshot", "time": 1.0, "path": "v", "picture": "p", "n_views": 5,
+                  "seconds": 1.0, "unlearnt": None}))
 print("a library's chatter")
 pathlib.Path(sys.argv[2]).write_text("volume")
 print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2], "axis_col": 80.5}))
@@ -306,7 +307,7 @@ print(json.dumps({"event": "enough", "n_views": 90, "planned": 180, "mean": 0.1,
 """
     reasons: list[str] = []
     command = script(said)(tmp_path / "scan.h5", tmp_path / "recon.h5")
-    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event, data: None, reasons.append)
+    process = LiveReconstruction(command, tmp_path / "recon.log", lambda event: None, reasons.append)
     process.finish(stop=lambda: False, hurry=lambda: False)
     assert reasons == ["90 of 180 views are enough, the others would add 0.10 dB (0.00 to 0.20)"]
     words = follow_command(small("recon.live=true", "recon.stop_when={psnr_loss: 0.5}"))(tmp_path, tmp_path)
@@ -361,4 +362,4 @@ class _Live:
     def __init__(self, folder: Path, code: str) -> None:
         self.said: list[str] = []
         command = script(code)(folder / "scan.h5", folder / "recon.h5")
-        self.process = LiveReconstruction(command, folder / "recon.log", lambda event, data: self.said.append(event))
+        self.process = LiveReconstruction(command, folder / "recon.log", lambda event: self.said.append(event.event))

@@ -53,7 +53,7 @@ def record(writer: Writer) -> Recorder:
         start(ScanContext(65535, 4)),
         TIMELINE,
         preview_bin=2,
-        emit=lambda event, data: None,
+        sink=lambda event: None,
     )
 
 

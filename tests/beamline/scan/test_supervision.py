@@ -85,7 +85,10 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
     stop, pause = StopRequest(), PauseRequest()
     events: list[tuple[str, Mapping[str, Any]]] = []
     react = AlarmReaction(
-        AlarmPolicy(act_after=3, policies={"beam": policy}), stop, pause, lambda kind, data: events.append((kind, data))
+        AlarmPolicy(act_after=3, policies={"beam": policy}),
+        stop,
+        pause,
+        lambda event: events.append((event.event, event.data)),
     )
     held = 0
     for level in frames:

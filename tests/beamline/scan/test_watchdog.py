@@ -40,7 +40,7 @@ if len(sys.argv) > 2:
     watchdog.COMMAND = (sys.executable, "-c", sys.argv[2])
 folder, by_hand = Path(sys.argv[1]), []
 config = load(folder / "config.resolved.yaml", environment={})
-with watched(folder, lambda event, data: None), stage_alone(config) as stage:
+with watched(folder, lambda event: None), stage_alone(config) as stage:
     shutter_of(config, stage, SystemClock(), by_hand.append).open()
     stage.start_move(3.0, 0.05)
     print("it turns", flush=True)
@@ -97,7 +97,7 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(tmp_path: Pa
         assert line.angle_at(clock.now()) == stood < 2.9  # it was on its way to 3
         log.unlink()
         told: list[str] = []
-        with watched(tmp_path, lambda event, data: told.append(event)):
+        with watched(tmp_path, lambda event: told.append(event.event)):
             pass
         assert told == [] and not log.exists()
 
@@ -167,7 +167,7 @@ def children_with(word: str) -> list[psutil.Process]:
 def test_requests_to_end_do_not_end_the_watchdog_of_a_scan_that_lives(tmp_path: Path) -> None:
     (tmp_path / CONFIG).write_text(resolved_yaml(load(config_folder() / "instrument.yaml", (), {})))
     told: list[str] = []
-    with watched(tmp_path, lambda event, data: told.append(data["message"])):
+    with watched(tmp_path, lambda event: told.append(event.data["message"])):
         (process,) = children_with("beamline.scan.watchdog")
         for request in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
             process.send_signal(request)
@@ -183,7 +183,7 @@ def test_a_watchdog_that_died_is_told_and_replaced_or_the_scan_pauses(
     monkeypatch.setattr(watchdog, "BEAT", 0.01)
     monkeypatch.setattr(watchdog, "COMMAND", (sys.executable, "-c", "print('ready')"))  # it ends at once
     told, stop, pause = list[str](), StopRequest(), PauseRequest()
-    with watched(tmp_path, lambda event, data: told.append(data["message"]), stop, pause if paused else None):
+    with watched(tmp_path, lambda event: told.append(event.data["message"]), stop, pause if paused else None):
         deadline = time.monotonic() + 60
         while not any("ended, too" in text for text in told) and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -197,7 +197,7 @@ def test_a_scan_that_was_taken_for_dead_ends_and_says_so(tmp_path: Path, monkeyp
         watchdog, "COMMAND", (sys.executable, "-c", f"print('ready'); raise SystemExit({watchdog.ACTED})")
     )
     told, stop = list[str](), StopRequest()
-    with watched(tmp_path, lambda event, data: told.append(data["message"]), stop):
+    with watched(tmp_path, lambda event: told.append(event.data["message"]), stop):
         deadline = time.monotonic() + 60
         while not stop.aborting and time.monotonic() < deadline:
             time.sleep(0.01)

@@ -14,7 +14,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error, Property
-from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixels, TriggerActive, TriggerMode, TriggerPolarity
+from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 from tests.drivers.dcam.fake import World
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
@@ -45,8 +45,8 @@ def connected(world: World, **options: Any) -> Iterator[DcamCamera]:
         ({"global_exposure": GlobalExposure.GLOBAL_RESET}, Property.TRIGGER_GLOBALEXPOSURE, 5),
         ({"trigger_times": 3}, Property.TRIGGERTIMES, 3),
         ({"trigger_delay": 0.25}, Property.TRIGGERDELAY, 0.25),
-        ({"hot_pixels": HotPixels.AGGRESSIVE}, Property.HOTPIXELCORRECT_LEVEL, 3),
-        ({"hot_pixels": HotPixels.MINIMUM}, Property.DEFECTCORRECT_MODE, 2),
+        ({"hot_pixels": HotPixelMode.AGGRESSIVE}, Property.HOTPIXELCORRECT_LEVEL, 3),
+        ({"hot_pixels": HotPixelMode.MINIMUM}, Property.DEFECTCORRECT_MODE, 2),
     ],
 )
 def test_an_option_reaches_the_camera_and_one_that_it_ignores_is_noticed(
@@ -193,7 +193,7 @@ def test_photon_number_resolving_is_a_readout(world: World) -> None:
 
 
 def test_repairs_are_refused_where_photons_are_counted(world: World) -> None:
-    with connected(world, hot_pixels=HotPixels.STANDARD) as camera:
+    with connected(world, hot_pixels=HotPixelMode.STANDARD) as camera:
         assert camera.describe()["hot_pixels"] == "standard"
         with pytest.raises(DeviceRefused, match="DEFECTCORRECT_MODE"):
             camera.configure(replace(EXTERNAL, readout="photon_number"))

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from recon.assess.plans import CURVES, PRESETS, Choice, Curve, Speeds, best_steps, plans
+from recon.assess.plans import CURVES, PRESETS, Choice, QualityCurve, Speeds, best_steps, plans
 from recon.methods import build, by_name
 
 SPEEDS = st.builds(
@@ -98,5 +98,5 @@ def test_the_curves_are_curves() -> None:
         assert all(a[0] < b[0] for a, b in pairwise(curve.points))
         assert curve.gain(curve.points[0][0] / 2) == -math.inf
         assert curve.gain(1e9) == curve.points[-1][1]
-    assert Curve("r2", "steps", 1, 1.0, 1.0, 0.0, ((100, 1.0), (400, 3.0))).gain(200) == pytest.approx(2.0)
+    assert QualityCurve("r2", "steps", 1, 1.0, 1.0, 0.0, ((100, 1.0), (400, 3.0))).gain(200) == pytest.approx(2.0)
     assert PRESETS["preview"].steps < PRESETS["standard"].steps < PRESETS["best"].steps

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.motion import TrapezoidMove
-from simulators.devices.motor import Ended, PulseMotor, TriggerOutput, TriggerSettings
+from simulators.devices.motor import Ended, MotorOutput, PulseMotor, TriggerSettings
 from simulators.devices.trigger_line import TriggerLine
 
 
@@ -25,7 +25,7 @@ def test_working_out_the_edges_again_gives_the_rest_of_the_same_edges(
     """Also with pulses so wide that they run together: what was high stays high."""
     move = TrapezoidMove.between(0, 20_000, 10_000, 10_000, begin=0.0)
     settings = TriggerSettings(width=width, start=7, end=900, interval=interval)
-    once, again = TriggerOutput(frozenset({3})), TriggerOutput(frozenset({3}))
+    once, again = MotorOutput(frozenset({3})), MotorOutput(frozenset({3}))
     for output in (once, again):
         output.settings = settings
         output.arm()
@@ -38,7 +38,7 @@ def test_working_out_the_edges_again_gives_the_rest_of_the_same_edges(
 def test_an_edge_that_rounding_puts_into_the_past_still_comes() -> None:
     """The point is ahead of the axis and has not fired: it fires now, after the present instant, not before it."""
     now = 1.8e9
-    output = TriggerOutput(frozenset())
+    output = MotorOutput(frozenset())
     output.settings = TriggerSettings(start=100, end=100, interval=1)
     output.arm()
     move = TrapezoidMove.between(0, 100, 1e6, 1e12, begin=now - 100 / 1e6)

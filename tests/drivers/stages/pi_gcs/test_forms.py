@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.pi_gcs.errors import EVENTS, REFUSALS, advice, meaning
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, is_rounding_of, plain
-from drivers.stages.pi_gcs.train import FirstPulse, is_spent_by, window_of
+from drivers.stages.pi_gcs.train import PiFirstPulse, is_spent_by, window_of
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 # bytes
@@ -112,19 +112,18 @@ TRAINS = st.builds(
 )  # fmt: skip
 
 
-@given(TRAINS, st.sampled_from(list(FirstPulse)))
-def test_a_window_begins_before_and_ends_half_a_step_behind_its_train(train: TriggerTrain, rule: FirstPulse) -> None:
+@given(TRAINS, st.sampled_from(list(PiFirstPulse)))
+def test_a_window_begins_before_and_ends_half_a_step_behind_its_train(train: TriggerTrain, rule: PiFirstPulse) -> None:
     sign = 1 if train.interval > 0 else -1
-    if rule is FirstPulse.GRID:
+    if rule is PiFirstPulse.GRID:
         train = TriggerTrain(train.start * train.interval, train.interval, train.n)
     window = window_of(train, rule)
     assert (window.step == abs(train.interval)) or (train.n == 1 and window.step == 2)
     behind = sign * (window.stop - train.end)
     assert behind == window.step / 2
     before = sign * (train.start - window.start)
-    assert before == {FirstPulse.AT_THRESHOLD: 0, FirstPulse.STEP_AFTER: 1, FirstPulse.GRID: Fraction(1, 2)}[rule] * (
-        window.step
-    )
+    shares = {PiFirstPulse.AT_THRESHOLD: 0, PiFirstPulse.STEP_AFTER: 1, PiFirstPulse.GRID: Fraction(1, 2)}
+    assert before == shares[rule] * window.step
     assert window.start != window.stop
 
 

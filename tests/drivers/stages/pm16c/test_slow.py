@@ -6,7 +6,7 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.pm16c.train import FirstPulse
+from drivers.stages.pm16c.train import Pm16cFirstPulse
 from tests.drivers.pm16c_rig import Rig
 
 
@@ -15,7 +15,7 @@ from tests.drivers.pm16c_rig import Rig
 def test_a_train_is_right_whether_the_start_point_fires_or_not_as_long_as_that_is_known(
     sign: int, fires_at_start: bool
 ) -> None:
-    known = FirstPulse.AT_START if fires_at_start else FirstPulse.INTERVAL_AFTER
+    known = Pm16cFirstPulse.AT_START if fires_at_start else Pm16cFirstPulse.INTERVAL_AFTER
     bench = Rig(fires_at_start=fires_at_start).bench(low=-2.0, high=2.0, first_pulse=known)
     for first, interval, n in ((500, 100, 12), (2000, 7, 3), (3000, 4, 1), (3100, 1, 9)):
         before = len(bench.pulses())

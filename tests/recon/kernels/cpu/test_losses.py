@@ -7,7 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from recon.kernels.cpu.losses import L2, POISSON, DataTerm, ProjectionLoss, total_variation
+from recon.kernels.cpu.losses import L2, POISSON, CpuProjectionLoss, DataTerm, total_variation
 from recon.kernels.reference import data_term, projection_loss, ssim
 from recon.kernels.reference import total_variation as reference_total_variation
 
@@ -20,7 +20,7 @@ def _images(rng: np.random.Generator, shape: tuple[int, int] = (27, 33)) -> tupl
 @pytest.mark.parametrize("shape", [(27, 33), (40, 48), (9, 16), (30, 5), (1, 40), (3, 1), (17, 31)])
 def test_projection_loss_and_gradient_equal_the_reference(rng: np.random.Generator, shape: tuple[int, int]) -> None:
     image, target = _images(rng, shape)
-    loss = ProjectionLoss(image.shape, 0.25)
+    loss = CpuProjectionLoss(image.shape, 0.25)
     gradient = np.empty_like(image)
     value = loss(image, target, loss.target_maps(target), gradient)
     x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
@@ -41,7 +41,7 @@ def test_weighted_loss_and_gradient_equal_the_reference(rng: np.random.Generator
     weights = (rng.random(shape) * (rng.random(shape) > 0.3)).astype(np.float32)
     weights[: shape[0] // 3] = 0  # whole rows, more than a window can look across where there are so many
     weights[:, -1] = 0.5
-    loss, gradient = ProjectionLoss(image.shape, 0.25), np.empty_like(image)
+    loss, gradient = CpuProjectionLoss(image.shape, 0.25), np.empty_like(image)
     value = loss(image, target, loss.target_maps(target, weights), gradient, weights)
     x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
     # The reference cannot see what is masked, not even a NaN.
@@ -65,7 +65,7 @@ def test_squares_and_the_poisson_likelihood_equal_the_reference(
 ) -> None:
     image, target = _images(rng)
     weights = (rng.random(image.shape) * (rng.random(image.shape) > 0.3)).astype(np.float32) if weighted else None
-    loss, gradient = ProjectionLoss(image.shape, 0.25, term=term), np.empty_like(image)
+    loss, gradient = CpuProjectionLoss(image.shape, 0.25, term=term), np.empty_like(image)
     value = loss(image, target, loss.target_maps(target, weights), gradient, weights)
     x = torch.from_numpy(image.astype(np.float64)).requires_grad_()
     w = None if weights is None else torch.from_numpy(weights.astype(np.float64))
@@ -79,7 +79,7 @@ def test_squares_and_the_poisson_likelihood_equal_the_reference(
 def test_no_transmission_is_above_one(rng: np.random.Generator) -> None:
     image, target = _images(rng)
     target[3:9] -= np.float32(3)  # line integrals below zero: noise, or a flat field that has changed
-    likely, squares = (ProjectionLoss(image.shape, 0.0, term=DataTerm(kind, 0.02, 4.0)) for kind in (POISSON, L2))
+    likely, squares = (CpuProjectionLoss(image.shape, 0.0, term=DataTerm(kind, 0.02, 4.0)) for kind in (POISSON, L2))
     maps, gradient, expected = likely.target_maps(target), np.empty_like(image), np.empty_like(image)
     value = likely(image, target, maps, gradient)
     squares(image, target, maps, expected)
@@ -103,7 +103,7 @@ def test_the_poisson_term_is_the_likelihood_of_counts_near_its_minimum() -> None
 
 def test_weights_of_one_change_nothing_and_of_none_leave_nothing(rng: np.random.Generator) -> None:
     image, target = _images(rng)
-    loss, plain, weighted = ProjectionLoss(image.shape, 0.25), np.empty_like(image), np.empty_like(image)
+    loss, plain, weighted = CpuProjectionLoss(image.shape, 0.25), np.empty_like(image), np.empty_like(image)
     value = loss(image, target, loss.target_maps(target), plain)
     ones, none = np.ones_like(image), np.zeros_like(image)
     assert loss(image, target, loss.target_maps(target, ones), weighted, ones) == pytest.approx(value, rel=1e-6)
@@ -127,7 +127,7 @@ def test_images_far_brighter_than_they_should_be_do_not_break_the_loss(rng: np.r
     target = np.full((40, 48), size, np.float32)
     image = (target + 0.05 * rng.normal(size=target.shape)).astype(np.float32)
     naive = np.float32(np.mean(image * image)) - np.float32(np.mean(image)) ** 2
-    loss, gradient = ProjectionLoss(image.shape, 0.25), np.empty_like(image)
+    loss, gradient = CpuProjectionLoss(image.shape, 0.25), np.empty_like(image)
     value = loss(image, target, loss.target_maps(target), gradient)
     absolute = float(np.abs(image.astype(np.float64) - target).mean())
     assert absolute <= value <= absolute + 0.25 * 2.001  # SSIM lies in -1..1
@@ -162,7 +162,7 @@ def test_ssim_equals_scikit_image_in_the_interior(rng: np.random.Generator) -> N
 
 def test_equal_images_cost_nothing(rng: np.random.Generator) -> None:
     image = rng.random((20, 24)).astype(np.float32)
-    loss = ProjectionLoss(image.shape, 0.25)
+    loss = CpuProjectionLoss(image.shape, 0.25)
     gradient = np.empty_like(image)
     assert loss(image, image, loss.target_maps(image), gradient) == pytest.approx(0, abs=1e-6)
     assert np.abs(gradient).max() < 1e-5

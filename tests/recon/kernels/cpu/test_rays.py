@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.base.geometry import Geometry
 from recon.kernels import reference
 from recon.kernels.cpu.engine import Active, Gradients, camera
-from recon.kernels.cpu.rays import Rays
+from recon.kernels.cpu.rays import CpuRays
 
 F32 = NDArray[np.float32]
 
@@ -37,9 +37,9 @@ def raw(rng: np.random.Generator, n: int = 25, extent: float = 10.0, largest: fl
     return tuple(a.astype(np.float32) for a in arrays)
 
 
-def rays_of(active: Active, geometry: Geometry, faint: float = 1e-12, cut: float = 8.0) -> Rays:
+def rays_of(active: Active, geometry: Geometry, faint: float = 1e-12, cut: float = 8.0) -> CpuRays:
     parameters = (active.means, active.scales, active.rotations, active.densities)
-    return Rays(*parameters, camera(geometry, 0), geometry.detector_shape, faint, cut)
+    return CpuRays(*parameters, camera(geometry, 0), geometry.detector_shape, faint, cut)
 
 
 def exact_view(leaves: Sequence[torch.Tensor], geometry: Geometry) -> torch.Tensor:
@@ -53,7 +53,7 @@ def as_leaves(parameters: tuple[F32, ...]) -> list[torch.Tensor]:
     return [torch.from_numpy(a.astype(np.float64)).requires_grad_() for a in parameters]
 
 
-def backward(rays: Rays, weights: F32) -> tuple[Gradients, F32]:
+def backward(rays: CpuRays, weights: F32) -> tuple[Gradients, F32]:
     n = rays.table.shape[0]
     into, centres = Gradients.zeros(n), np.empty((n, 2), np.float32)
     rays.backward(weights, into.means, into.log_scales, into.rotations, into.densities, centres)

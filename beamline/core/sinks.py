@@ -1,0 +1,103 @@
+"""Sinks of events: JSON lines, several sinks as one, warnings, and a thread that passes events on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from queue import SimpleQueue
+from types import TracebackType
+from typing import Self, TextIO
+
+from beamline.core.events import Event, Sink, Warned
+from drivers.base.clock import Clock
+
+
+class JsonLines:
+    """A sink that writes one JSON line per event and flushes it, so that a crash loses no earlier event."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __call__(self, event: Event) -> None:
+        self._stream.write(event.to_json() + "\n")
+        self._stream.flush()
+
+
+def fan_out(*sinks: Sink) -> Sink:
+    """A sink that passes each event to all of `sinks`, in order."""
+
+    def send(event: Event) -> None:
+        for sink in sinks:
+            sink(event)
+
+    return send
+
+
+def while_it_works(sink: Sink, others: Sink) -> Sink:
+    """A sink that gets events until it raises (a full disk, a closed pipe); `others` then gets a warning, once."""
+    works = True
+
+    def send(event: Event) -> None:
+        nonlocal works
+        if not works:
+            return
+        try:
+            sink(event)
+        except Exception as error:
+            works = False
+            others(Warned(f"An output of events failed and gets no further events: {error}", time=event.time))
+
+    return send
+
+
+class Warnings:
+    """Sends each warning on as an event, once, and keeps it in `messages` for the report."""
+
+    def __init__(self, sink: Sink, clock: Clock) -> None:
+        self._sink, self._clock = sink, clock
+        self.messages: list[str] = []
+
+    def __call__(self, text: str) -> None:
+        if text not in self.messages:
+            self.messages.append(text)
+            self._sink(Warned(text, time=self._clock.now()))
+
+
+_PATIENCE = 10.0  # s
+
+
+class Announcer:
+    """Passes events to sinks in a thread of its own. Leaving the context waits until all events have been passed on.
+
+    It waits for `_PATIENCE` s at most: a terminal or pipe that nobody reads takes no event, and must not keep the
+    program from ending. A sink that raises (a closed pipe, a full disk) gets no further events; the others get a
+    warning.
+    """
+
+    def __init__(self, sinks: Sequence[Sink], clock: Clock) -> None:
+        self._sinks, self._clock = [while_it_works(sink, self._send) for sink in sinks], clock
+        self._queue: SimpleQueue[Event | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._deliver, name="announcer", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._queue.put(None)
+        self._thread.join(_PATIENCE)
+
+    def __call__(self, event: Event) -> None:
+        """Queue the event with the current time; returns at once."""
+        self._queue.put(replace(event, time=self._clock.now()))
+
+    def _deliver(self) -> None:
+        while (event := self._queue.get()) is not None:
+            self._send(event)
+
+    def _send(self, event: Event) -> None:
+        for sink in self._sinks:
+            sink(event)
