@@ -181,8 +181,10 @@ def _add_ellipsoid(part: Reals, rays: ChordRays, matrix: Reals, attenuation: flo
 
 @njit(**_KERNEL)
 def _add_polyhedron(part: Reals, rays: ChordRays, faces: Reals, attenuation: float, enter: Reals, leave: Reals) -> None:
-    """Behind all faces at which a ray enters and before those at which it leaves (Cyrus & Beck, Computers & Graphics
-    3, 23, 1978); face by face, for the processor's vector lanes."""
+    """A ray is inside behind all faces where it enters, and before all where it leaves.
+
+    Cyrus & Beck 1978, Computers & Graphics 3, 23. Face by face, for the processor's vector lanes.
+    """
     enter[:], leave[:] = -np.inf, np.inf
     least = EDGE_ON * rays.scale
     for f in range(faces.shape[0]):
