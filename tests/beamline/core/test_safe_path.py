@@ -47,7 +47,7 @@ def said(command: Sequence[str], folder: Path, environment: dict[str, str] | Non
 def test_the_watchdog_starts(tmp_path: Path, executed: Callable[[], list[str]]) -> None:
     (tmp_path / CONFIG).write_text(resolved_yaml(load(config_folder() / "instrument.yaml", (), {})))
     told: list[str] = []
-    with watched(tmp_path, lambda event, data: told.append(event)):
+    with watched(tmp_path, lambda event: told.append(event.event)):
         pass
     assert (told, executed()) == ([], [])
 

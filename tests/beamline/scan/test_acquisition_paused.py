@@ -226,7 +226,7 @@ def slow_disk(guarded: bool) -> tuple[SlowDisk, Run, Paused]:
     guard = BacklogGuard(8, paused.pause, Workload())
     disk = SlowDisk(paused, 0.5, 8, guard if guarded else lambda waiting: None)
     paused.instrument.on_frame = lambda number: disk.put()
-    machine = StateMachine(lambda event, data: paused.states.append(data["state"]), State.PREPARING)
+    machine = StateMachine(lambda event: paused.states.append(event.data["state"]), State.PREPARING)
     timeline = paused.instrument.timeline(30, Mode.FLY, at=Place.BOTH)
     run = Run(
         paused.instrument, timeline, None, Supervision(pause=paused.pause, wait_in_pause=disk.rest, states=machine)
@@ -294,7 +294,7 @@ def test_a_shutter_moved_by_hand_stays_as_it_is_in_a_pause_for_the_disk(
 
     paused.instrument.on_frame = at_frame
     paused.instrument.devices = replace(paused.instrument.devices, shutter=ManualShutter(put))
-    machine = paused.machine = StateMachine(lambda event, data: paused.states.append(data["state"]), State.PREPARING)
+    machine = paused.machine = StateMachine(lambda event: paused.states.append(event.data["state"]), State.PREPARING)
     supervision = Supervision(pause=paused.pause, wait_in_pause=wait, states=machine)
     run = Run(paused.instrument, paused.instrument.timeline(12, Mode.FLY, 1, Place.START, 30), None, supervision)
     assert run.error is None and paused.states.count(State.PAUSED) == 1

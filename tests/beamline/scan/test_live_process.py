@@ -239,7 +239,7 @@ def deliver(*_):
     print(json.dumps({"event": "done", "time": 2.0, "output": sys.argv[2]}), flush=True)
     sys.exit(4)
 signal.signal(signal.SIGTERM, deliver)
-print(json.dumps({"event": "progress", "time": 1.0}), flush=True)
+print(json.dumps({"event": "progress", "time": 1.0, "stage": "kernels", "n": 1, "seconds": 1.0}), flush=True)
 time.sleep(100)
 """
 

@@ -100,7 +100,7 @@ def test_the_demo_is_tuned_with_its_own_camera() -> None:
     config = load(config_folder() / "demo.yaml", words, {})
     with connect(config) as instrument:
         home = instrument.devices.stage.position()
-        found = tune(config, instrument, StopRequest(), lambda event, data: None, angle=0.7)
+        found = tune(config, instrument, StopRequest(), lambda event: None, angle=0.7)
         assert instrument.devices.stage.position() == home
         assert not instrument.devices.shutter.is_open()
         assert found.angle == pytest.approx(0.7, abs=1e-4)
@@ -108,7 +108,7 @@ def test_the_demo_is_tuned_with_its_own_camera() -> None:
         assert found.dark == pytest.approx(OFFSET["standard"], abs=2)
         assert found.saturated > 0.9 and found.exposure == pytest.approx(0.095 / 8, rel=0.01)
         again = load(config_folder() / "demo.yaml", [*words, f"scan.exposure_s={found.advised}"], {})
-        better = tune(again, instrument, StopRequest(), lambda event, data: None, angle=0.7)
+        better = tune(again, instrument, StopRequest(), lambda event: None, angle=0.7)
     assert (better.saturated, better.faults) == (0.0, ())
     assert better.brightest == pytest.approx(TARGET * 65535, rel=0.02)
     assert better.advised == pytest.approx(found.advised, rel=0.03)
@@ -117,5 +117,5 @@ def test_the_demo_is_tuned_with_its_own_camera() -> None:
 def test_lost_frames_are_the_cameras_fault_and_the_instrument_is_safe() -> None:
     instrument = FakeInstrument(Faults(lost={1}))
     with pytest.raises(InstrumentError, match="camera: frames are missing"):
-        tune(small(), instrument.connected(), StopRequest(), lambda event, data: None)
+        tune(small(), instrument.connected(), StopRequest(), lambda event: None)
     assert_safe(instrument)
