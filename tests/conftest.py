@@ -40,11 +40,15 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """The tests of a file go to one worker, which alone makes its fixtures and compiles its kernels."""
+    """The tests of a file go to one worker, which alone makes its fixtures and compiles its kernels.
+
+    Not the slow ones: few files have most of their time.
+    """
     from xdist.scheduler import LoadFileScheduling
 
     config.option.loadscopereorder = False  # by the number of tests, which says nothing of their time
-    return LoadFileScheduling(config, log) if config.option.dist == "load" else None
+    by_file = config.option.dist == "load" and "not slow" in config.option.markexpr
+    return LoadFileScheduling(config, log) if by_file else None
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
