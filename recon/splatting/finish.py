@@ -127,8 +127,7 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, without roll and tilt, and the weights of their rays.
-        sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and
-            `bregman_weight`.
+        sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and `bregman_weight`.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. A stop between the
             two attempts keeps the first if it explains the views better than the fit, and the fit otherwise. Only views

@@ -98,8 +98,8 @@ def choose_weight(
 def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, that views held out prefer, from `first` on.
 
-    Volumes of 16 rows are reconstructed from seven of eight views with the weight, twice or half of it, and so on to
-    the better side. They end when the root mean square of what they leave of the other views rises. The vertex of the
+    Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, with the weight, and on to the
+    better side. They end when the root mean square of what they leave of the other views rises. The vertex of the
     parabola through the last three is taken. A volume that is too smooth misses edges of unseen views. One that follows
     the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their number.
     Trials begin from FBP: a fit knows the views held out, and any weight takes it away from them.
