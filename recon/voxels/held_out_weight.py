@@ -24,7 +24,7 @@ LEAST_VIEWS = 2 * ONE_IN
 _ROWS = 16  # of the slab that trials see
 _SWEEPS, _SUBSETS, _TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
 _AT_ONCE = 8  # sweeps of a round, or of a run of two
-_HALVINGS, _DOUBLINGS = 5, 7  # of the first weight, at most
+_OCTAVES = 5  # from the first weight, at most: OS-SIRT-TV makes a checkerboard at 128 times
 _ROUNDS = 3  # of sweeps, at most
 _BREGMAN_TRIALS = 3
 MOST_SWEEPS = _ROUNDS * _AT_ONCE
@@ -114,7 +114,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     errors = {octave: error(first * 2.0**octave) for octave in (1, 0)}
     towards = 1 if errors[1] < errors[0] else -1
     best = max(towards, 0)
-    while -_HALVINGS <= best + towards <= _DOUBLINGS:
+    while abs(best + towards) <= _OCTAVES:
         errors[best + towards] = error(first * 2.0 ** (best + towards))
         if errors[best + towards] >= errors[best]:
             break
