@@ -22,7 +22,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
-from recon.voxels.held_out_weight import bregman_weight, choose_weight, preferred_sweeps, sweeps_by_noise
+from recon.voxels.held_out_weight import bregman_weight, choose_weight, preferred_sweeps
 from recon.voxels.iterative import solve
 from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
 from recon.voxels.ordered_fista import bregman, ordered_fista
@@ -76,13 +76,9 @@ class _FromModel:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled)
-        ask, least = self.by_content and not self.watch.ended, self.iterations
-        if ask and self.unmodelled is None and isinstance(weight, NoiseBalance):
-            first = weight.first
-            self.iterations = problem.decide("sweeps", lambda: sweeps_by_noise(problem, x, first, least))
-        elif ask and not isinstance(weight, NoiseBalance):
+        if self.by_content and not (self.watch.ended or isinstance(weight, NoiseBalance)):
             mu = weight
-            self.iterations = problem.decide("sweeps", lambda: preferred_sweeps(problem, x, mu, least))
+            self.iterations = problem.decide("sweeps", lambda: preferred_sweeps(problem, x, mu, SWEEPS))
             once = self.iterations > SWEEPS or self.watch.ended
             heavy = None if once else problem.decide("heavy", lambda: bregman_weight(problem, mu))
             if heavy is not None:
@@ -131,8 +127,7 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, without roll and tilt, and the weights of their rays.
-        sweeps: 1 or more; None: 8, or as views held out prefer, see `sweeps_by_noise`, `preferred_sweeps`
-            and `bregman_weight`.
+        sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and `bregman_weight`.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. A stop between the
             two attempts keeps the first if it explains the views better than the fit, and the fit otherwise. Only views

@@ -1,11 +1,9 @@
-"""The weight of total variation that views held out prefer, where the one by the noise hides detail."""
+"""The weight of total variation, and the sweeps with it, that views held out prefer."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,20 +22,19 @@ ONE_IN = 8  # views held out
 LEAST_VIEWS = 2 * ONE_IN
 
 _ROWS = 16  # of the slab that trials see
-_SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3  # of a trial
-_HALVINGS = 5  # at most
+_SWEEPS, _SUBSETS, _TV_STEPS = 16, 9, 3  # of a trial: after 8 the best weight is twice as heavy as after 20
+_AT_ONCE = 8  # sweeps of a round, or of a run of two
+_OCTAVES = 5  # from the first weight, at most: OS-SIRT-TV makes a checkerboard at 128 times
 _ROUNDS = 3  # of sweeps, at most
-_BREGMAN_RUNS = 5  # one once, and two twice
-MOST_SWEEPS = _ROUNDS * _SWEEPS
+_BREGMAN_TRIALS = 3
+MOST_SWEEPS = _ROUNDS * _AT_ONCE
 """Sweeps of a finish, where views held out prefer them."""
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
-_LEVEL = 0.002  # residuals of views held out that differ by less are equal
 
 # Weights of the two runs of `bregman`, in that of one run. Then by how much the residual of views held out has to fall;
 # less is chance (docs/notes/exploration.md).
 _HEAVY, _LESS_HEAVY = 3.0, 2.5
 _GAIN, _FURTHER_GAIN = 0.003, 0.001
-_MATTER = 0.1  # of the largest line integrals
 
 
 def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geometry, Grid]:
@@ -67,17 +64,17 @@ def busiest_rows(data: F32, height: int) -> slice:
 
 
 def choice_sweeps(geometry: Geometry) -> float:
-    """What `choose_weight` costs, in sweeps over all rows: three trials, seldom more; 0 where nothing is held out."""
+    """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
     if not _can_hold_out(geometry):
         return 0.0
-    return 3 * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return 4 * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
 
 
 def sweeps_choice_cost(geometry: Geometry) -> float:
-    """What `preferred_sweeps`, `sweeps_by_noise` and `bregman_weight` cost at most, in sweeps over all rows."""
+    """What `preferred_sweeps` and `bregman_weight` cost at most, in sweeps over all rows."""
     if not _can_hold_out(geometry):
         return 0.0
-    return (_ROUNDS + _BREGMAN_RUNS) * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return (MOST_SWEEPS + _BREGMAN_TRIALS * _SWEEPS) * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
 
 
 def _can_hold_out(geometry: Geometry) -> bool:
@@ -99,38 +96,40 @@ def choose_weight(
 
 
 def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
-    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, that views held out prefer, unless it is far above `first`.
+    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, that views held out prefer, from `first` on.
 
-    Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, the weight, half of it, and so
-    on. They end when the root mean square of what they leave of the other views rises. The vertex of the parabola
-    through the last three is taken, at most √2 times `first`. A volume that is too smooth misses edges of unseen views.
-    One that follows the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their
-    number.
+    Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, with the weight, and on to the
+    better side. They end when the root mean square of what they leave of the other views rises. The vertex of the
+    parabola through the last three is taken. A volume that is too smooth misses edges of unseen views. One that follows
+    the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their number.
+    Trials begin from FBP: a fit knows the views held out, and any weight takes it away from them.
 
-    None where twice the weight leaves less: then nothing shows that the weight by the noise hides anything, and
-    it may rise. (Weights far above it are not taken: a walnut of 50 views lost 1.3 dB.) None, too, where nothing can be
-    held out: a cone, fewer than 16 views, or data without noise; and where `problem.trial_goes_on` ends the trials.
+    None where nothing can be held out: a cone, fewer than 16 views, or data without noise; and where
+    `problem.trial_goes_on` ends the trials.
     """
     geometry = problem.projector.geometry
     if not (_can_hold_out(geometry) and first > 0):
         return None
     error = _Trial.of(problem)
-    heavier, here = error(2 * first), error(first)
-    if heavier < (1 - _LEVEL) * here:
+    errors = {octave: error(first * 2.0**octave) for octave in (1, 0)}
+    towards = 1 if errors[1] < errors[0] else -1
+    best = max(towards, 0)
+    while abs(best + towards) <= _OCTAVES:
+        errors[best + towards] = error(first * 2.0 ** (best + towards))
+        if errors[best + towards] >= errors[best]:
+            break
+        best += towards
+    if math.inf in errors.values():  # the trials were ended
         return None
-    lighter, halvings = error(first / 2), 0
-    while lighter < here and halvings < _HALVINGS:
-        heavier, here, lighter = here, lighter, error(first / 2 ** (halvings + 2))
-        halvings += 1
-    if lighter == math.inf:  # the trials were ended
-        return None
+    lighter, here, heavier = (errors.get(octave, errors[best]) for octave in (best - 1, best, best + 1))
     curvature = lighter - 2 * here + heavier
-    vertex = (lighter - heavier) / (2 * curvature) if lighter >= here and curvature > 0 else 0.0
-    return float(first * 2 ** (min(vertex, 0.5) - halvings))
+    vertex = (lighter - heavier) / (2 * curvature) if min(lighter, heavier) > here else 0.0
+    return float(first * 2 ** (best + vertex))
 
 
 def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
-    """The weight of `bregman` that predicts views held out better than one run with `weight`; None: none does.
+    """The weight of `bregman` that predicts views held out better than one run of as many sweeps with `weight`; None:
+    none does.
 
     At the same noise two runs show more of a crack than one, most where views are few (docs/notes/exploration.md).
     """
@@ -144,38 +143,16 @@ def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
 
 
 def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
-    """Sweeps from `start` [y, x, z] with the weight μ that views held out prefer: `sweeps`, twice or three times these.
+    """Sweeps from `start` [y, x, z] with the weight μ that views held out prefer: `sweeps`, or three times these.
 
     A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24). It leaves
     others nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Sixteen rows are refined from seven of
-    eight views for as long as each further `sweeps` bring the others nearer. Where slices are not those of rows:
-    `sweeps`.
+    eight views in three rounds. Each has to bring the others nearer, and all by one per cent, which parts the two
+    (docs/notes/exploration.md). Where slices are not those of rows: `sweeps`.
     """
-    errors = _errors_by_round(problem, start, weight, sweeps, lambda last, now: now < _NEARER * last)
-    return sweeps * (1 + sum(now < _NEARER * last for last, now in pairwise(errors)))
-
-
-def sweeps_by_noise(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
-    """Sweeps from `start` [y, x, z] where the weight follows the noise from μ on: `sweeps`, or three times these.
-
-    Most samples come no nearer by more sweeps. They leave a fit that is better than total variation alone (a teapot:
-    39.6 dB after 8, 37.5 after 24). A battery, where fits of few views are far off, comes nearer (33.3, 36.1). So views
-    held out have to be predicted better by one per cent, which parts the two (docs/notes/exploration.md).
-    """
-    if not (_can_hold_out(problem.projector.geometry) and weight > 0):
-        return sweeps
-    errors = _errors_by_round(problem, start, weight, sweeps, lambda last, now: now <= last)
-    return _ROUNDS * sweeps if len(errors) == _ROUNDS and errors[-1] < _NEARER * errors[0] else sweeps
-
-
-def _errors_by_round(
-    problem: VoxelProblem, start: F32, weight: float, sweeps: int, go_on: Callable[[float, float], bool]
-) -> list[float]:
-    """What a trial leaves of views held out after each round of `sweeps` from `start`. There are at most three rounds,
-    as long as the last two let it `go_on`. Empty where slices are not those of rows."""
     grid, rows = problem.projector.grid, Grid.matching(problem.projector.geometry)
     if (grid.shape[0], grid.spacing[0], grid.centre[0]) != (rows.shape[0], rows.spacing[0], rows.centre[0]):
-        return []
+        return sweeps
     trial = _Trial.of(problem, start)
     x = trial.start.copy()
     errors: list[float] = []
@@ -186,11 +163,12 @@ def _errors_by_round(
         if sweep % sweeps:
             return True
         errors.append(trial.error(x))
-        return len(errors) == 1 or go_on(*errors[-2:])
+        return len(errors) == 1 or errors[-1] <= errors[-2]
 
     watched = replace(trial.problem, go_on=further)
     ordered_fista(watched, x, weight, sweeps=_ROUNDS * sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS)
-    return errors
+    nearer = len(errors) == _ROUNDS and errors[-1] <= min(errors) and errors[-1] < _NEARER * errors[0]
+    return _ROUNDS * sweeps if nearer else sweeps
 
 
 class _Trial:
@@ -199,8 +177,6 @@ class _Trial:
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
         self.problem, self.start, self._unseen = replace(problem, go_on=self._go_on), start, unseen
         self._asked, self._ended = problem.go_on, False
-        matter = unseen.data > _MATTER * np.percentile(unseen.data, 99)
-        self._weight = matter if unseen.weight is None else matter * unseen.weight
 
     @classmethod
     def of(cls, problem: VoxelProblem, start: F32 | None = None) -> _Trial:
@@ -242,13 +218,13 @@ class _Trial:
         """
         if self._ended:
             return math.inf
-        run = bregman if twice else ordered_fista
+        run, sweeps = (bregman, _AT_ONCE) if twice else (ordered_fista, _SWEEPS)
         problem = replace(self.problem, rng=np.random.default_rng(0))  # the same order of subsets for all
-        x = run(problem, self.start.copy(), weight, sweeps=_SWEEPS, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        x = run(problem, self.start.copy(), weight, sweeps=sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS)
         return math.inf if self._ended else self.error(x)
 
     def error(self, x: F32) -> float:
         """Root mean square of what slices [y, x, z] leave of the views held out."""
         left = self._unseen.projector.forward_lines(x)
         left -= self._unseen.data
-        return math.sqrt(float(np.average(np.square(left, dtype=np.float64), weights=self._weight)))
+        return math.sqrt(float(np.average(np.square(left, dtype=np.float64), weights=self._unseen.weight)))

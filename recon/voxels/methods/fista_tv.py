@@ -34,7 +34,7 @@ class FistaTv:
 
     Attributes:
         iterations: passes over all views.
-        tv_weight: None adapts μ to the noise of the data in each sweep, see `NoiseBalance`; a number is the
+        tv_weight: None chooses μ by views held out, or by the noise of the data, see `choose_weight`; a number is the
             threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
         subsets: of the views, a step each; 1 is FISTA without subsets, which needs about ten times the iterations.
         tv_steps: dual steps of total variation in each step.

@@ -23,7 +23,6 @@ from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
-from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -78,19 +77,6 @@ def test_more_sweeps_or_a_second_run_are_made_where_no_number_is_given(
     data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)  # so that one attempt is enough
     found = finish(_of(g), g, _problem(data), sweeps, control=RunControl(looks))
     assert looks.call_count == found.sweeps == made
-
-
-@pytest.mark.parametrize(("sweeps", "made"), [(None, 3), (2, 2)])
-def test_where_the_weight_follows_the_noise_views_held_out_are_asked_for_more_sweeps_too(
-    sweeps: int | None, made: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    balance = NoiseBalance(first=1.0, noise=1.0)
-    monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: balance)
-    monkeypatch.setattr("recon.splatting.finish.sweeps_by_noise", lambda *_: 3)
-    g = _blob()
-    data = project(g, VIEWS).numpy()
-    data += np.random.default_rng(0).normal(0, 1, data.shape).astype(np.float32)
-    assert finish(_of(g), g, _problem(data), sweeps).sweeps == made
 
 
 def test_a_stop_during_the_trials_of_a_weight_keeps_the_fit() -> None:

@@ -40,12 +40,12 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
     grid = Grid.matching(views)
     # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6
-    # and three trials of 8 over seven of eight views.
-    found = [finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 141.0, 146.0, 165.0, 1e3)]
-    assert found == [(0, 0.0), (0, 0.0), (2, 145.0), (6, 165.0), (8, 175.0)]
-    # As many as views held out prefer, where time is left for 24, and for eight trials of 8 over seven of eight views.
-    found = [finish_within(1e3, spare, views, grid, Ticking(1.0)) for spare in (534.0, 535.0)]
-    assert found == [(8, 175.0), (None, 535.0)]
+    # and four trials of 16 over seven of eight views.
+    found = [finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 316.0, 321.0, 340.0, 1e3)]
+    assert found == [(0, 0.0), (0, 0.0), (2, 320.0), (6, 340.0), (8, 350.0)]
+    # As many as views held out prefer, where time is left for 24, for as many of a trial and for three trials of 16.
+    found = [finish_within(1e3, spare, views, grid, Ticking(1.0)) for spare in (744.0, 745.0)]
+    assert found == [(8, 350.0), (None, 745.0)]
 
 
 @pytest.mark.usefixtures("one_thread")
