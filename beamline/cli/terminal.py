@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -162,17 +162,21 @@ def _closed_terminal_ignored() -> Iterator[None]:
 
 
 class LogLines:
-    """A sink that writes every event as a line: time, kind, and the sentence for people or else its values."""
+    """A sink that writes every event as a line: time, kind, and the sentence for people or else its values.
 
-    def __init__(self, stream: TextIO) -> None:
+    Where `terminal`, errors of one that was closed are ignored; from a file the same error is one of its disk.
+    """
+
+    def __init__(self, stream: TextIO, *, terminal: bool = False) -> None:
         self._stream, self._lock = stream, threading.Lock()
+        self._ignored = _closed_terminal_ignored if terminal else nullcontext
 
     def __call__(self, event: Event) -> None:
         said = sentence(event) if event.event not in ("done", "recon_started") else None
         if said is None:
             said = ", ".join(f"{name} {value}" for name, value in event.data.items())
         at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
-        with self._lock, _closed_terminal_ignored():
+        with self._lock, self._ignored():
             self._stream.write(f"{at}  {event.event}: {printable(' '.join(said.split()))}\n")
             self._stream.flush()
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event, Sink, Warnings
-from beamline.core.files import named_on_failure, result_folder
+from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import PreparedProjections, prepare_projections
@@ -108,8 +108,7 @@ def run_tradeoff(
         slices.add("truth", truth)
     with result_folder(folder) as work:
         try:
-            with named_on_failure(work / "data.npz"):
-                data.save(work / "data.npz")
+            data.save(work / "data.npz")
             state = {"state": "compiling", "message": "Compiling kernels that are not in the cache"}
             sink(Event("state", clock.now(), state))
             compile_kernels(trials, work)
