@@ -67,7 +67,7 @@ def _register(symbol: Callable[..., Any], instruction: str) -> None:
     @infer_global(symbol)
     class Operation(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: Any, kws: Any) -> Any:
-            kinds = [types.unliteral(kind) for kind in args]
+            kinds = [types.unliteral(kind) for kind in args]  # type: ignore[attr-defined]
             if LANES in kinds and all(isinstance(kind, LanesType | types.Number) for kind in kinds):
                 return LANES(*kinds)
             return None
