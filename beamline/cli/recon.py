@@ -349,7 +349,7 @@ def recon(
         json_events(as_json) as json_sinks,
         Terminal(sys.stderr) as terminal,
     ):
-        shown = fan_out(*(json_sinks or [LogLines(sys.stderr) if verbose else terminal]))
+        shown = fan_out(*(json_sinks or [LogLines(sys.stderr, terminal=True) if verbose else terminal]))
         with _logged(log, shown) as logged:
             sink = fan_out(last.append, made, *logged, shown)
             metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=stop)
@@ -434,7 +434,13 @@ def _logged(path: Path | None, tell: Sink) -> Iterator[list[Sink]]:
     with ExitStack() as closing:
         with named_on_failure(path):
             file = closing.enter_context(new_log(path))
-        lines = while_it_works(LogLines(file), tell)
+        write = LogLines(file)
+
+        def named(event: Event) -> None:
+            with named_on_failure(path):
+                write(event)
+
+        lines = while_it_works(named, tell)
         lines(StateEntered("", f"splatline {version()}: {shlex.join(sys.argv)}", time=SystemClock().now()))
         try:
             yield [lines]

@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Self, TextIO
@@ -175,17 +175,21 @@ def _closed_terminal_ignored() -> Iterator[None]:
 
 
 class LogLines:
-    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence."""
+    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence.
 
-    def __init__(self, stream: TextIO) -> None:
+    Where `terminal`, errors of one that was closed are ignored; from a file the same error is one of its disk.
+    """
+
+    def __init__(self, stream: TextIO, *, terminal: bool = False) -> None:
         self._stream, self._lock = stream, threading.Lock()
+        self._ignored = _closed_terminal_ignored if terminal else nullcontext
 
     def __call__(self, event: Event) -> None:
         said = None if isinstance(event, ReconStarted) else sentence(event)
         if said is None:
             said = ", ".join(f"{name} {value}" for name, value in event.data.items())
         at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
-        with self._lock, _closed_terminal_ignored():
+        with self._lock, self._ignored():
             self._stream.write(f"{at}  {event.event}: {printable(' '.join(said.split()))}\n")
             self._stream.flush()
 

@@ -189,10 +189,10 @@ def prepare_projections(
     scan_frames = usable.frames
     pixel_size(source, selection)
     choose_views(source, scan_frames, selection)  # what is wrong with the words is told before any frame is read
-    phases.enter("tilt and references")
-    selection, sought = with_tilt(source, selection, scan_frames, warn)
+    phases.enter("tilt and references", "bands")
+    selection, sought = with_tilt(source, selection, scan_frames, warn, phases.progress)
     correction = ScanCorrection(source, selection, warn)
-    warn_of_tilt(source, selection, correction, scan_frames, warn)
+    warn_of_tilt(source, selection, correction, scan_frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
     phases.enter("jumps", "guesses")
@@ -211,7 +211,7 @@ def prepare_projections(
         projections = correction.at_once(scan_frames[chosen], progress=phases.progress)
     else:
         projections = correction.in_batches(scan_frames[chosen], spill.views, spill.batch, spill.progress)
-    phases.enter("background, rings, views held out, hardening")
+    phases.enter("background, rings, views held out, hardening", "corrections")
     rest = np.setdiff1d(np.arange(scan_frames.size), chosen)
     others, held_out = None, None
     if rest.size:
@@ -230,9 +230,10 @@ def prepare_projections(
     found = assemble(source, selection, projections, (axis_col, axis), usable, warn, held_out)
     done = {**correction.done, **({"tilt": selection.step(TiltAndLens).done(sought)} if sought else {})}
     found = replace(found, geometry=geometry, jumps=jumps.said, shares_of=shares_of)
-    for step in selection.in_order:
-        if isinstance(step, ScanStep):
-            done[step.name] = step.apply(found, source.angles[ids])
+    steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
+    for n, step in enumerate(steps, 1):
+        done[step.name] = step.apply(found, source.angles[ids])
+        phases.progress(n, len(steps))
     found = replace(found, done=done)
     if spill is not None:
         _fill_unknown(found, regions, rows_of(source, selection), selection.binning)

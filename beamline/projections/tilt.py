@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,14 +25,19 @@ _MATTERS = 0.5  # px over the rows
 _NOTHING = 0.05  # px over the rows, not worth new pixels
 _SURE = 3.0  # standard deviations from which on a tilt is one
 _ROUNDS = 5
+Told = Callable[[int, int], None]
+"""(n, N): so many are done, of so many."""
 
 
-def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> tuple[Selection, str]:
+def with_tilt(
+    source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, told: Told
+) -> tuple[Selection, str]:
     """The selection with its tilt found, if it wants that, by all rows of the detector; and a sentence about it,
     empty where nothing was sought.
 
     Args:
         frames: views that may be used.
+        told: hears how many bands of rows were corrected, and how many there are at most.
 
     Raises:
         ConfigError: a cone.
@@ -43,7 +49,7 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
         return selection, ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
     try:
-        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames)
+        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, told)
     except ValueError as error:
         raise DataError(
             f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
@@ -62,15 +68,20 @@ def with_tilt(source: ScanSource, selection: Selection, frames: NDArray[np.int64
 
 
 def warn_of_tilt(
-    source: ScanSource, selection: Selection, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
+    source: ScanSource,
+    selection: Selection,
+    correction: ScanCorrection,
+    frames: NDArray[np.int64],
+    warn: Warn,
+    told: Told,
 ) -> None:
-    """Warn where the rows chosen show a tilt that matters, and nobody said what it is."""
+    """Warn where the rows chosen show a tilt that matters, and nobody said what it is; `told` as in `with_tilt`."""
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
     if selection.step(TiltAndLens).tilt is not None or cone_of(source, selection) is not None or rows < _FEWEST_ROWS:
         return
     frames = spread_views(source.angles[frames], _LOOK_VIEWS, frames)
     try:
-        found = _look(source, correction, frames, _LOOK_BANDS, _LOOK_ROWS)
+        found = _look(source, correction, frames, (_LOOK_BANDS, _LOOK_ROWS), told)
     except (ValueError, DataError):
         return  # nothing is known, and nothing was asked
     if abs(found.tilt) * rows > _MATTERS and abs(found.tilt) > _SURE * found.uncertainty:
@@ -100,7 +111,7 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
 
 
-def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64]) -> tuple[float, float]:
+def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64], told: Told) -> tuple[float, float]:
     """The tilt by views that were levelled by what is known of it, and its uncertainty; radians.
 
     Raises:
@@ -109,28 +120,35 @@ def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64]
     plain, step = selection.having(Phase(), CountModel("log")), selection.step(TiltAndLens)
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     tilt = 0.0
-    for _ in range(_ROUNDS):
+    for n in range(_ROUNDS):
         levelled = ScanCorrection(source, plain.having(replace(step, tilt=math.degrees(tilt))), lambda _: None)
-        found = _look(source, levelled, frames, _BANDS, _BAND_ROWS)
+        found = _look(source, levelled, frames, (_BANDS, _BAND_ROWS), _after(n * _BANDS, _ROUNDS * _BANDS, told))
         tilt += found.tilt
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
             break
     return tilt, found.uncertainty
 
 
+def _after(before: int, total: int, told: Told) -> Told:
+    """For a part of the work, before which so much was done."""
+    return lambda n, _: told(before + n, total)
+
+
 def _look(
-    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], bands: int, thick: int
+    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], size: tuple[int, int], told: Told
 ) -> TiltEstimate:
-    """The tilt that is left in corrected views, by bands of `thick` rows that can be corrected.
+    """The tilt that is left in corrected views, by bands that can be corrected; `size`: bands, and rows of one.
 
     Raises:
         ValueError: see `find_tilt`.
     """
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
+    bands, thick = size
     height = max(1, min(thick, rows // bands))
     means: list[NDArray[np.float32]] = []
     heights, ids = [], np.empty(0, np.int64)
-    for first in np.unique(np.linspace(0, rows - height, min(bands, rows)).round().astype(int)).tolist():
+    for n, first in enumerate(np.unique(np.linspace(0, rows - height, min(bands, rows)).round().astype(int)).tolist()):
+        told(n, bands)
         try:
             band = correction.at_once(frames, slice(first, first + height))
         except DataError:
@@ -140,6 +158,7 @@ def _look(
         if np.array_equal(band.view_ids, ids):
             means.append(band.data.mean(axis=1))
             heights.append(first + (height - 1) / 2)
+    told(bands, bands)
     if len(means) < FEWEST_BANDS:
         raise ValueError(f"{len(means)} bands of rows, {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StudyStarted, TrialDone, TrialReached
-from beamline.core.files import named_on_failure, refuse_existing, result_folder
+from beamline.core.files import refuse_existing, result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
@@ -26,7 +26,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.study.figures import write_page
 from beamline.study.studies import Study, StudyRow, ViewSet, averaged
 from beamline.study.table import Cell, StudyTable, write_table
-from beamline.tradeoff.data import Data
+from beamline.tradeoff.data import Data, write_array
 from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
 from drivers.base.clock import Clock
@@ -130,8 +130,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     slices = SliceSheet()
     with result_folder(folder) as work:
         try:
-            with named_on_failure(work / "views.npy"):
-                np.save(work / "views.npy", prepared.projections.data)
+            write_array(work / "views.npy", prepared.projections.data)
             del prepared  # from here on the views are in the file alone
             rig = _Rig(work, geometry, options.seed, options.settings)
             whole = StudyRow(REFERENCE, np.arange(geometry.n_views)[:, None])
@@ -208,8 +207,7 @@ class _Rig:
         data, angles = averaged(np.load(self.work / "views.npy", mmap_mode="r"), self.geometry.angles, row.groups)
         angles.setflags(write=False)
         geometry = replace(self.geometry.select(row.groups[:, row.window // 2]), angles=angles)
-        with named_on_failure(self.work / "data.npz"):
-            Data(data, geometry, None, None).save(self.work / "data.npz")
+        Data(data, geometry, None, None).save(self.work / "data.npz")
         del data
         kept = self.work / "volume.npy"
         trial = Trial(

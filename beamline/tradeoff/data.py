@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.files import named_on_failure
 from recon.base.geometry import Geometry
 
 F32 = NDArray[np.float32]
@@ -31,13 +33,18 @@ class Data:
     truth: F32 | None
 
     def save(self, path: Path) -> None:
-        """As .npz, without pickle."""
+        """As .npz, without pickle.
+
+        Raises:
+            DataError: the disk did not take it.
+        """
         arrays = {"projections": self.projections, **_geometry_arrays("geometry", self.geometry)}
         if self.held_out is not None:
             arrays |= {"held_out": self.held_out[0], **_geometry_arrays("held_out_geometry", self.held_out[1])}
         if self.truth is not None:
             arrays["truth"] = self.truth
-        np.savez(path, allow_pickle=False, **arrays)
+        with named_on_failure(path):
+            np.savez(path, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Data:
@@ -45,6 +52,16 @@ class Data:
             geometry = _geometry("geometry", file)
             held = (file["held_out"], _geometry("held_out_geometry", file)) if "held_out" in file else None
             return cls(file["projections"], geometry, held, file.get("truth"))
+
+
+def write_array(path: Path, array: F32) -> None:
+    """Write a .npy file. `np.save` of a path loses the last 4 kB where the disk is full, and says nothing.
+
+    Raises:
+        DataError: the disk did not take it.
+    """
+    with named_on_failure(path), path.open("wb") as file:
+        np.save(SimpleNamespace(write=file.write), array, allow_pickle=False)
 
 
 def geometry_in(path: Path) -> Geometry:

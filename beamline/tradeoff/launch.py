@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from beamline.core.errors import DataError
 from beamline.core.files import named_on_failure
 from beamline.core.process import ChildProcess, Ending, json_object, last_line, with_our_path
 from beamline.tradeoff.trials import Outcome, Status, Trial
@@ -45,6 +46,9 @@ def run_trial(
         work: a folder with data.npz.
         max_seconds: after which the process is killed; None: no limit.
         keep: a .npy file for its volume [z, y, x]; None: the volume is forgotten.
+
+    Raises:
+        DataError: the disk did not take the job or the volume: trials to come would fail, too.
     """
     job = {"data": str(work / "data.npz"), "trial": asdict(trial), "seed": seed, "keep": keep and str(keep)}
     return _outcome(trial, _run(job, work, max_seconds))
@@ -88,4 +92,7 @@ def _outcome(trial: Trial, ended: _Ended) -> Outcome:
     if ended.out_of_time:
         return Outcome(trial, status, message="ended: the time given with --max-seconds was over")
     default = f"its process ended with code {ended.code}" + (f": {ended.last_line}" if ended.last_line else "")
-    return Outcome(trial, status, math.nan, message=str(event.get("message", default)))
+    message = str(event.get("message", default))
+    if ended.code == DataError.exit_code:
+        raise DataError(message)
+    return Outcome(trial, status, math.nan, message=message)

@@ -13,7 +13,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Sink, StateEntered, TradeoffStarted, TrialReached
-from beamline.core.files import named_on_failure, result_folder
+from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.projections.held_out import hold_out
@@ -109,8 +109,7 @@ def run_tradeoff(
         slices.add("truth", truth)
     with result_folder(folder) as work:
         try:
-            with named_on_failure(work / "data.npz"):
-                data.save(work / "data.npz")
+            data.save(work / "data.npz")
             sink(StateEntered("compiling", "Compiling kernels that are not in the cache", time=clock.now()))
             compile_kernels(trials, work)
             for grown in _each(table, work, slices, options, sink, clock, now):

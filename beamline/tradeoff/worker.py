@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import recon
+from beamline.core.errors import DataError
 from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
-from beamline.tradeoff.data import Data, geometry_in
+from beamline.tradeoff.data import Data, geometry_in, write_array
 from beamline.tradeoff.trials import Trial
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
@@ -62,6 +63,7 @@ def run(
 
     Raises:
         ValueError: the reconstruction refuses these settings.
+        DataError: the disk did not take the volume.
     """
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
@@ -75,7 +77,7 @@ def run(
     peak = peak_memory()  # before measuring, which has needs of its own
     volume = on_grid(result.volume, grid)
     if keep is not None:
-        np.save(keep, volume.data)
+        write_array(keep, volume.data)
     found = {}
     if data.truth is not None:
         found["psnr"] = metrics.psnr(data.truth, volume.data)
@@ -205,6 +207,9 @@ def main(job: Path) -> int:
     except ValueError as error:
         say({"event": "failed", "message": str(error)})
         return 1
+    except DataError as error:  # the disk
+        say({"event": "failed", "message": str(error)})
+        return error.exit_code
     say({"event": "result", **result})
     return 0
 

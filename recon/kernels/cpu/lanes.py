@@ -12,7 +12,8 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic, models, overload, register_model
+from numba.core.typing.templates import AbstractTemplate, infer_global
+from numba.extending import intrinsic, lower_builtin, models, register_model
 
 WIDTH = 16
 
@@ -60,34 +61,28 @@ def _vector_function(builder: Any, name: str, arity: int) -> Any:
     return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32")
 
 
-def _binary(instruction: str) -> Any:
-    @intrinsic
-    def call(typing_context, x, y):
-        def code(context, builder, signature, args):
-            kinds = signature.args
-            left, right = (_as_lanes(builder, k, a) for k, a in zip(kinds, args, strict=True))
-            return getattr(builder, instruction)(left, right, flags=_FAST)
+def _register(symbol: Callable[..., Any], instruction: str) -> None:
+    """Typed and lowered by hand: of an `overload` the compiler copies a function into each place that adds."""
 
-        return LANES(x, y), code
+    @infer_global(symbol)
+    class Operation(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args: Any, kws: Any) -> Any:
+            kinds = [types.unliteral(kind) for kind in args]  # type: ignore[attr-defined]
+            if LANES in kinds and all(isinstance(kind, LanesType | types.Number) for kind in kinds):
+                return LANES(*kinds)
+            return None
 
-    return call
+    def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        left, right = (_as_lanes(builder, k, a) for k, a in zip(signature.args, args, strict=True))
+        return getattr(builder, instruction)(left, right, flags=_FAST)
 
-
-def _register(symbol: Callable[..., Any], implementation: Any) -> None:
-    @overload(symbol, inline="always")
-    def operation(x, y):
-        if isinstance(x, LanesType) or isinstance(y, LanesType):
-
-            def apply(x, y):
-                return implementation(x, y)
-
-            return apply
-        return None
+    for kinds in ((LanesType, LanesType), (LanesType, types.Number), (types.Number, LanesType)):
+        lower_builtin(symbol, *kinds)(code)
 
 
 _OPERATORS = ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"))
 for _symbol, _instruction in _OPERATORS:
-    _register(_symbol, _binary(_instruction))
+    _register(_symbol, _instruction)
 
 
 @intrinsic

@@ -6,7 +6,9 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,9 +31,14 @@ COMMANDS = {
     "OME-Zarr": ("export volume.h5 -o out/o.zarr", {"o.zarr"}),
     "ingested scan": ("ingest scan.h5 out/o.h5", {"o.h5"}),
     "archive": ("archive ours.h5 -o out/o.h5", {"o.h5"}),
-    "reconstruction": ("recon scan.h5 -m fbp --no-report -o out/o.h5", {"o.h5"}),
+    "reconstruction and report": ("recon scan.h5 -m fbp -o out/o.h5", {"o.h5", "o.html"}),
     "labels": ("segment volume.h5 --crop none -o out/o.h5", {"o.h5", "o.csv", "o.png"}),
 }
+FOLDERS = {  # of results, which keep those of the trials that were done
+    "tradeoff": ("tradeoff scan.h5 --methods fbp,sirt -o out/o", 5),
+    "study": ("study fixed-views views.h5 -m fbp -m sirt -o out/o", 2),
+}
+LOG = "recon scan.h5 -m fbp --no-report --log out/o.txt -o out/o.h5"
 POINTS = 6  # writes of each fault; there are up to 315
 
 
@@ -46,27 +53,61 @@ def inputs(tmp_path: Path, rng: np.random.Generator) -> Path:
     np.save(tmp_path / "volume.npy", data)
     os.utime(tmp_path / "volume.npy", (0, 0))
     write_exchange(tmp_path / "scan.h5", SCAN)
+    write_exchange(tmp_path / "views.h5", replace(SCAN, angles=np.radians(np.arange(0, 180, 3.0))))
     ingest(tmp_path / "scan.h5", tmp_path / "ours.h5")
     return tmp_path
+
+
+def _swept(inputs: Path, command: str, watched: str = "/out/") -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The run without a fault, and those with one."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.beamline.cli.disk_sweep", inputs, str(POINTS), *command.split()],
+        env=os.environ | faulty_disk.environment(watched) | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+        cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=600, check=True,
+    )  # fmt: skip
+    clean, *runs = [json.loads(line) for line in done.stdout.splitlines()]
+    assert clean["code"] == 0 and len(runs) >= 3 * 4, clean
+    for run in runs:
+        assert "Traceback" not in run["stderr"] and "ignored" not in run["stderr"], run
+    return clean, runs
 
 
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_an_output_is_right_or_absent(inputs: Path, kind: str) -> None:
     command, outputs = COMMANDS[kind]
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.beamline.cli.disk_sweep", inputs, str(POINTS), *command.split()],
-        env=os.environ | faulty_disk.environment("/out/") | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-        cwd=Path(__file__).parents[3], capture_output=True, text=True, timeout=600, check=True,
-    )  # fmt: skip
-    clean, *runs = [json.loads(line) for line in done.stdout.splitlines()]
-    assert clean["code"] == 0 and set(clean["outputs"]) == outputs, clean
-    assert len(runs) >= 3 * 4
+    clean, runs = _swept(inputs, command)
+    assert set(clean["outputs"]) == outputs, clean
     for run in runs:
         right = run["outputs"] == clean["outputs"]
-        assert "Traceback" not in run["stderr"] and "ignored" not in run["stderr"], run
         if run["fault"] == "kill":  # of several outputs some may be there, and these are right
             assert run["code"] == -9 and run["outputs"].items() <= clean["outputs"].items(), run
             continue
         said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
         assert (run["code"], len(said)) in ((0, 0), (5, 1)) and run["hidden"] == 0, run
         assert right if run["code"] == 0 else not run["outputs"], run
+
+
+@pytest.mark.parametrize("kind", FOLDERS)
+def test_a_folder_of_results_holds_whole_files_and_the_trials_done(inputs: Path, kind: str) -> None:
+    command, trials = FOLDERS[kind]
+    clean, runs = _swept(inputs, command)
+    assert set(clean["outputs"]) == {"o"}
+    for run in runs:
+        assert not run["cut"], run
+        if run["fault"] == "kill":
+            assert run["code"] == -9, run
+            continue
+        said = [line for line in run["stderr"].splitlines() if line.startswith("beamline: ")]
+        assert (run["code"], len(said), run["hidden"]) == (5, 1, 0) and "could not be written" in said[0], run
+        assert run["outputs"] or f"1/{trials} " not in run["stderr"], run
+
+
+def test_a_volume_is_right_where_its_log_is_lost(inputs: Path) -> None:
+    clean, runs = _swept(inputs, LOG, "/out/o.txt")
+    for run in runs:
+        if run["fault"] == "kill":
+            assert run["code"] == -9, run
+            continue
+        said = [line for line in run["stderr"].splitlines() if "o.txt could not be written" in line]
+        assert run["code"] == 0 and len(said) == 1, run
+        assert run["outputs"]["o.h5"] == clean["outputs"]["o.h5"], run

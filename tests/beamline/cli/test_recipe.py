@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +17,7 @@ from beamline.cli import recon
 from beamline.cli.recipe import repeating
 from beamline.cli.segment import segment
 from beamline.cli.study import study
-from beamline.cli.terminal import LogLines
 from beamline.cli.tradeoff import tradeoff
-from beamline.core.events import Event
 from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 from tests.beamline.scans import write_exchange
@@ -118,17 +121,25 @@ def test_a_log_says_what_happened_and_why_it_failed(folder: Path) -> None:
     assert [line.split()[1] for line in said.splitlines()] == kinds[1:]
 
 
-def test_a_log_whose_disk_is_full_does_not_end_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Full(LogLines):
-        def __call__(self, event: Event) -> None:
-            if event.event != "state":
-                raise OSError(28, "No space left on device")
-            super().__call__(event)
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_a_log_that_the_disk_does_not_take_is_named_and_does_not_end_the_work(
+    number: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            if " state: " not in text:
+                raise OSError(number, os.strerror(number))
+            return super().write(text)
 
-    monkeypatch.setattr(recon, "LogLines", Full)
+    @contextmanager
+    def new_log(path: Path) -> Iterator[Full]:
+        path.touch()
+        yield Full()
+
+    monkeypatch.setattr(recon, "new_log", new_log)
     result = beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5", "--no-report")
     assert result.exit_code == 0
-    assert result.stderr.count("No space left on device") == 1
+    assert result.stderr.count(f"log.txt could not be written ({os.strerror(number)})") == 1
     assert {"log.txt", "x.h5"} <= left(folder)
 
 

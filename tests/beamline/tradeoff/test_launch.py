@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamline.core.errors import DataError
 from beamline.tradeoff import launch as trial_run
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
@@ -40,6 +41,13 @@ def test_what_becomes_of_a_process(
     outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
     assert (outcome.status, said in outcome.message) == (status, True)
     assert (outcome.seconds == 2.5 and outcome.curve == ((1.0, 2.0),)) is (status == "done")
+
+
+def test_a_full_disk_ends_all_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = 'import sys; print(\'{"event": "failed", "message": "v.npy: the disk is full"}\'); sys.exit(5)'
+    monkeypatch.setattr(trial_run, "command", lambda job: [sys.executable, "-c", program])
+    with pytest.raises(DataError, match=r"v\.npy: the disk is full"):
+        run_trial(Trial("method", "fbp", 10), tmp_path, 0)
 
 
 def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(

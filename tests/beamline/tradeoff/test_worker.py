@@ -15,8 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 import recon.warm_up
+from beamline.core.errors import DataError
 from beamline.tradeoff import worker as module
-from beamline.tradeoff.data import Data
+from beamline.tradeoff.data import Data, write_array
 from beamline.tradeoff.trials import Trial
 from beamline.tradeoff.worker import main, on_grid, run
 from recon.assess.metrics import psnr
@@ -72,6 +73,25 @@ def test_a_volume_that_is_kept_is_the_one_measured(data: Data, tmp_path: Path, c
     assert data.truth is not None
     said = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert said["metrics"]["psnr"] == pytest.approx(psnr(data.truth, expected))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_disk_that_is_full_is_no_trial_that_failed(
+    data: Data, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "data.npz").symlink_to("/dev/full")
+    with pytest.raises(DataError, match=r"data\.npz could not be written \(No space left"):
+        data.save(tmp_path / "data.npz")
+    data.save(tmp_path / "views.npz")
+    job = {
+        "data": str(tmp_path / "views.npz"), "trial": asdict(Trial("method", "fbp", 27)), "seed": 0,
+        "keep": "/dev/full",
+    }  # fmt: skip
+    (tmp_path / "job.json").write_text(json.dumps(job))
+    assert main(tmp_path / "job.json") == DataError.exit_code
+    assert "/dev/full could not be written (No space left" in capsys.readouterr().out
+    with pytest.raises(DataError, match="/dev/full"):  # a last block, which np.save loses
+        write_array(Path("/dev/full"), np.zeros(10, np.float32))
 
 
 def test_fewer_views_are_worse_and_spread_over_all_angles(data: Data) -> None:
