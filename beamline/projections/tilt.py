@@ -25,19 +25,19 @@ _MATTERS = 0.5  # px over the rows
 _NOTHING = 0.05  # px over the rows, not worth new pixels
 _SURE = 3.0  # standard deviations from which on a tilt is one
 _ROUNDS = 5
-Told = Callable[[int, int], None]
+BandsDone = Callable[[int, int], None]
 """(n, N): so many are done, of so many."""
 
 
 def with_tilt(
-    source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, told: Told
+    source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
 ) -> tuple[Selection, str]:
     """The selection with its tilt found, if it wants that, by all rows of the detector; and a sentence about it,
     empty where nothing was sought.
 
     Args:
         frames: views that may be used.
-        told: hears how many bands of rows were corrected, and how many there are at most.
+        progress: takes how many bands of rows were corrected, and how many there are at most.
 
     Raises:
         ConfigError: a cone.
@@ -49,7 +49,7 @@ def with_tilt(
         return selection, ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
     try:
-        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, told)
+        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, progress)
     except ValueError as error:
         raise DataError(
             f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
@@ -73,15 +73,15 @@ def warn_of_tilt(
     correction: ScanCorrection,
     frames: NDArray[np.int64],
     warn: Warn,
-    told: Told,
+    progress: BandsDone,
 ) -> None:
-    """Warn where the rows chosen show a tilt that matters, and nobody said what it is; `told` as in `with_tilt`."""
+    """Warn where the rows chosen show a tilt that matters, and nobody said what it is; `progress` as in `with_tilt`."""
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
     if selection.step(TiltAndLens).tilt is not None or cone_of(source, selection) is not None or rows < _FEWEST_ROWS:
         return
     frames = spread_views(source.angles[frames], _LOOK_VIEWS, frames)
     try:
-        found = _look(source, correction, frames, (_LOOK_BANDS, _LOOK_ROWS), told)
+        found = _look(source, correction, frames, (_LOOK_BANDS, _LOOK_ROWS), progress)
     except (ValueError, DataError):
         return  # nothing is known, and nothing was asked
     if abs(found.tilt) * rows > _MATTERS and abs(found.tilt) > _SURE * found.uncertainty:
@@ -111,7 +111,9 @@ def spread(items: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     return items[np.unique(np.linspace(0, items.size - 1, n).round().astype(np.int64))]
 
 
-def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64], told: Told) -> tuple[float, float]:
+def _refined(
+    source: ScanSource, selection: Selection, frames: NDArray[np.int64], progress: BandsDone
+) -> tuple[float, float]:
     """The tilt by views that were levelled by what is known of it, and its uncertainty; radians.
 
     Raises:
@@ -122,20 +124,24 @@ def _refined(source: ScanSource, selection: Selection, frames: NDArray[np.int64]
     tilt = 0.0
     for n in range(_ROUNDS):
         levelled = ScanCorrection(source, plain.having(replace(step, tilt=math.degrees(tilt))), lambda _: None)
-        found = _look(source, levelled, frames, (_BANDS, _BAND_ROWS), _after(n * _BANDS, _ROUNDS * _BANDS, told))
+        found = _look(source, levelled, frames, (_BANDS, _BAND_ROWS), _after(n * _BANDS, _ROUNDS * _BANDS, progress))
         tilt += found.tilt
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
             break
     return tilt, found.uncertainty
 
 
-def _after(before: int, total: int, told: Told) -> Told:
+def _after(before: int, total: int, progress: BandsDone) -> BandsDone:
     """For a part of the work, before which so much was done."""
-    return lambda n, _: told(before + n, total)
+    return lambda n, _: progress(before + n, total)
 
 
 def _look(
-    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], size: tuple[int, int], told: Told
+    source: ScanSource,
+    correction: ScanCorrection,
+    frames: NDArray[np.int64],
+    size: tuple[int, int],
+    progress: BandsDone,
 ) -> TiltEstimate:
     """The tilt that is left in corrected views, by bands that can be corrected; `size`: bands, and rows of one.
 
@@ -148,7 +154,7 @@ def _look(
     means: list[NDArray[np.float32]] = []
     heights, ids = [], np.empty(0, np.int64)
     for n, first in enumerate(np.unique(np.linspace(0, rows - height, min(bands, rows)).round().astype(int)).tolist()):
-        told(n, bands)
+        progress(n, bands)
         try:
             band = correction.at_once(frames, slice(first, first + height))
         except DataError:
@@ -158,7 +164,7 @@ def _look(
         if np.array_equal(band.view_ids, ids):
             means.append(band.data.mean(axis=1))
             heights.append(first + (height - 1) / 2)
-    told(bands, bands)
+    progress(bands, bands)
     if len(means) < FEWEST_BANDS:
         raise ValueError(f"{len(means)} bands of rows, {FEWEST_BANDS} are needed")
     return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])
