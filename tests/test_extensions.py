@@ -68,8 +68,8 @@ class Grey:
     (
         (
             "recon/methods.py",
-            '    "os-sirt-tv": Entry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),',
-            '    "grey": Entry("recon.voxels.methods.grey", "Grey"),',
+            '    "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),',
+            '    "grey": MethodEntry("recon.voxels.methods.grey", "Grey"),',
         ),
     ),
     """
@@ -192,8 +192,8 @@ class Half:
     (
         (
             "simulators/effects/catalogue.py",
-            '        "photon_noise": Entry(Domain.PHOTONS, "photons arrive at random"),',
-            '        "half": Entry(Domain.PHOTONS, "half of the light"),',
+            '        "photon_noise": EffectRow(Domain.PHOTONS, "photons arrive at random"),',
+            '        "half": EffectRow(Domain.PHOTONS, "half of the light"),',
         ),
     ),
     """

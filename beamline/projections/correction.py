@@ -251,7 +251,7 @@ class ScanCorrection:
             rows = slice(max(0, start - SHADOW_REACH), min(len(found), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * self.binning, first + rows.stop * self.binning)
             data = np.nan_to_num(read_binned(self._source, views, read, self.binning))
-            plain = Correction(references.rows(rows), self._settings)
+            plain = Correction(references.rows(rows), replace(self._settings, air="none"))
             light = plain.transmission(data, views.astype(np.float64)).data
             found[start : start + _BAND] = shadowed(light, self._settings.floor)[start - rows.start :][:_BAND]
         self._shadow = np.zeros_like(found) if found.all() else found

@@ -32,6 +32,7 @@ _LATE = 0.1  # share of the time used that a volume of all pixels may take, when
 _TRIAL_ROWS = (ROWS, ROWS // 2, ROWS // 4)
 # Share of the time that a trial may take by prediction; in fact it may take a quarter more.
 _TRIAL, _TRIAL_SLACK = 0.375, 1.25
+_OF_TRIALS = 0.4  # of the time of a method on voxels, that trials of its weight may take
 _LEVEL = 0.3  # dB: by the curves of four scans such methods are level
 
 
@@ -221,7 +222,8 @@ def _run(method: Method, prepared: PreparedProjections, seed: int, end: float, c
     if method.traits.held_out:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
     use = DataUse(prepared.ray_weights(len(held_out)), held_out)
-    control = replace(control, should_stop=_until(control, end))
+    trials = _until(control, now() + _OF_TRIALS * (end - now()))
+    control = replace(control, should_stop=_until(control, end), stop_trials=trials)
     return recon.reconstruct(data, geometry, method, grid=grid, seed=seed, use=use, control=control)
 
 

@@ -76,6 +76,8 @@ class RunControl:
         resume: the checkpoint of a fit with the same data and settings, which is continued.
         now: a clock in s.
         decide: keeps the method's decisions by its data, and may follow another run; None: the run decides alone.
+        stop_trials: asked after each sweep of the trials by which a method on voxels chooses its weight; True ends
+            these alone. None: as `should_stop`.
     """
 
     should_stop: Callable[[], bool] | None = None
@@ -85,6 +87,7 @@ class RunControl:
     resume: Mapping[str, NDArray[Any]] | None = None
     now: Callable[[], float] = time.perf_counter
     decide: Decisions | None = None
+    stop_trials: Callable[[], bool] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,7 +120,7 @@ def run_iterative(method: IterativeMethod, problem: ReconProblem, control: RunCo
     settings = {f.name: getattr(method, f.name) for f in fields(method)}  # type: ignore[arg-type]
     volume = solve(
         method, projector, filled, weight=known, nonnegative=not settings.get("allow_negative", False),
-        on_iteration=report, on_trial=control.should_stop, decide=decide,
+        on_iteration=report, on_trial=control.stop_trials or control.should_stop, decide=decide,
     )  # fmt: skip
     return MethodResult(volume, {**settings, "seed": problem.seed}, tuple(history))
 

@@ -28,8 +28,8 @@ class OsSirtTv:
     """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
 
     Attributes:
-        tv_weight: None chooses it by views held out, or by the noise of the data, see `choose_weight`; a number is the
-            threshold of that step in density units.
+        tv_weight: threshold of that step in density units; None: by views held out or by the noise, see
+            `choose_weight`.
         momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
             167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
             -0.1 and -1.0 dB: noise comes in sooner, too.

@@ -171,7 +171,7 @@ def test_events_and_sentences_are_those_of_the_command(
     with connected() as instrument:
         instrument.scan(on_event=lambda event: heard.append(event.event))
         assert capsys.readouterr() == ("", "")
-        instrument._tell = api.to_stderr
+        instrument._say = api.to_stderr
         instrument.scan()
     assert {"run_started", "state", "scan_done", "done"} <= set(heard)
     out, err = capsys.readouterr()

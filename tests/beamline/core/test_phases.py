@@ -35,7 +35,7 @@ def test_a_phase_says_how_far_it_is_at_most_a_few_times_a_second() -> None:
     phases.enter("reading")
     for n in range(1, 101):
         clock.time += 0.05
-        phases.told(n, 100)
+        phases.progress(n, 100)
     assert 20 <= len(said) <= 35
     last = said[-1].data
     assert (last["n"], last["of"], last["eta_s"]) == (100, 100, 0.0)
@@ -47,5 +47,5 @@ def test_a_phase_with_nothing_done_says_no_more_than_that_it_has_begun() -> None
     said = list[Event]()
     phases = Phases(said.append, Clock())
     phases.enter("axis", "guesses")
-    phases.told(0, 100)
+    phases.progress(0, 100)
     assert [(event.data["n"], event.data["counted"]) for event in said] == [(0, "guesses")]

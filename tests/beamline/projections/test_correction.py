@@ -54,7 +54,7 @@ def test_progress_counts_views_that_are_corrected_not_only_read(monkeypatch: pyt
     correction = ScanCorrection(source, Selection(), pytest.fail)  # type: ignore[arg-type]
     monkeypatch.setattr(module, "read_binned", reading)
     monkeypatch.setattr(Correction, "transmission", dividing)
-    correction.at_once(np.arange(2, 47), told=lambda n, of: told.append((n, of)))
+    correction.at_once(np.arange(2, 47), progress=lambda n, of: told.append((n, of)))
     assert after == {"reading": 15, "dividing": 30} and told == sorted(told) and told[-1] == (45, 45)
 
 

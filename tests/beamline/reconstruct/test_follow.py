@@ -587,7 +587,7 @@ def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "beamline.projections.prepare.find_axis",
+        "beamline.projections.axis.find_axis",
         lambda data, angles: AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), False, "pair"),
     )
     clock, events = ScanClock(), list[Event]()

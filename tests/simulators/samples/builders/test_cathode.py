@@ -124,7 +124,7 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
         ({"fill": 0.7}, "below 0.64"),
         ({"fill": 0.63}, "lower the fill"),
         ({"size_um": 100, "fill": 0.5, "diameter": 0.11}, "does not fit"),
-        ({"size_um": 300}, "more than the fill"),
+        ({"size_um": 300}, "larger than the whole fill"),
         ({"irregularity": 1.0}, "irregularity must be"),
         ({"hollow": 0.7, "cracked": 0.7}, "1 at most in sum"),
         ({"habits": {"cube": 1}}, "'cube' is unknown"),
