@@ -24,8 +24,6 @@ VIEWS = 90
 """Views that are enough."""
 _LEAST_VIEWS = 12
 _ONE_IN = 3  # views held out
-_COARSE_COLS, _COARSE_SWEEPS = 32, 3  # enough to come within half a coarse pixel
-_FINE_ROWS, _FINE_SWEEPS = 8, 6
 _WIDEST = 0.1875  # of the columns to either side of the start
 _TV_WEIGHT = 3e-3  # any weight that keeps noise out of the volume shows the same axis
 _STEPS = 8  # of the parabola's middle towards its vertex, at most
@@ -57,9 +55,8 @@ def axis_by_views(
     if geometry.n_views < _LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
     cols = geometry.detector_shape[1]
-    judges = [_Judge(projections, geometry, each, progress) for each in (_COARSE_COLS, COLS)]
-    coarse, fine = judges
-    fine.others = coarse
+    coarse = _Judge(projections, geometry, _COARSE, progress)
+    fine = _Judge(projections, geometry, _FINE, progress, others=coarse)
     start, half = geometry.axis_col, 0.5 * fine.bin
     if near and (vertex := _vertex(fine, start, half)) is not None and vertex.least > _BETTER * fine(start):
         return _estimate(start, fine, confident=True)
@@ -86,13 +83,33 @@ def axis_by_views(
     return _estimate(found.axis_col, coarse, confident=clear)
 
 
+@dataclass(frozen=True)
+class _Accuracy:
+    """What the volume of a candidate is made of.
+
+    Attributes:
+        cols, rows: of the binned views, at most.
+        sweeps: of FISTA-TV.
+        one_grid: all candidates have the first one's grid. Another grid moves the residual more than a small step does.
+    """
+
+    cols: int
+    rows: int
+    sweeps: int
+    one_grid: bool
+
+
+_COARSE = _Accuracy(cols=32, rows=32, sweeps=3, one_grid=False)  # enough to come within half a coarse pixel
+_FINE = _Accuracy(COLS, rows=8, sweeps=6, one_grid=True)
+
+
 @dataclass(eq=False)
 class _Judge:
     """The share of unseen views that a volume leaves, for an axis in columns of the data; each is asked once."""
 
     projections: F32
     geometry: Geometry
-    cols: int
+    accuracy: _Accuracy
     progress: Callable[[int], None]
     others: _Judge | None = None
     found: dict[float, float] = field(default_factory=dict)
@@ -100,10 +117,9 @@ class _Judge:
 
     def __post_init__(self) -> None:
         whole, rows = self.geometry, self.geometry.detector_shape[0]
-        self.bin = max(1, min(rows, whole.detector_shape[1] // self.cols))
+        self.bin = max(1, min(rows, whole.detector_shape[1] // self.accuracy.cols))
         data, views = self.projections, whole
-        if self.cols > _COARSE_COLS and rows > _FINE_ROWS * self.bin:
-            height = _FINE_ROWS * self.bin
+        if (height := self.accuracy.rows * self.bin) < rows:
             first = round(min(max(whole.axis_row - height / 2, 0), rows - height))
             data, views = data[:, first : first + height], whole.rows(first, first + height)
         self.binned, self._views = bin_views(np.ascontiguousarray(data), self.bin), views.binned(self.bin)
@@ -120,10 +136,9 @@ class _Judge:
     def _residual(self, axis_col: float) -> float:
         moved = (axis_col - self.geometry.axis_col) / self.bin
         views = replace(self._views, axis_col=self._views.axis_col + moved)
-        coarse = self.cols == _COARSE_COLS
-        # One grid for candidates near each other: another one would move the residual more than they do.
-        grid = self._grid = Grid.matching(views) if coarse or self._grid is None else self._grid
-        method = FistaTv(_COARSE_SWEEPS if coarse else _FINE_SWEEPS, _TV_WEIGHT)
+        if self._grid is None or not self.accuracy.one_grid:
+            self._grid = Grid.matching(views)
+        grid, method = self._grid, FistaTv(self.accuracy.sweeps, _TV_WEIGHT)
         part = ReconProblem(self.binned[self._seen], views.select(self._seen), grid, DataUse(), 0, "cpu")
         volume = method.run(part, RunControl()).volume
         unseen = self.binned[self._unseen]
