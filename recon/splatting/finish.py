@@ -39,6 +39,7 @@ SUBSETS, TV_STEPS = 9, 3
 
 _DIFFERENT = 0.6  # of the noise
 _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 of the noise, and differs by 2.2 dB
+_CLEARLY = 0.9  # a parallel beam: residuals .94 to .98 of the first's lose 3 dB (spheres), .5 less than 0.1 dB (slabs)
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
@@ -114,8 +115,8 @@ def finish(
     things are looked at. The projection of the voxels at the start may differ from that of the Gaussians by more than
     0.6 of the noise. The sweeps may leave more than the fit, or 1.05 times the noise. Where both hold, the sweeps are
     tried anew on p - G + A x. Here p are the measured views, G those of the Gaussians, A x the projection of the voxels
-    at the start. What voxels cannot explain then counts as noise. The second volume is taken if it explains its views
-    better. Of a cone, and of matter beyond the field, it may leave them worse explained by a tenth.
+    at the start. What voxels cannot explain then counts as noise. The second volume is taken if it leaves a tenth less
+    of its views. Of a cone, and of matter beyond the field, it may leave a tenth more.
 
     Single pixels that stand out in all views alike become rings. They are brought back to their neighbours first, see
     `ring_offsets`. The weight of total variation follows the noise, see `NoiseBalance`, or is the one that views held
@@ -189,7 +190,7 @@ def finish(
     if watch.asked() and not bent:  # cut short
         return found
     after = _deviation(data - projector.forward(other.volume.data), known)
-    return other if decide("other", lambda: after <= (_ALIKE if bent else 1.0) * left) else found
+    return other if decide("other", lambda: after <= (_ALIKE if bent else _CLEARLY) * left) else found
 
 
 def _deviation(left: F32, weights: F32 | None) -> float:

@@ -131,13 +131,12 @@ def test_values_that_are_not_finite_weigh_nothing_whatever_they_are(clean: F32, 
 
 @pytest.mark.slow
 def test_a_fit_loses_little_by_values_that_are_not_finite(clean: F32, truth: F32, bad: NDArray[np.bool_]) -> None:
-    # 40.7 dB of all values, 40.2 without one in twenty; of three fits one loses 0.7 dB. A weight of total variation by
-    # the noise alone had 37.9 and 38.6 dB.
-    whole, holed = (
-        np.array([psnr(truth, fitted(data, steps=150, seed=seed).volume.data) for seed in range(3)])
-        for data in (clean, np.where(bad, np.float32(np.nan), clean))
-    )
-    assert np.median(whole - holed) < 0.7 and holed.min() > 39.5
+    losses = [
+        psnr(truth, fitted(clean, steps=150, seed=seed).volume.data)
+        - psnr(truth, fitted(np.where(bad, np.float32(np.nan), clean), steps=150, seed=seed).volume.data)
+        for seed in range(3)
+    ]
+    assert np.median(losses) < 0.5
 
 
 @pytest.fixture(scope="module")
