@@ -60,6 +60,7 @@ _COMMANDS = {
     "batch": _Entry("batch", "Reconstruct many scans by one recipe; a table says what became of each."),
     "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
     "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),
+    "view": _Entry("view", "Show one or two volumes in the browser: slices, histogram, profile, difference."),
     "segment": _Entry("segment", "Segment the particles of a volume: labels, sizes, places."),
     "bench": _Entry("bench", "Measure this machine: kernels, fits, quality against time, and acquisition."),
     "info": _Entry("files", "Describe a scan file or a volume.", files=False),

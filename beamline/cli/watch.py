@@ -22,12 +22,19 @@ LOOPBACK, PORT = "127.0.0.1", 8642
 LOOK, ACT = "watch", "control"
 """Purpose of an address: the first word of its line."""
 
+port_option = click.option(
+    "--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="Or the next free one."
+)
+bind_option = click.option(
+    "--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all."
+)
+
 
 @click.command()
 @click.argument("path", metavar="[RUN|FILE]", required=False, type=click.Path(path_type=Path, exists=True))
 @click.option("--control", is_flag=True, help="A second address, from which the scan can be paused and ended.")
-@click.option("--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="Or the next free one.")
-@click.option("--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all.")
+@port_option
+@bind_option
 @click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
 @click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
 def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
@@ -38,13 +45,14 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     Exit code: 0 ended by Ctrl-C, 2 no run, or no port, 5 no scan of this program.
     """
-    from beamline.page.run_files import Reader, watched  # they load HDF5 and the server, which `scan -h` does not need
+    from beamline.page.app import page  # these load HDF5 and the server, which `scan -h` does not need
+    from beamline.page.run_files import Reader, watched
     from beamline.page.serve import open_port, start
     from beamline.scan.runs import newest
 
     reader = Reader(watched(path or newest(Path(RUNS))))
     try:
-        server = start(reader, open_port(bind, port), control=control, log=_log)
+        server = start(lambda access: page(reader, access, _log), open_port(bind, port), control=control)
         click.echo(f"{LOOK:<8}{server.addresses.look}")
         if server.addresses.act is not None:
             click.echo(f"{ACT:<8}{server.addresses.act}")

@@ -88,7 +88,7 @@ class Guard:
             answer.set_cookie(COOKIE, self._access.look, httponly=True, samesite="strict")
             await answer(scope, receive, send_with_headers)
         else:
-            text = "This page needs the token in the address that `beamline watch` printed.\n"
+            text = "This page needs the token in the address that was printed at its start.\n"
             await Response(text, 403, media_type="text/plain")(scope, receive, send_with_headers)
 
 
@@ -120,11 +120,12 @@ def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlett
         Route("/api/verb/{verb}", server.verb, methods=["POST"]),
     ]
     return Starlette(
-        routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers={BeamlineError: _refused}
+        routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers={BeamlineError: refused}
     )
 
 
-def _refused(request: Request, error: Exception) -> Response:
+def refused(request: Request, error: Exception) -> Response:
+    """What no file gives, as a sentence."""
     return JSONResponse({"message": user_message(error)}, 404)
 
 
@@ -176,12 +177,12 @@ class _Server:
 
     async def frame(self, request: Request) -> Response:
         frame, corrected = int(request.path_params["frame"]), request.query_params.get("corrected") == "1"
-        region = _region(request)
+        region = region_of(request)
 
         def read() -> Response:
             values, shown, factor = self._reader.do(lambda file: file.picture(frame, region, corrected=corrected))
             edges = [shown.first_row, shown.last_row, shown.first_col, shown.last_col]
-            return _tile(values, {"frame": frame, "region": edges, "bin": factor})
+            return tile_of(values, {"frame": frame, "region": edges, "bin": factor})
 
         return await self._kept(("frame", frame, region, corrected), read)
 
@@ -190,12 +191,12 @@ class _Server:
 
         def read() -> Response:
             lines, views, factor = self._reader.do(lambda file: file.sinogram(row, first))
-            return _tile(lines, {"views": views.tolist(), "bin": factor})
+            return tile_of(lines, {"views": views.tolist(), "bin": factor})
 
         return await run_in_threadpool(read)
 
     async def trace(self, request: Request) -> Response:
-        region, first = _region(request), _number(request, "first")
+        region, first = region_of(request), _number(request, "first")
         values = await run_in_threadpool(self._reader.do, lambda recording: recording.trace(region, first))
         return JSONResponse({"first": first, "values": values})
 
@@ -207,7 +208,7 @@ class _Server:
 
         def read() -> Response:
             values, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index))
-            return _tile(values, {"axis": axis, "index": index, "bin": factor})
+            return tile_of(values, {"axis": axis, "index": index, "bin": factor})
 
         return await run_in_threadpool(read)
 
@@ -243,7 +244,7 @@ class _Server:
         return self._tiles[key]
 
 
-def _tile(values: Any, facts: dict[str, Any]) -> Response:
+def tile_of(values: Any, facts: dict[str, Any]) -> Response:
     """A header in JSON, its length before it as u4, and the numbers of `tiles.Packed`."""
     packed = pack(values)
     head = json.dumps({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
@@ -257,7 +258,7 @@ def _number(request: Request, name: str) -> int:
     return int(given) if given.isdecimal() and len(given) < 10 else 0
 
 
-def _region(request: Request) -> TileRegion:
+def region_of(request: Request) -> TileRegion:
     """`region=first_row,last_row,first_col,last_col`; the whole picture where it is not that."""
     edges = request.query_params.get("region", "").split(",")
     if len(edges) == 4 and all(edge.isdecimal() and len(edge) < 10 for edge in edges):

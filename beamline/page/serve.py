@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import psutil
 import uvicorn
+from starlette.applications import Starlette
 
 from beamline.core.errors import ConfigError
-from beamline.page.app import Access, page
-from beamline.page.run_files import Reader
+from beamline.page.app import Access
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ def open_port(bind: str, port: int) -> socket.socket:
 class PageServer:
     """A server that is ready to run, with known addresses."""
 
-    def __init__(self, reader: Reader, listening: socket.socket, access: Access, log: Callable[[str], None]) -> None:
+    def __init__(self, app: Starlette, listening: socket.socket, access: Access) -> None:
         self._listening = listening
         root = f"http://{access.hosts[0]}/?token={access.look}"
         self.addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
         self._server = uvicorn.Server(
             uvicorn.Config(
-                page(reader, access, log), log_level="warning", access_log=False, lifespan="off",
+                app, log_level="warning", access_log=False, lifespan="off",
                 timeout_graceful_shutdown=1, limit_concurrency=200, server_header=False,
             )
         )  # fmt: skip
@@ -77,15 +77,14 @@ class PageServer:
         self._server.should_exit = True
 
 
-def start(reader: Reader, listening: socket.socket, *, control: bool, log: Callable[[str], None]) -> PageServer:
-    """A server with new tokens.
+def start(app: Callable[[Access], Starlette], listening: socket.socket, *, control: bool = False) -> PageServer:
+    """A server of an application, with new tokens.
 
     Args:
         control: allow verbs from the page, with the address for acting.
-        log: takes a line for each verb.
     """
     access = Access(_names(listening), act=secrets.token_hex(16) if control else None)
-    return PageServer(reader, listening, access, log)
+    return PageServer(app(access), listening, access)
 
 
 def _names(listening: socket.socket) -> list[str]:

@@ -29,11 +29,11 @@ export function usualWindow(tile, low = 0.005, high = 0.995) {
 export class Picture {
   /**
    * `extent`: [rows, cols] of the whole picture. Callbacks: `point(row, col, value)` under the pointer (null: outside),
-   * `region([r0, r1, c0, c1])` chosen with Shift, `moved([r0, r1, c0, c1])` the part that is seen, `draw(context, place)` on top.
+   * `region([r0, r1, c0, c1])` or `line([r0, c0, r1, c1])` chosen with Shift, `moved([r0, r1, c0, c1])` the part that is seen, `draw(context, place)` on top.
    * `stretch`: rows and columns each fill the canvas.
    */
-  constructor(canvas, { point = () => {}, region = null, moved = () => {}, draw = () => {}, stretch = false } = {}) {
-    Object.assign(this, { canvas, point, region, moved, drawOver: draw, stretch });
+  constructor(canvas, { point = () => {}, region = null, line = null, moved = () => {}, draw = () => {}, stretch = false } = {}) {
+    Object.assign(this, { canvas, point, region, line, moved, drawOver: draw, stretch });
     this.extent = [1, 1]; this.window = [0, 1]; this.zoom = 1; this.centre = [0.5, 0.5];
     this.image = document.createElement("canvas"); this.tile = null; this.dragged = null; this.pending = false;
     new ResizeObserver(() => this.redraw()).observe(canvas);
@@ -92,7 +92,11 @@ export class Picture {
     const y = (row) => top + row * down, x = (col) => left + col * across;
     context.drawImage(this.image, x(c0), y(r0), (c1 - c0) * across, (r1 - r0) * down);
     this.drawOver(context, { x, y });
-    if (this.chosen) this.box(context, { x, y }, this.chosen, "#3fb950");
+    if (this.chosen && this.line) {
+      const [ra, ca, rb, cb] = this.chosen;
+      context.strokeStyle = "#3fb950"; context.lineWidth = 2;
+      context.beginPath(); context.moveTo(x(ca), y(ra)); context.lineTo(x(cb), y(rb)); context.stroke();
+    } else if (this.chosen) this.box(context, { x, y }, this.chosen, "#3fb950");
   }
 
   box(context, { x, y }, [r0, r1, c0, c1], colour, label = "") {
@@ -132,18 +136,18 @@ export class Picture {
 
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
-    this.dragged = { x: event.clientX, y: event.clientY, from: this.place(event), choose: event.shiftKey && this.region };
+    this.dragged = { x: event.clientX, y: event.clientY, from: this.place(event), choose: event.shiftKey && (this.region || this.line) };
   }
 
   drag(event) {
     const [row, col] = this.place(event);
-    if (this.dragged && this.dragged.choose) { this.chosen = this.between(this.dragged.from, [row, col]); this.redraw(); return; }
+    if (this.dragged && this.dragged.choose) { this.chosen = (this.line ? this.lineTo : this.between).call(this, this.dragged.from, [row, col]); this.redraw(); return; }
     if (this.dragged) { this.moveBy(event.clientY - this.dragged.y, event.clientX - this.dragged.x); this.dragged.x = event.clientX; this.dragged.y = event.clientY; }
     this.tell(row, col);
   }
 
   release() {
-    if (this.dragged && this.dragged.choose && this.chosen) this.region(this.chosen);
+    if (this.dragged && this.dragged.choose && this.chosen) (this.line || this.region)(this.chosen);
     this.dragged = null;
   }
 
@@ -151,6 +155,11 @@ export class Picture {
     const clip = (value, most) => Math.max(0, Math.min(most, Math.round(value)));
     const [rows, cols] = this.extent;
     return [clip(Math.min(ra, rb), rows - 1), clip(Math.max(ra, rb), rows), clip(Math.min(ca, cb), cols - 1), clip(Math.max(ca, cb), cols)];
+  }
+
+  lineTo(from, to) {
+    const clip = (value, i) => Math.max(0, Math.min(this.extent[i], value));
+    return [clip(from[0], 0), clip(from[1], 1), clip(to[0], 0), clip(to[1], 1)];
   }
 
   tell(row, col) {

@@ -5,11 +5,14 @@ from __future__ import annotations
 import http.client
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
+from beamline.page.app import page
 from beamline.page.run_files import Reader, watched
-from beamline.page.serve import Addresses, open_port, start
+from beamline.page.serve import Addresses, PageServer, open_port, start
+from beamline.page.viewed import HELD, ViewedVolume
+from beamline.page.viewer import viewer
 
 
 class Served:
@@ -34,15 +37,32 @@ class Served:
 
 
 @contextmanager
+def viewed(*paths: Path, held: int = HELD) -> Iterator[Served]:
+    """The viewer of volumes."""
+    with ExitStack() as opened:
+        volumes = [opened.enter_context(closing(ViewedVolume(path, held=held))) for path in paths]
+        yield opened.enter_context(_running(start(lambda access: viewer(volumes, access), open_port("127.0.0.1", 0))))
+
+
+@contextmanager
 def served(path: Path, *, control: bool = False) -> Iterator[Served]:
+    """The page of a run or scan file."""
     log: list[str] = []
     reader = Reader(watched(path))
-    server = start(reader, open_port("127.0.0.1", 0), control=control, log=log.append)
+    try:
+        server = start(lambda access: page(reader, access, log.append), open_port("127.0.0.1", 0), control=control)
+        with _running(server, log) as found:
+            yield found
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _running(server: PageServer, log: list[str] | None = None) -> Iterator[Served]:
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
-        yield Served(server.addresses, log)
+        yield Served(server.addresses, [] if log is None else log)
     finally:
         server.stop()
         thread.join()
-        reader.close()

@@ -1,0 +1,158 @@
+// One volume, or two with their difference: slices across z, y, x with one zoom each, grey window, profile, histogram.
+import { Picture, fetchTile, usualWindow, windowSliders } from "./picture.js";
+
+const $ = (name) => document.getElementById(name);
+const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]], COLOURS = ["#1f6feb", "#d29922"];
+const json = async (url) => { const answer = await fetch(url), body = await answer.json(); if (!answer.ok) throw new Error(body.message); return body; };
+const debounce = (action, wait) => { let timer; return (...words) => { clearTimeout(timer); timer = setTimeout(() => action(...words), wait); }; };
+
+let volumes = [], rows = [], profiled = null, plots = {};
+
+/** A row of slices: `url(axis, index)` of its tiles, `shape` and facts of its volume. */
+function addRow(title, facts, url) {
+  const heading = document.createElement("h2"), box = document.createElement("div");
+  heading.textContent = title; box.className = "slices";
+  const row = { facts, url, window: facts.window, pictures: [] };
+  for (let axis = 0; axis < 3; axis++) {
+    const canvas = document.createElement("canvas");
+    canvas.id = `slice${rows.length}${axis}`; canvas.tabIndex = 0;
+    canvas.setAttribute("aria-label", `${title}, slice across ${NAMES[axis]}`);
+    box.append(canvas);
+    row.pictures.push(new Picture(canvas, {
+      point: (r, c, value) => { $("value").textContent = r === null ? "" : `${title}, ${place(row, axis, r, c)}: ${value.toPrecision(5)} ${facts.unit}`; },
+      line: (line) => { profiled = { axis, line, row }; showProfile(); },
+      moved: () => follow(row, axis),
+      draw: (context, { x }) => drawScale(context, canvas, x, row, axis),
+    }));
+    canvas.addEventListener("keydown", (event) => {
+      const step = { PageUp: 1, PageDown: -1 }[event.key];
+      if (!step) return;
+      event.preventDefault();
+      $(`at${axis}`).value = Number($(`at${axis}`).value) + step; showAxis(axis);
+    });
+  }
+  $("slices").append(heading, box);
+  rows.push(row);
+  return row;
+}
+
+/** Index in another volume at the same height of its field. */
+const indexIn = (facts, axis) => Math.min(facts.shape[axis] - 1, Math.floor((Number($(`at${axis}`).value) + 0.5) * facts.shape[axis] / volumes[0].shape[axis]));
+const length = (facts, axis, index) => ((index - (facts.shape[axis] - 1) / 2) * facts.voxel[axis]);
+const inUnits = (facts, axis, index) => facts.length_unit === "px" ? `${index}` : `${length(facts, axis, index).toPrecision(4)} ${facts.length_unit}`;
+
+function place({ facts }, axis, row, col) {
+  const at = [0, 0, 0];
+  at[axis] = indexIn(facts, axis); at[PLANES[axis][0]] = row; at[PLANES[axis][1]] = col;
+  return at.map((index, i) => `${NAMES[i]} ${inUnits(facts, i, index)}`).join(", ");
+}
+
+/** A bar of a round length in the lower left corner. */
+function drawScale(context, canvas, x, { facts }, axis) {
+  const pixel = facts.voxel[PLANES[axis][1]], perScreen = pixel / (x(1) - x(0)), wanted = 90 * perScreen;
+  const ten = 10 ** Math.floor(Math.log10(wanted)), round = [5, 2, 1].find((n) => n * ten <= wanted) * ten, wide = round / perScreen;
+  const height = canvas.getBoundingClientRect().height;
+  context.fillStyle = "#fff"; context.strokeStyle = "#000"; context.lineWidth = 3; context.font = "12px system-ui";
+  context.strokeRect(10, height - 14, wide, 4); context.fillRect(10, height - 14, wide, 4);
+  const text = `${Number(round.toPrecision(1))} ${facts.length_unit}`;
+  context.strokeText(text, 10, height - 20); context.fillText(text, 10, height - 20);
+}
+
+/** Other rows show the part that this one shows; what is seen is fetched at its own resolution. */
+function follow(row, axis) {
+  for (const other of rows) {
+    const [from, to] = [row.pictures[axis], other.pictures[axis]];
+    if (other !== row) { to.zoom = from.zoom; to.centre = [...from.centre]; to.redraw(); }
+    other.refine = other.refine || [0, 1, 2].map((each) => debounce(() => showSlice(other, each), 150));
+    other.refine[axis]();
+  }
+}
+
+async function showSlice(row, axis) {
+  const index = indexIn(row.facts, axis), extent = PLANES[axis].map((i) => row.facts.shape[i]), picture = row.pictures[axis];
+  const [r0, r1, c0, c1] = picture.tile ? picture.seen() : [0, extent[0], 0, extent[1]];
+  try {
+    const tile = await fetchTile(`${row.url(axis, index)}?region=${r0},${r1},${c0},${c1}`);
+    if (index !== indexIn(row.facts, axis)) return;
+    if (!row.window) { const high = Math.max(...usualWindow(tile).map(Math.abs)); setWindow(row, [-high, high]); }
+    picture.window = row.window;
+    picture.show(tile, extent, tile.region);
+  } catch (error) { $("value").textContent = error.message; }
+}
+
+async function showAxis(axis) {
+  $(`where${axis}`).textContent = inUnits(volumes[0], axis, Number($(`at${axis}`).value));
+  await Promise.all(rows.map((row) => showSlice(row, axis)));
+  if (profiled && profiled.axis === axis) showProfile();
+}
+
+let setDifference = null;
+function setWindow(row, window) {
+  row.window = window;
+  setDifference([2 * window[0], 2 * window[1]], window);
+  row.pictures.forEach((picture) => picture.setWindow(window));
+}
+
+function draw(name, title, unit, x, lines, scales) {
+  plots[name]?.destroy();
+  const colour = getComputedStyle(document.body).color, axis = { stroke: colour, grid: { stroke: "#8884" }, ticks: { stroke: "#8884" } };
+  plots[name] = new uPlot({
+    width: $(name).clientWidth || 600, height: 260, scales, axes: [{ ...axis, label: title }, { ...axis, label: unit, size: 70 }],
+    series: [{ label: title }, ...lines.map((line, i) => ({ label: line.name, stroke: COLOURS[i], width: 1.5 }))],
+    hooks: name === "histogram" ? { draw: [drawWindow] } : {},
+  }, [x, ...lines.map((line) => line.values)], $(name));
+}
+
+function drawWindow(plot) {
+  const { ctx, bbox } = plot;
+  ctx.strokeStyle = "#3fb950"; ctx.lineWidth = 2;
+  for (const edge of rows[0].window) {
+    const at = plot.valToPos(edge, "x", true);
+    if (at < bbox.left || at > bbox.left + bbox.width) continue;
+    ctx.beginPath(); ctx.moveTo(at, bbox.top); ctx.lineTo(at, bbox.top + bbox.height); ctx.stroke();
+  }
+}
+
+async function showProfile() {
+  const { axis, line, row } = profiled;
+  const found = await Promise.all(volumes.map((facts, which) => {
+    const scaled = line.map((value, i) => { const side = PLANES[axis][i % 2]; return value * facts.shape[side] / row.facts.shape[side]; });
+    return json(`/api/profile/${which}/${axis}/${indexIn(facts, axis)}?line=${scaled.join(",")}`);
+  }));
+  const distance = found[0].distance;  // of the same line in steps of the first volume's voxels
+  const lines = found.map((each, i) => ({ name: volumes[i].name, values: distance.map((d, k) => each.values[Math.round(k * (each.values.length - 1) / Math.max(distance.length - 1, 1))]) }));
+  $("profile-name").textContent = `${distance.at(-1).toPrecision(4)} ${volumes[0].length_unit} across ${NAMES[axis]}`;
+  draw("profile", volumes[0].length_unit, volumes[0].unit, distance, lines, { x: { time: false } });
+}
+
+async function showHistogram() {
+  const found = await Promise.all(volumes.map((_, which) => json(`/api/histogram/${which}`)));
+  const x = [...new Set(found.flatMap((each) => each.values))].sort((a, b) => a - b);
+  const lines = found.map((each, i) => { const at = new Map(each.values.map((value, k) => [value, each.voxels[k] || null])); return { name: volumes[i].name, values: x.map((value) => at.has(value) ? at.get(value) : undefined) }; });
+  draw("histogram", volumes[0].unit || "value", "voxels", x, lines, { x: { time: false }, y: { distr: 3 } });
+}
+
+async function start() {
+  volumes = await json("/api/volumes");
+  const [first, second] = volumes;
+  $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.shape.join(" x ")} voxels${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
+  document.title = volumes.map((each) => each.name).join(", ");
+  volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `/api/slice/${which}/${axis}/${index}`));
+  const setRange = windowSliders($("window"), (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); });
+  const [low, high] = first.window;
+  for (const row of rows) row.window = first.window;
+  setRange([low - (high - low), high + (high - low)], first.window);
+  if (second && first.shape.join() === second.shape.join()) {
+    $("difference-window").hidden = false;
+    const row = addRow(`${second.name} less ${first.name}`, { ...first, window: null }, (axis, index) => `/api/difference/${axis}/${index}`);
+    setDifference = windowSliders($("difference-window"), (window) => { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); });
+  }
+  for (let axis = 0; axis < 3; axis++) {
+    Object.assign($(`at${axis}`), { max: first.shape[axis] - 1, value: Math.floor(first.shape[axis] / 2) });
+    $(`at${axis}`).addEventListener("input", debounce(() => showAxis(axis), 40));
+  }
+  await Promise.all([0, 1, 2].map(showAxis));
+  await showHistogram();
+}
+
+start().catch((error) => { $("names").textContent = error.message; });

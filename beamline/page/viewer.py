@@ -1,0 +1,97 @@
+"""The viewer's server: one or two volumes as a page, slice by slice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib.resources import files
+from typing import Any, TypeVar
+
+import numpy as np
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from beamline.core.errors import BeamlineError, DataError
+from beamline.page.app import Access, Guard, refused, region_of, tile_of
+from beamline.page.viewed import ViewedVolume
+
+_Result = TypeVar("_Result")
+
+
+def viewer(volumes: Sequence[ViewedVolume], access: Access) -> Starlette:
+    """The application for one volume, or two to compare."""
+    server, static = _Viewer(volumes), files("beamline.page") / "static"
+    routes = [
+        Route("/", lambda request: FileResponse(str(static / "view.html"))),
+        Mount("/static", StaticFiles(directory=str(static))),
+        Route("/api/volumes", server.facts),
+        Route("/api/slice/{which:int}/{axis:int}/{index:int}", server.cut),
+        Route("/api/difference/{axis:int}/{index:int}", server.difference),
+        Route("/api/histogram/{which:int}", server.histogram),
+        Route("/api/profile/{which:int}/{axis:int}/{index:int}", server.profile),
+    ]
+    return Starlette(
+        routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers={BeamlineError: refused}
+    )
+
+
+class _Viewer:
+    """Each answer is computed in one thread, as HDF5 asks for."""
+
+    def __init__(self, volumes: Sequence[ViewedVolume]) -> None:
+        self._volumes, self._thread = volumes, ThreadPoolExecutor(1, thread_name_prefix="viewer")
+
+    async def facts(self, request: Request) -> Response:
+        return JSONResponse(await self._do(lambda: [volume.facts() for volume in self._volumes]))
+
+    async def cut(self, request: Request) -> Response:
+        volume, axis, index = self._volume(request), *_place(request)
+        return await self._tile(lambda: volume.cut(axis, index, region_of(request)))
+
+    async def difference(self, request: Request) -> Response:
+        """The second volume less the first one; DataError unless both have one shape."""
+        if len({volume.shape for volume in self._volumes}) != 1 or len(self._volumes) != 2:
+            raise DataError("A difference is of two volumes of the same shape.")
+        (axis, index), region = _place(request), region_of(request)
+
+        def read() -> Any:
+            first, second = (volume.cut(axis, index, region) for volume in self._volumes)
+            return np.asarray(second[0] - first[0]), *first[1:]
+
+        return await self._tile(read)
+
+    async def histogram(self, request: Request) -> Response:
+        return JSONResponse(await self._do(self._volume(request).histogram))
+
+    async def profile(self, request: Request) -> Response:
+        volume, axis, index = self._volume(request), *_place(request)
+        try:
+            line = [float(word) for word in request.query_params.get("line", "").split(",")]
+            if len(line) != 4 or not all(abs(each) < 1e6 for each in line):
+                raise ValueError
+        except ValueError:
+            raise DataError("A profile is along a line: first row, first column, last row, last column.") from None
+        return JSONResponse(await self._do(lambda: volume.profile(axis, index, line)))
+
+    def _volume(self, request: Request) -> ViewedVolume:
+        which = int(request.path_params["which"])
+        if which >= len(self._volumes):
+            raise DataError(f"Volume {which} is not shown here.")
+        return self._volumes[which]
+
+    async def _tile(self, read: Callable[[], Any]) -> Response:
+        values, shown, factor = await self._do(read)
+        edges = [shown.first_row, shown.last_row, shown.first_col, shown.last_col]
+        return tile_of(values, {"region": edges, "bin": factor})
+
+    async def _do(self, read: Callable[[], _Result]) -> _Result:
+        return await run_in_threadpool(lambda: self._thread.submit(read).result())
+
+
+def _place(request: Request) -> tuple[int, int]:
+    return int(request.path_params["axis"]), int(request.path_params["index"])
