@@ -40,6 +40,12 @@ class Browser:
         service = selenium.ChromeService(shutil.which("chromedriver"))
         self.driver = selenium.Chrome(options=options, service=service)
 
+    def open(self, address: str) -> None:
+        """A page; complaints of earlier ones, whose servers have ended, are forgotten."""
+        self.driver.get("about:blank")
+        self.driver.get_log("browser")
+        self.driver.get(address)
+
     def text(self, name: str) -> str:
         return str(self.driver.find_element("id", name).text)
 
@@ -84,7 +90,7 @@ def test_a_scan_is_watched_paused_resumed_and_stopped(browser: Browser, tmp_path
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as scan:
         assert scan.stderr is not None
         address = next(found[1] for line in scan.stderr if (found := re.search(r"to control: (\S+)", line)))
-        browser.driver.get(address)
+        browser.open(address)
         assert "token" not in browser.driver.current_url
         assert "act" not in browser.driver.current_url
         browser.until(lambda: browser.text("state") == "acquiring", "the views begin")
@@ -107,7 +113,7 @@ def test_a_flag_is_found_on_its_frame(browser: Browser, tmp_path: Path) -> None:
     flag = Flag(CHECKS[0].name, Level.ALARM, 12, 0.5, 0.1, "", region=(0, 2, 5, 9))
     write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {}, flags=[flag])
     with served(tmp_path / "scan.h5") as page:
-        browser.driver.get(page.addresses.look)
+        browser.open(page.addresses.look)
         browser.until(lambda: "1 of 49" in browser.text("flag-count"), "the flag is counted")
         canvas = browser.driver.find_element("id", "flags")
         canvas.send_keys("\ue012")  # arrow to the left: the flag before the newest frame
@@ -124,7 +130,7 @@ def test_what_a_name_holds_is_text(browser: Browser, tmp_path: Path) -> None:
     (tmp_path / "events.jsonl").write_text(events, encoding="utf-8")
     write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
     with served(tmp_path) as page:
-        browser.driver.get(page.addresses.look)
+        browser.open(page.addresses.look)
         browser.until(lambda: evil in browser.text("log"), "the warning is in the log")
         assert browser.script("return window.evil === undefined && document.querySelector('#log img') === null")
 
@@ -132,7 +138,7 @@ def test_what_a_name_holds_is_text(browser: Browser, tmp_path: Path) -> None:
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:
     write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
     with served(tmp_path / "scan.h5") as page:
-        browser.driver.get(page.addresses.look)
+        browser.open(page.addresses.look)
         browser.until(lambda: canvas_has_picture(browser, "frame"), "a frame is drawn")
     browser.until(lambda: "no connection" in browser.text("state"), "the page says that it has lost the server")
 
@@ -142,7 +148,7 @@ def test_two_volumes_are_compared(browser: Browser, tmp_path: Path) -> None:
     for name, values in {"first.npy": ramp, "second.npy": ramp + 7 * (ramp > 2000)}.items():
         np.save(tmp_path / name, values)
     with viewed(tmp_path / "first.npy", tmp_path / "second.npy") as page:
-        browser.driver.get(page.addresses.look)
+        browser.open(page.addresses.look)
         for row in range(3):
             for axis in range(3):
                 browser.until(partial(canvas_has_picture, browser, f"slice{row}{axis}"), f"slice {row} {axis} is drawn")
