@@ -26,7 +26,6 @@ class PiAxisStatus:
     """What the axis says. `raw`: the replies, for errors."""
 
     counts: int
-    moving: bool
     homed: bool
     servo: bool
     raw: str
@@ -94,12 +93,11 @@ class PiGcsAxis:
 
     def status(self) -> PiAxisStatus:
         """Where it is and how; what the error register has becomes `fault`."""
-        moving = self.moving()
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
-        said = f"moving {moving:d}, counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
-        return PiAxisStatus(counts, moving, homed, servo, said)
+        said = f"counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
+        return PiAxisStatus(counts, homed, servo, said)
 
     def limit_switch(self) -> str:
         """Which limit switch is on, in words; "" without one, or for a model with an unknown register."""

@@ -13,7 +13,7 @@ from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
@@ -78,11 +78,6 @@ class PiGcsStage:
     def position(self) -> float:
         return self.to_angle(self._axis.counts())
 
-    def status(self) -> StageStatus:
-        status = self._axis.status()
-        held = None if status.moving or not status.servo or self._away(status.counts) else self._target
-        return StageStatus(status.counts, status.moving, status.homed, self._fault(status), held)
-
     def start_move(self, angle: float, speed: float) -> None:
         target = self._travel.target(angle)
         if not SLOWEST <= math.degrees(speed) <= math.degrees(self.limits.max_speed) * (1 + 1e-12):
@@ -101,7 +96,7 @@ class PiGcsStage:
             self._target = target
 
     def start_home(self) -> None:
-        """See `drivers.base.protocols.Motion`; soft limits do not hold on the way. It ends an armed train."""
+        """Soft limits do not hold on the way. It ends an armed train."""
         with self._begin("the reference move"):
             self._axis.standing("a reference move")
             self._train, self._target, self._homing = None, None, False
@@ -146,9 +141,6 @@ class PiGcsStage:
         """In any state, also while it moves."""
         self._axis.disarm()
         self._train = None
-
-    def remaining_pulses(self) -> None:
-        """None: the controller does not count its pulses."""
 
     def stop(self) -> None:
         self._stops.came(hard=False)
@@ -216,7 +208,7 @@ class PiGcsStage:
     def _fault(self, status: PiAxisStatus) -> str:
         """Why the last move ended early, or what stands, in words; "" for nothing."""
         code, words = self._line.fault, []
-        early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
+        early = self._away(status.counts) or (self._homing and not status.homed)
         if code and code != STOPPED:
             words.append(meaning(code))
         elif early and (code == STOPPED or self._stops.count != self._stops_before):

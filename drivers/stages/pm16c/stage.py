@@ -11,7 +11,7 @@ import math
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import DigitalOutput, StageLimits, StageStatus, TriggerTrain
+from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
 from drivers.stages.pm16c.home import HomeSearch
 from drivers.stages.pm16c.settings import PM16CSettings
@@ -81,7 +81,7 @@ class PM16CStage:
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """See `drivers.base.protocols.Motion`; `wait` does the later steps. An armed train is disarmed."""
+        """`wait` does the later steps of the search. An armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,
@@ -93,12 +93,6 @@ class PM16CStage:
         with self._stops.none_while("the search"):
             search.begin(self._settings.search_rate)
         self._target, self._search = self._home, search
-
-    def status(self) -> StageStatus:
-        """See `drivers.base.protocols.Motion`; `homed` is None without a home switch."""
-        status = self._channel.status()
-        homed = None if self._home is None else self._channel.home() is not None
-        return StageStatus(status.counts, status.moving, homed, status.ending)
 
     def moving(self) -> bool:
         return self._channel.status().moving
@@ -134,9 +128,6 @@ class PM16CStage:
 
     def disarm(self) -> None:
         self._channel.disarm()
-
-    def remaining_pulses(self) -> None:
-        """None: the controller says only whether the first pulse is still to come."""
 
     def stop(self) -> None:
         self._stops.came(hard=False)

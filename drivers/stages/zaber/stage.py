@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.standing import longest_stop, until_standing
 from drivers.stages.stops import Stops
 from drivers.stages.travel import Travel
@@ -83,11 +83,6 @@ class ZaberStage:
 
     def position(self) -> float:
         return self.to_angle(self._axis.status().counts)
-
-    def status(self) -> StageStatus:
-        status = self._axis.status()
-        fault = meaning_of(status.flags)
-        return StageStatus(status.counts, status.moving, status.referenced, "" if fault is None else fault.text)
 
     def start_move(self, angle: float, speed: float) -> None:
         self._start_move(angle, speed, self._stops.count)
@@ -175,10 +170,6 @@ class ZaberStage:
     def disarm(self) -> None:
         """Legal in every state. The output is put at rest."""
         self._pulses.disarm()
-
-    def remaining_pulses(self) -> int:
-        """By the fires that the controller's triggers still count."""
-        return self._pulses.remaining()
 
     def stop(self) -> None:
         self._stops.came(hard=False)

@@ -1,4 +1,4 @@
-"""Every stage: identity, position, absolute and relative moves, status, closing."""
+"""Every stage: identity, position, moves, closing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind, start_move_by
+from drivers.testing.stages.bench import LONG, SPEED, StageBench
 
 
 class Moves:
@@ -97,55 +97,6 @@ class Moves:
             bench.stage.wait(0.5)
         assert bench.stage.moving()
         assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
-
-    @pytest.mark.slow
-    def test_a_thousand_relative_moves_of_a_third_of_a_degree_land_on_exact_counts(
-        self, kind: StageKind, bench: StageBench
-    ) -> None:
-        """A third of a degree is no whole count; no move may add another rounding, up, down, or at the turns."""
-        stage = bench.stage
-        third = math.radians(1 / 3)
-        counts = stage.to_counts(third)
-        assert third != stage.to_angle(counts)
-        speed = stage.limits.max_speed
-        expected = 0
-        for sign, share in ((1, 0.29), (-1, 0.3), (1, 0.295), (-1, 0.115)):
-            moves = round(share * kind.relative_moves)
-            for _ in range(moves):
-                start_move_by(stage, sign * third, speed)
-                stage.wait(LONG)
-            expected += sign * moves * counts
-            assert stage.status().counts == expected
-            assert stage.to_counts(stage.position()) == expected
-        assert bench.line.angle_at(bench.clock.now()) == pytest.approx(stage.to_angle(expected), rel=1e-9)
-
-    @pytest.mark.parametrize("degrees", [-5.5, 101.0, math.nan, math.inf])
-    def test_a_relative_move_beyond_the_limits_is_refused(self, bench: StageBench, degrees: float) -> None:
-        bench.go(1.0)
-        with pytest.raises(DeviceRefused, match="Nothing has moved"):
-            start_move_by(bench.stage, math.radians(degrees) - math.radians(1.0), SPEED)
-        assert math.degrees(bench.stage.position()) == pytest.approx(1.0, abs=bench.count)
-
-    def test_a_relative_move_is_refused_while_it_moves(self, bench: StageBench) -> None:
-        bench.stage.start_move(math.radians(20), SPEED)
-        bench.clock.sleep(0.5)
-        with pytest.raises(DeviceRefused, match="moves"):
-            start_move_by(bench.stage, 0.1, SPEED)
-        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
-
-    def test_its_status_is_where_it_is_and_what_it_does(self, bench: StageBench) -> None:
-        stage = bench.stage
-        status = stage.status()
-        assert (status.counts, status.moving, status.fault) == (0, False, "")
-        stage.start_move(math.radians(30), SPEED)
-        bench.clock.sleep(1.5)
-        status = stage.status()
-        assert status.moving
-        assert 0 < status.counts < bench.counts(30)
-        assert status.counts == pytest.approx(bench.counts(math.degrees(bench.line.angle_at(bench.clock.now()))), abs=2)
-        stage.wait(LONG)
-        status = stage.status()
-        assert (status.counts, status.moving, status.fault) == (bench.counts(30), False, "")
 
     def test_closing_twice_is_fine_and_a_closed_stage_says_so(self, bench: StageBench) -> None:
         bench.stage.close()

@@ -8,21 +8,11 @@ import threading
 import pytest
 
 from drivers.base.errors import DeviceError
-from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
+from drivers.testing.stages.bench import LONG, SPEED, StageBench
 
 
 class StopTests:
     """Laws of drivers.base.protocols.RotationStage; see `drivers.testing.stages.StageConformance`."""
-
-    def test_its_status_tells_a_stop_until_the_next_move_where_it_remembers_stops(
-        self, kind: StageKind, bench: StageBench
-    ) -> None:
-        bench.stage.start_move(math.radians(30), SPEED)
-        bench.clock.sleep(1.0)
-        bench.stage.stop()
-        assert (bench.stage.status().fault != "") is kind.stops_are_told
-        bench.go(2.0)
-        assert bench.stage.status().fault == ""
 
     @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
     def test_a_stop_on_the_way_stands_short_and_gives_no_more_pulses(self, bench: StageBench, hard: bool) -> None:
