@@ -15,7 +15,8 @@ from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.mapping import Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
 
-Length, Height = Annotated[float, Field(ge=1e-9, le=1e9)], Annotated[float, Field(ge=-1e9, le=1e9)]
+Length = Annotated[float, Field(ge=1e-9, le=1e9)]
+Height = Annotated[float, Field(ge=-1e9, le=1e9)]
 """mm. With larger values, more crumbs or deeper ones a frame takes seconds or overflows."""
 
 

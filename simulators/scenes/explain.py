@@ -13,9 +13,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from simulators.effects.catalogue import CATALOGUE
+from simulators.effects.catalogue import CATALOGUE, Domain
 from simulators.effects.chain import Chain, ImageEffect
-from simulators.frame.domain import Domain
 from simulators.frame.shot import Shot
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene

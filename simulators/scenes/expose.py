@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.effects.catalogue import Domain
 from simulators.effects.chain import StepHook
-from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.sensor import digitise, largest_count
 from simulators.frame.shot import Image, Shot

@@ -12,12 +12,10 @@ import math
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
-from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
-from drivers.stages.pm16c.home import HomeSearch
+from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.train import MODES, points_of
-from drivers.stages.standing import longest_stop, until_standing
-from drivers.stages.stops import Stops
+from drivers.stages.stops import Stops, longest_stop, until_standing
 from drivers.stages.travel import Travel
 
 

@@ -13,8 +13,7 @@ from dataclasses import replace
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.stages.standing import longest_stop, until_standing
-from drivers.stages.stops import Stops
+from drivers.stages.stops import Stops, longest_stop, until_standing
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
 from drivers.stages.zaber.packet import meaning_of

@@ -69,6 +69,10 @@ class StageBench:
         """Those that have been emitted by now."""
         return emitted(self.line, self.clock)
 
+    def pulse_counts(self) -> list[int]:
+        """Where they came, in counts."""
+        return [self.stage.to_counts(pulse.angle) for pulse in self.pulses()]
+
     def go(self, degrees: float) -> float:
         """Move and wait; returns its place in degrees."""
         self.stage.start_move(math.radians(degrees), SPEED)

@@ -1,13 +1,14 @@
-"""Every stage: identity, position, moves, closing."""
+"""Every stage: identity, position, moves, stops, the search for the reference, closing."""
 
 from __future__ import annotations
 
 import math
+import threading
 
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.testing.stages.bench import LONG, SPEED, StageBench
+from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
 
 
 class Moves:
@@ -103,3 +104,114 @@ class Moves:
         bench.stage.close()
         with pytest.raises(DeviceError):
             bench.stage.position()
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_stop_on_the_way_stands_short_and_gives_no_more_pulses(self, bench: StageBench, hard: bool) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 40))
+        bench.stage.start_move(math.radians(50), SPEED)
+        bench.clock.sleep(2.0)
+        asked_at = bench.clock.now()
+        (bench.stage.abort if hard else bench.stage.stop)()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(LONG)
+        assert not bench.stage.moving()
+        where = bench.stage.position()
+        braking = 0.0 if hard else SPEED / bench.stage.limits.acceleration
+        assert bench.clock.now() - asked_at == pytest.approx(braking, abs=0.3)
+        bench.clock.sleep(30.0)
+        assert bench.stage.position() == where
+        assert 5.0 < math.degrees(where) < 25.0
+        assert len(bench.pulses()) == math.floor(math.degrees(where) + 1e-9)
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_stop_is_legal_while_it_stands_and_it_moves_afterwards(self, bench: StageBench, hard: bool) -> None:
+        (bench.stage.abort if hard else bench.stage.stop)()
+        assert bench.stage.wait(1.0) == 0.0
+        assert bench.go(2.0) == pytest.approx(2.0, abs=bench.count)
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_after_a_stop_it_goes_on_elsewhere(self, bench: StageBench, hard: bool) -> None:
+        bench.stage.start_move(math.radians(50), SPEED)
+        bench.clock.sleep(1.0)
+        (bench.stage.abort if hard else bench.stage.stop)()
+        assert bench.go(-2.0) == pytest.approx(-2.0, abs=bench.count)
+
+    def test_a_stop_from_another_thread_ends_the_wait_with_an_error(self, bench: StageBench) -> None:
+        bench.stage.start_move(math.radians(90), math.radians(1))
+        bench.clock.sleep(5.0)
+        stopper = threading.Thread(target=bench.stage.stop)
+        stopper.start()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(1e4)
+        stopper.join()
+        assert not bench.stage.moving()
+
+    def test_a_search_ends_at_the_same_place_from_either_side(self, kind: StageKind, bench: StageBench) -> None:
+        if not kind.homes:
+            _refused(bench, 20.0)
+            return
+        places, counts = [], []
+        for degrees in (20.0, -4.0, 0.0):
+            bench.go(degrees)
+            before = bench.clock.now()
+            bench.stage.start_home()
+            assert bench.clock.now() - before < 0.5
+            where = bench.stage.wait(LONG)
+            assert bench.stage.position() == where
+            assert not bench.stage.moving()
+            places.append(bench.line.angle_at(bench.clock.now()))
+            counts.append(bench.stage.to_counts(where))
+        assert places == pytest.approx([places[0]] * 3, abs=math.radians(bench.count))
+        assert counts == [counts[0]] * 3
+        assert bench.go(5.0) == pytest.approx(5.0, abs=bench.count)
+        assert bench.pulses() == []
+
+    def test_a_search_may_need_more_than_one_wait(self, kind: StageKind, bench: StageBench) -> None:
+        if not kind.homes:
+            _refused(bench, 30.0)
+            return
+        bench.go(30.0)
+        bench.stage.start_home()
+        with pytest.raises(DeviceTimeout, match="left moving"):
+            bench.stage.wait(0.1)
+        bench.stage.wait(LONG)
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_search_that_is_stopped_is_not_taken_for_done(
+        self, kind: StageKind, bench: StageBench, hard: bool
+    ) -> None:
+        if not kind.homes:
+            _refused(bench, 90.0)
+            return
+        bench.go(90.0)
+        bench.stage.start_home()
+        bench.clock.sleep(0.3)
+        (bench.stage.abort if hard else bench.stage.stop)()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(LONG)
+        where = bench.stage.position()
+        bench.clock.sleep(30.0)
+        assert bench.stage.position() == where
+        bench.stage.start_home()
+        bench.stage.wait(LONG)
+
+    def test_a_search_is_refused_while_it_moves_or_without_a_reference(
+        self, kind: StageKind, bench: StageBench
+    ) -> None:
+        if not kind.homes:
+            _refused(bench, 0.0)
+            return
+        bench.stage.start_move(math.radians(20), SPEED)
+        bench.clock.sleep(0.5)
+        with pytest.raises(DeviceRefused, match="moves"):
+            bench.stage.start_home()
+        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
+
+
+def _refused(bench: StageBench, degrees: float) -> None:
+    """A stage without a reference refuses a search where it stands, and stays there."""
+    bench.go(degrees)
+    before = bench.stage.position()
+    with pytest.raises(DeviceRefused, match="Nothing has moved"):
+        bench.stage.start_home()
+    assert bench.stage.position() == before

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Annotated, ClassVar, Protocol
 
-from simulators.samples.bodies.solids import Solid
+from pydantic import Field
+
+from simulators.samples.bodies.solids import LEAST, MOST, Solid
+
+Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
+Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]
+Gap = Annotated[float, Field(ge=0, le=1e3 * MOST)]
+"""um."""
 
 
 @dataclass(frozen=True)

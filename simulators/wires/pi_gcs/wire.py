@@ -19,8 +19,7 @@ from drivers.stages.pi_gcs.settings import PiGcsSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.axis import GcsAxis, GcsError, PiAxisBuild
 from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
-from simulators.wires.pi_gcs.output import PiOutput
-from simulators.wires.pi_gcs.trigger import FirstPulse
+from simulators.wires.pi_gcs.output import FirstPulse, PiOutput
 
 OUTPUTS = 4
 LONGEST_LINE = 256

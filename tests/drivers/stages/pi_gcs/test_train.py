@@ -9,7 +9,7 @@ import pytest
 from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED
-from simulators.wires.pi_gcs.trigger import FirstPulse
+from simulators.wires.pi_gcs.output import FirstPulse
 from tests.drivers.stages.pi_gcs_rig import Rig
 
 
