@@ -1,4 +1,4 @@
-"""Stops of a stage, from any thread, and the wait until it stands."""
+"""Stops of a stage, from any thread; the wait until it stands; the refusal of what needs that."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 from drivers.base.clock import Clock
-from drivers.base.errors import DeviceError
+from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import StageLimits
 
 
@@ -84,3 +84,14 @@ def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[St
 def longest_stop(limits: StageLimits) -> float:
     """s after a stop by which every stage stands: it slows down from its full speed."""
     return limits.max_speed / limits.acceleration + STOP_MARGIN
+
+
+def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> DeviceRefused:
+    """The refusal of what needs a standing stage."""
+    return DeviceRefused(
+        name,
+        f"{purpose} is not possible while it moves",
+        reply=reply,
+        advice="Wait for the move to end, or stop it",
+        state=f"The move under way goes on; it is at {counts} counts",
+    )

@@ -14,6 +14,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.stages.pm16c.line import PM16CLine
 from drivers.stages.pm16c.train import TriggerPoints
 from drivers.stages.settings import Wiring
+from drivers.stages.stops import while_it_moves
 
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)
@@ -98,13 +99,7 @@ class PM16CChannel:
         """The status; refuses `purpose` while the motor moves or the panel is in LOCAL."""
         status = self.status()
         if status.moving:
-            raise DeviceRefused(
-                self._name,
-                f"{purpose} is not possible while it moves",
-                reply=status.raw,
-                advice="Wait for the move to end, or stop it",
-                state=f"The move under way goes on; it is at {status.counts} counts",
-            )
+            raise while_it_moves(self._name, purpose, status.counts, status.raw)
         if not status.remote:
             raise DeviceRefused(
                 self._name,
