@@ -86,7 +86,8 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
             advice="Ask for a larger region of interest",
             state="No frame was taken",
         )
-    line = 2 * properties.get(Property.TIMING_READOUTTIME) / _sensor_rows(properties, settings)
+    sensor_rows = properties.get(Property.IMAGE_HEIGHT) * settings.binning
+    line = 2 * properties.get(Property.TIMING_READOUTTIME) / sensor_rows
     tolerance = options.exposure_tolerance * settings.exposure + line
     properties.set_nearly(Property.EXPOSURETIME, settings.exposure, tolerance)
     apply_trigger_source(properties, settings.trigger)
@@ -174,8 +175,3 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     properties.set_exactly(Property.SUBARRAYVPOS, row0)
     properties.set_exactly(Property.SUBARRAYHPOS, col0)
     properties.set_exactly(Property.SUBARRAYMODE, codes.ON)
-
-
-def _sensor_rows(properties: Properties, settings: CameraSettings) -> float:
-    """Number of sensor rows that are read, before binning."""
-    return properties.get(Property.IMAGE_HEIGHT) * settings.binning

@@ -119,13 +119,7 @@ class StageFigures:
 
 @dataclass(frozen=True)
 class Wiring:
-    """How a stage's controller is connected; s.
-
-    Attributes:
-        baudrate: as set on the controller; nominal over USB and TCP.
-        pulse_width: s; None leaves it to the driver.
-        active_high: polarity of the pulses.
-        transcript: file to which every byte on the wire is appended; None keeps none.
+    """How a stage's controller is connected; s. The baud rate is as set on the controller, nominal over USB and TCP.
 
     Raises:
         ValueError: no reply can come in that timeout.

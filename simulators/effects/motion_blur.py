@@ -48,10 +48,7 @@ class MotionBlur(SamplingEffect):
         """Number of moments; 0 if the stage stands while the first row is exposed."""
         angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
         turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
-        return math.ceil(min(turned * _rim(shot) / self.tolerance_px, self.max_samples))
-
-
-def _rim(shot: Shot) -> float:
-    """Largest travel of the sample's rim in pixels a radian; in a cone on the side towards the source."""
-    reach, sod = shot.radius / shot.detector.pitch, shot.detector.sod
-    return reach if math.isinf(sod) else reach / max(1 - shot.radius / sod, 0.05)
+        rim, sod = shot.radius / shot.detector.pitch, shot.detector.sod  # its travel, pixels a radian
+        if not math.isinf(sod):
+            rim /= max(1 - shot.radius / sod, 0.05)  # on the side towards the source
+        return math.ceil(min(turned * rim / self.tolerance_px, self.max_samples))

@@ -88,7 +88,7 @@ class PiGcsStage(LineStage):
 
     def wait(self, timeout: float) -> float:
         target, homing = self._target, self._homing
-        if self._until_standing(timeout):
+        if until_standing(self._clock, self.moving, bool, timeout):
             aim = "" if target is None else self._travel.degrees(target)
             raise self._travel.still_moving(timeout, self._axis.counts(), aim, self._axis.last_move)
         if target is not None:
@@ -152,10 +152,6 @@ class PiGcsStage(LineStage):
 
     def _send_stop(self, hard: bool) -> str:
         return self._axis.stop_all() if hard else self._axis.brake()
-
-    def _until_standing(self, timeout: float) -> bool:
-        """Wait until it stands; returns whether it still moves when the time is over."""
-        return until_standing(self._clock, self.moving, bool, timeout)
 
     def _until_settled(self, target: int) -> None:
         """Wait for the servo to reach the target, if the stage is near it."""

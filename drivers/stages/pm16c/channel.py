@@ -151,14 +151,9 @@ class PM16CChannel:
         self.standing("disarming")
         self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
 
-    def slow_stop(self) -> str:
-        """Send the stop command without waiting; returns it."""
-        self._line.send(command := f"SSTP{self._digit}")
-        return command
-
-    def emergency_stop(self) -> str:
-        """As `slow_stop`, without deceleration."""
-        self._line.send(command := f"ESTP{self._digit}")
+    def stop(self, hard: bool) -> str:
+        """Send a stop (hard: without deceleration) without waiting; returns the command."""
+        self._line.send(command := f"{'ESTP' if hard else 'SSTP'}{self._digit}")
         return command
 
     def close(self) -> None:
@@ -251,7 +246,7 @@ class HomeSearch:
                 self._channel.go_home(found)
             finally:
                 if self._cancelled:  # the stop may have gone out just before the move
-                    self._channel.slow_stop()
+                    self._channel.stop(hard=False)
             return True
         if status.counts != found:
             raise self._failed(status)

@@ -51,7 +51,7 @@ class PM16CStage(LineStage):
     @staticmethod
     def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
         with contextlib.closing(PM16CChannel(url, settings.channel, settings.wiring, clock, "stage")) as channel:
-            channel.slow_stop()
+            channel.stop(hard=False)
 
     def _counts(self) -> int:
         return self._channel.counts()
@@ -133,7 +133,7 @@ class PM16CStage(LineStage):
     def _send_stop(self, hard: bool) -> str:
         if (search := self._search) is not None:
             search.cancel()
-        return self._channel.emergency_stop() if hard else self._channel.slow_stop()
+        return self._channel.stop(hard)
 
     def digital_output(self, number: int) -> DigitalOutput:
         raise DeviceRefused(

@@ -16,7 +16,7 @@ from drivers.base.protocols import TriggerTrain
 from drivers.stages.shared import LineStage
 from drivers.stages.stops import Stops, until_standing
 from drivers.stages.travel import Travel
-from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
+from drivers.stages.zaber.axis import ZaberAxis
 from drivers.stages.zaber.packet import meaning_of
 from drivers.stages.zaber.pulses import ZaberOutput, ZaberPulses
 from drivers.stages.zaber.settings import ZaberSettings
@@ -109,7 +109,7 @@ class ZaberStage(LineStage):
         return self._axis.status().moving
 
     def wait(self, timeout: float) -> float:
-        status = self._until_standing(timeout)
+        status = until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)
         aim = "its reference" if self._homing else "" if self._target is None else self._travel.degrees(self._target)
         if status.moving:
             raise self._travel.still_moving(timeout, status.counts, aim, self._axis.last_move, status.raw)
@@ -199,7 +199,3 @@ class ZaberStage(LineStage):
                 state="Nothing has moved",
             )
         self._travel.refuse_narrower(*self._axis.travel(), advice="widen the controller's limits")
-
-    def _until_standing(self, timeout: float) -> ZaberAxisStatus:
-        """The status once the stage stands, or when the time is over."""
-        return until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)

@@ -74,7 +74,9 @@ class Resolution:
         z = -height / MARGIN / 2
         pieces = [Piece(Cylinder(radius, height, 1.0), "carrier")]
         for solids, role, tall in self._layers():
-            pieces += [Piece(_raised(solid, z + tall / 2), role, "carrier") for solid in solids]
+            for solid in solids:
+                x, y, own = solid.centre
+                pieces.append(Piece(replace(solid, centre=(x, y, own + (z + tall / 2))), role, "carrier"))
             z += tall
         return tuple(pieces)
 
@@ -136,8 +138,3 @@ def _reach(solid: Box | Ellipsoid | Polyhedron) -> float:
         case Ellipsoid():
             return math.hypot(x, y) + max(solid.semi_axes)
     return max(math.hypot(px, py) for px, py, _ in solid.vertices)
-
-
-def _raised(solid: Box | Ellipsoid | Polyhedron, z: float) -> Box | Ellipsoid | Polyhedron:
-    x, y, own = solid.centre
-    return replace(solid, centre=(x, y, own + z))

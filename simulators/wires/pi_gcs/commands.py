@@ -75,6 +75,10 @@ def _number(text: str, low: float, high: float, out_of_range: int = 17) -> float
     return float(text)
 
 
+def _place(box: PiGcsBox, arguments: list[str]) -> float:
+    return _number(box.axis_of(arguments, 1)[0], -1e12, 1e12, 7)
+
+
 def _plain(value: float) -> str:
     return f"{value + 0.0:.{DECIMALS}f}"
 
@@ -106,14 +110,6 @@ def _rate(attribute: str, highest: Callable[[PiAxisBuild], float], error: int = 
         setattr(box.axis, attribute, value)
 
     return do
-
-
-def _move_to(box: PiGcsBox, arguments: list[str]) -> None:
-    box.axis.move_to(_number(box.axis_of(arguments, 1)[0], -1e12, 1e12, 7))
-
-
-def _move_by(box: PiGcsBox, arguments: list[str]) -> None:
-    box.axis.move_to(box.axis.target() + _number(box.axis_of(arguments, 1)[0], -1e12, 1e12, 7))
 
 
 def _reference(kind: str) -> Action:
@@ -243,8 +239,8 @@ COMMANDS: dict[str, Action] = {
     "POS?": _of_axis(lambda box: _plain(box.axis.position())),
     "TMN?": _of_axis(lambda box: _plain(box.axis.build.low)),
     "TMX?": _of_axis(lambda box: _plain(box.axis.build.high)),
-    "MOV": _move_to,
-    "MVR": _move_by,
+    "MOV": lambda box, arguments: box.axis.move_to(_place(box, arguments)),
+    "MVR": lambda box, arguments: box.axis.move_to(box.axis.target() + _place(box, arguments)),
     "MOV?": _of_axis(lambda box: _plain(box.axis.target())),
     "ONT?": _of_axis(lambda box: f"{box.axis.on_target():d}"),
     "VEL": _rate("velocity", lambda build: build.max_velocity, 8),

@@ -67,11 +67,6 @@ class Crossing:
     after: TrainProgress
 
 
-def switched_on(window: Window, position: float) -> TrainProgress:
-    """What a line knows when TRO switches it on with the axis at `position` (counts)."""
-    return TrainProgress() if window.sign else TrainProgress(True, position, 0)
-
-
 def crossings(window: Window, progress: TrainProgress, begin: float, end: float) -> Iterator[Crossing]:
     """What happens on the straight way from `begin` (not included) to `end` (included), in order."""
     if begin == end:
@@ -172,7 +167,7 @@ class WiredOutput:
         owed = self._settle(now)
         self.settings.on, self._zero = on, zero
         self._done_until = move.position(now)
-        self._progress = switched_on(self._window(), self._done_until)
+        self._progress = TrainProgress() if self._window().sign else TrainProgress(True, self._done_until, 0)
         self._schedule(move, now, owed)
 
     def begin(self, move: TrapezoidMove, zero: int, now: float) -> None:

@@ -27,10 +27,6 @@ LONGEST_LINE = 256
 Spoil = Callable[[int, bytes], bytes]
 
 
-def _as_sent(number: int, reply: bytes) -> bytes:
-    return reply
-
-
 def _degrees(angle: float) -> float:
     """As the driver writes it: with 12 decimals."""
     return round(math.degrees(angle), 12)
@@ -56,7 +52,7 @@ class PiGcsBuild:
     output: int = 1
     latency: float = 0.0
     unknown: Set[str] = frozenset()
-    spoil: Spoil = _as_sent
+    spoil: Spoil = lambda number, reply: reply
     specimen: PiAxisBuild = field(default=PiAxisBuild())
 
     def __post_init__(self) -> None:

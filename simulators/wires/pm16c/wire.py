@@ -33,10 +33,6 @@ Query = Callable[..., str]
 Setting = Callable[..., None]
 
 
-def _error_text(box: PM16CBox) -> str:
-    return next((text for flag, text in ERROR_TEXT.items() if flag in box.errors), "NO ERROR")
-
-
 def _clear_errors(box: PM16CBox) -> None:
     box.errors = Pm16cError(0)
 
@@ -65,7 +61,7 @@ QUERIES: tuple[tuple[str, Query], ...] = (
     (rf"SETLS\?{_C}", lambda box, c: box.channels[c].switches),
     (rf"STS{_C}\?", PM16CBox.channel_status),
     (r"STQ\?", lambda box: f"{box.place}{4 - box.moving()}"),
-    (r"ERR\?", _error_text),
+    (r"ERR\?", lambda box: next((text for flag, text in ERROR_TEXT.items() if flag in box.errors), "NO ERROR")),
     (r"ERRF\?", lambda box: f"{box.errors:02X}"),
     (rf"TMGM\?{_C}", PM16CBox.mode),
     (rf"TMGS\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.start:+08d}"),

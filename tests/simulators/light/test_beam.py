@@ -48,7 +48,7 @@ def test_the_source_is_far_unless_it_is_said() -> None:
         ({"harmonics": {3: 0.1}, "spectrum": [[8, 1]]}, "harmonics needs an energy_kev"),
         ({"energy_kev": 0}, "energy_kev must be greater than 0, got 0"),
         ({"energy_kev": 8, "bandwidth": 0.5}, "bandwidth must be less than or equal to 0.2, got 0.5"),
-        ({"energy_kev": 8, "harmonics": {1: 0.1}}, "harmonics.1: key must be greater than or equal to 2"),
+        ({"energy_kev": 8, "harmonics": {1: 0.1}}, r"harmonics\[1\]: key must be greater than or equal to 2"),
         ({"energy_kev": 8, "harmonics": {2: 0.5, 3: 0.5}}, "below 1 in sum"),
         ({"energy_kev": 8, "harmonics": [3, 0.1]}, r"beam.harmonics must be a mapping, got \[3, 0.1\]"),
         (
