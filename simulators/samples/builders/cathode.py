@@ -15,7 +15,7 @@ from simulators.frame.mapping import BelowOne, NotNegative, Positive, Share
 from simulators.samples.bodies.solids import Cylinder
 from simulators.samples.builders.arrangement import arrange, bodies_of
 from simulators.samples.builders.grains import Habit, Sizes, core, crack, grains
-from simulators.samples.builders.piece import Gap, Micrometres, Piece, check_roles
+from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
 
 MADE_OF: Mapping[str, str] = MappingProxyType(
     {
@@ -38,7 +38,7 @@ transmits about 5 % at its thickest part."""
 
 
 @dataclass(frozen=True)
-class Cathode:
+class Cathode(PieceBuilder):
     """A cell around the rotation axis.
 
     The largest fill depends on the grains: 0.55 for spheres, 0.45 for the default habits, 0.35 for octahedra or plates
@@ -58,8 +58,6 @@ class Cathode:
         hollow, cracked: shares of the grains that have a hole, of half their size, or a crack.
         gap_um: between two grains, at least.
         collector_um, separator_um: thickness of the foil below and of the film above; 0: none.
-        made_of: other materials for parts: {particle: NMC622, wall: steel}; for a beam with energies.
-        attenuation: 1/mm of parts, for a beam without energies, or in place of all materials.
         seed: of all random numbers.
     """
 
@@ -81,8 +79,6 @@ class Cathode:
     gap_um: Gap = 0.0
     collector_um: NotNegative = 0.0
     separator_um: NotNegative = 0.0
-    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     seed: int = 0
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF
@@ -108,7 +104,6 @@ class Cathode:
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
         return {role: value * 2 / self.diameter for role, value in GREY.items()}
 
     def pieces(self) -> tuple[Piece, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
-from simulators.samples.builders.piece import Gap, Micrometres, Millimetres, Piece, check_roles
+from simulators.samples.builders.piece import Gap, Micrometres, Millimetres, Piece, PieceBuilder, check_roles
 
 Reals = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ GREY = 2.0
 
 
 @dataclass(frozen=True)
-class Foam:
+class Foam(PieceBuilder):
     """A foam around the rotation axis.
 
     Attributes:
@@ -40,8 +40,6 @@ class Foam:
         largest_um, smallest_um: diameters of holes.
         gap_um: least thickness of matter between holes and to the outside.
         candidates: number of random points; more of them make a denser foam. The largest number takes minutes and 2 GB.
-        made_of: other materials for matter and hole, for a beam with energies.
-        attenuation: 1/mm of them, for a beam without energies, or in place of materials.
         seed: of all random numbers.
     """
 
@@ -53,8 +51,6 @@ class Foam:
     smallest_um: Micrometres = 5.0
     gap_um: Gap = 1.0
     candidates: Annotated[int, Field(ge=1, le=10_000_000)] = 200_000
-    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     seed: int = 0
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF
@@ -66,7 +62,6 @@ class Foam:
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
         width = self.diameter if self.edges is None else max(self.edges[:2])
         return {"matter": GREY * 2 / width, "hole": 0.0}
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Annotated, ClassVar
 
 from pydantic import Field
 
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Vector
-from simulators.samples.builders.piece import Gap, Micrometres, Piece, check_roles
+from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"carrier": "polypropylene", "bar": "Al", "star": "Al", "ball": "Al"})
 GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star": 2.0, "ball": 2.0})
@@ -27,7 +27,7 @@ MARGIN = 1.1
 
 
 @dataclass(frozen=True)
-class Resolution:
+class Resolution(PieceBuilder):
     """A pattern around the rotation axis.
 
     Attributes:
@@ -37,8 +37,6 @@ class Resolution:
         spokes: of the star.
         star_height_um: its thickness.
         balls_um: diameters; empty: no balls.
-        made_of: other materials for carrier, bar, star and ball, for a beam with energies.
-        attenuation: 1/mm of them, for a beam without energies, or in place of materials.
     """
 
     widths_um: tuple[Micrometres, ...] = (30.0, 20.0, 14.0, 10.0, 7.0, 5.0)
@@ -47,8 +45,6 @@ class Resolution:
     spokes: Annotated[int, Field(ge=3, le=1000)] = 36
     star_height_um: Micrometres = 60.0
     balls_um: tuple[Micrometres, ...] = (60.0, 40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
-    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF
 
@@ -64,7 +60,6 @@ class Resolution:
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
         radius = self._size()[0]
         return {role: value / radius for role, value in GREY.items()}
 
