@@ -45,8 +45,6 @@ def _fields_of(settings: type[Any], defaults: Any) -> list[FlatField]:
     hints, found = get_type_hints(settings), list[FlatField]()
     for field in fields(settings):
         default = field.default if defaults is MISSING else getattr(defaults, field.name)
-        if default is MISSING and field.default_factory is not MISSING:
-            default = field.default_factory()
         if is_dataclass(hints[field.name]):
             found += _fields_of(hints[field.name], default)
         else:

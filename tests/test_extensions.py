@@ -174,7 +174,7 @@ EFFECT = Extension(
 from dataclasses import dataclass
 from typing import ClassVar
 
-from simulators.frame.domain import Domain
+from simulators.effects.catalogue import Domain
 
 
 @dataclass(frozen=True)

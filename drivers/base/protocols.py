@@ -53,27 +53,22 @@ class TriggerTrain:
         return self.start + self.interval * (self.n - 1)
 
 
-@dataclass(frozen=True)
-class StageStatus:
-    """The present state of the controller.
+class DigitalOutput(Protocol):
+    """One output line of some controller."""
 
-    Attributes:
-        counts: its present place, in whole encoder counts (motor pulses).
-        moving: it has not come to rest.
-        homed: its counts refer to the reference; None if this controller cannot tell.
-        fault: why the last move ended early, or a standing fault, in words; "" without one.
-        held: count at which a servo holds it after a completed move; it may differ from `counts`. None otherwise.
-    """
+    name: str
 
-    counts: int
-    moving: bool
-    homed: bool | None
-    fault: str
-    held: int | None = None
+    def set(self, high: bool) -> None:
+        """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
+        ...
+
+    def get(self) -> bool | None:
+        """Whether the line is high; None if the controller cannot read it back."""
+        ...
 
 
-class Motion(Protocol):
-    """An axis that turns: angles in radians outside, whole counts inside."""
+class RotationStage(Protocol):
+    """A rotation stage with position-synchronised trigger pulses: angles in radians outside, whole counts inside."""
 
     name: str
 
@@ -88,10 +83,6 @@ class Motion(Protocol):
 
     def position(self) -> float:
         """Radians, read from the device."""
-        ...
-
-    def status(self) -> StageStatus:
-        """The present state; DeviceError if the reply cannot be understood."""
         ...
 
     def start_move(self, angle: float, speed: float) -> None:
@@ -120,37 +111,11 @@ class Motion(Protocol):
         """Stop at once, without deceleration. Legal in every state."""
         ...
 
-
-class TriggerOutput(Protocol):
-    """Position-synchronised pulses of the device that turns the sample."""
-
     def arm(self, train: TriggerTrain) -> None:
         """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
         ...
 
     def disarm(self) -> None: ...
-
-    def remaining_pulses(self) -> int | None:
-        """Pulses of the armed train still to come, 0 if none is armed; None if the controller does not tell."""
-        ...
-
-
-class DigitalOutput(Protocol):
-    """One output line of some controller."""
-
-    name: str
-
-    def set(self, high: bool) -> None:
-        """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
-        ...
-
-    def get(self) -> bool | None:
-        """Whether the line is high; None if the controller cannot read it back."""
-        ...
-
-
-class RotationStage(Motion, TriggerOutput, Protocol):
-    """A rotation stage with a position-synchronised trigger output."""
 
     def digital_output(self, number: int) -> DigitalOutput:
         """Another output of the stage's controller, such as one that opens a shutter.

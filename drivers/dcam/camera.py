@@ -163,17 +163,7 @@ class DcamCamera:
             self._free()
 
     def wait_until_cold(self, timeout: float, progress: cooling.Progress = lambda celsius, status: None) -> float:
-        """Wait until the sensor has its final temperature; returns it in °C.
-
-        Args:
-            timeout: s.
-            progress: called once a second with the temperature and the cooler's status.
-
-        Raises:
-            DeviceRefused: the cooler is off.
-            DeviceTimeout: it was not cold in time.
-            DeviceError: the cooler reports a fault.
-        """
+        """See `drivers.dcam.cooling.wait_until_cold`."""
         self._require_open()
         return cooling.wait_until_cold(self._properties, self.name, self._clock, timeout, progress)
 

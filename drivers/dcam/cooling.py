@@ -20,7 +20,7 @@ STEADY_BAND, STEADY_FOR = 0.5, 60.0
 def wait_until_cold(
     properties: Properties, device: str, clock: Clock, timeout: float, progress: Progress = lambda celsius, status: None
 ) -> float:
-    """Wait until the cooler is ready; returns the sensor's temperature in °C.
+    """Wait until the cooler is ready; returns the sensor's temperature in °C. `progress` is called once a second.
 
     Raises:
         DeviceRefused: the cooler is off.

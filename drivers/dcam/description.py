@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from types import MappingProxyType
 
 from drivers.base.protocols import CameraSettings
@@ -39,9 +41,11 @@ def description(
             ("framestamps_by", Property.FRAMESTAMP_PRODUCER),
         )
     }
+    dcam, camera = session.dcam, session.camera
+    texts = {which: _if_told(partial(dcam.dev_getstring, camera, which), "") for which in Text}
     return {
-        **{which.name.lower(): text for which in Text if (text := _text(session, which))},
-        "capabilities": _capabilities(session),
+        **{which.name.lower(): text for which, text in texts.items() if text},
+        "capabilities": _if_told(lambda: str(dcam.dev_getcapability(camera).name or "none").lower(), "not reported"),
         "exposure": properties.get(Property.EXPOSURETIME),
         "trigger": str(settings.trigger),
         "trigger_active": str(options.trigger_active),
@@ -60,19 +64,11 @@ def description(
     }
 
 
-def _capabilities(session: Session) -> str:
+def _if_told(ask: Callable[[], str], otherwise: str) -> str:
+    """The answer; `otherwise` for a camera that does not give it."""
     try:
-        return str(session.dcam.dev_getcapability(session.camera).name or "none").lower()
+        return ask()
     except DcamError as error:
         if error.code not in _NOT_AVAILABLE:
             raise
-        return "not reported"
-
-
-def _text(session: Session, which: Text) -> str:
-    try:
-        return session.dcam.dev_getstring(session.camera, which)
-    except DcamError as error:
-        if error.code not in _NOT_AVAILABLE:
-            raise
-        return ""
+        return otherwise

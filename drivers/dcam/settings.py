@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from enum import StrEnum
 from types import MappingProxyType
 
 from drivers.base.errors import DeviceRefused
@@ -11,40 +13,26 @@ from drivers.dcam.codes import Property
 from drivers.dcam.options import DcamOptions, GlobalExposure, HotPixelMode, TriggerActive, TriggerMode, TriggerPolarity
 from drivers.dcam.properties import Properties
 
-_TRIGGERS = MappingProxyType(
+_VALUES: Mapping[StrEnum, int] = MappingProxyType(
     {
-        TriggerSource.INTERNAL: codes.TRIGGERSOURCE_INTERNAL,
-        TriggerSource.EXTERNAL: codes.TRIGGERSOURCE_EXTERNAL,
-        TriggerSource.SOFTWARE: codes.TRIGGERSOURCE_SOFTWARE,
+        TriggerSource.INTERNAL: 1,
+        TriggerSource.EXTERNAL: 2,
+        TriggerSource.SOFTWARE: 3,
+        TriggerActive.EDGE: 1,
+        TriggerActive.LEVEL: 2,
+        TriggerActive.SYNC_READOUT: 3,
+        TriggerMode.NORMAL: 1,
+        TriggerMode.START: 6,
+        TriggerPolarity.NEGATIVE: 1,
+        TriggerPolarity.POSITIVE: 2,
+        GlobalExposure.DELAYED: 3,
+        GlobalExposure.GLOBAL_RESET: 5,
+        HotPixelMode.STANDARD: 1,
+        HotPixelMode.MINIMUM: 2,
+        HotPixelMode.AGGRESSIVE: 3,
     }
 )
-_ACTIVE = MappingProxyType(
-    {
-        TriggerActive.EDGE: codes.TRIGGERACTIVE_EDGE,
-        TriggerActive.LEVEL: codes.TRIGGERACTIVE_LEVEL,
-        TriggerActive.SYNC_READOUT: codes.TRIGGERACTIVE_SYNCREADOUT,
-    }
-)
-_MODES = MappingProxyType({TriggerMode.NORMAL: codes.TRIGGER_MODE_NORMAL, TriggerMode.START: codes.TRIGGER_MODE_START})
-_POLARITIES = MappingProxyType(
-    {
-        TriggerPolarity.POSITIVE: codes.TRIGGERPOLARITY_POSITIVE,
-        TriggerPolarity.NEGATIVE: codes.TRIGGERPOLARITY_NEGATIVE,
-    }
-)
-_GLOBAL = MappingProxyType(
-    {
-        GlobalExposure.DELAYED: codes.TRIGGER_GLOBALEXPOSURE_DELAYED,
-        GlobalExposure.GLOBAL_RESET: codes.TRIGGER_GLOBALEXPOSURE_GLOBALRESET,
-    }
-)
-_HOT_PIXELS = MappingProxyType(
-    {
-        HotPixelMode.MINIMUM: codes.HOTPIXEL_MINIMUM,
-        HotPixelMode.STANDARD: codes.HOTPIXEL_STANDARD,
-        HotPixelMode.AGGRESSIVE: codes.HOTPIXEL_AGGRESSIVE,
-    }
-)
+"""Our choices as values of the camera's properties."""
 PHOTON_NUMBER = "photon_number"
 _READOUTS = MappingProxyType(
     {
@@ -85,7 +73,7 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
         properties.set_if_available(Property.DEFECTCORRECT_MODE, codes.OFF)
     else:
         properties.set_exactly(Property.DEFECTCORRECT_MODE, codes.ON)
-        properties.set_exactly(Property.HOTPIXELCORRECT_LEVEL, _HOT_PIXELS[options.hot_pixels])
+        properties.set_exactly(Property.HOTPIXELCORRECT_LEVEL, _VALUES[options.hot_pixels])
     properties.set_exactly(Property.BINNING, settings.binning)
     _apply_roi(properties, device, settings.roi)
     if properties.find(Property.FRAMEBUNDLE_MODE) == codes.ON:
@@ -98,23 +86,24 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
             advice="Ask for a larger region of interest",
             state="No frame was taken",
         )
-    line = 2 * properties.get(Property.TIMING_READOUTTIME) / _sensor_rows(properties, settings)
+    sensor_rows = properties.get(Property.IMAGE_HEIGHT) * settings.binning
+    line = 2 * properties.get(Property.TIMING_READOUTTIME) / sensor_rows
     tolerance = options.exposure_tolerance * settings.exposure + line
     properties.set_nearly(Property.EXPOSURETIME, settings.exposure, tolerance)
     apply_trigger_source(properties, settings.trigger)
     # Pulse options do not apply to software triggers: each of these gives one frame of the set exposure.
     pulses = options if settings.trigger is TriggerSource.EXTERNAL else _PLAIN
-    properties.set_exactly(Property.TRIGGER_MODE, _MODES[pulses.trigger_mode])
-    properties.set_exactly(Property.TRIGGERACTIVE, _ACTIVE[pulses.trigger_active])
-    properties.set_exactly(Property.TRIGGERPOLARITY, _POLARITIES[options.trigger_polarity])
-    properties.set_exactly(Property.TRIGGER_GLOBALEXPOSURE, _GLOBAL[options.global_exposure])
+    properties.set_exactly(Property.TRIGGER_MODE, _VALUES[pulses.trigger_mode])
+    properties.set_exactly(Property.TRIGGERACTIVE, _VALUES[pulses.trigger_active])
+    properties.set_exactly(Property.TRIGGERPOLARITY, _VALUES[options.trigger_polarity])
+    properties.set_exactly(Property.TRIGGER_GLOBALEXPOSURE, _VALUES[options.global_exposure])
     properties.set_exactly(Property.TRIGGERDELAY, pulses.trigger_delay)
     properties.set_exactly(Property.TRIGGERTIMES, pulses.trigger_times)
 
 
 def apply_trigger_source(properties: Properties, source: TriggerSource) -> None:
     """Set the trigger source. In START mode the first pulse resets it, so that it must be set before each run."""
-    properties.set_exactly(Property.TRIGGERSOURCE, _TRIGGERS[source])
+    properties.set_exactly(Property.TRIGGERSOURCE, _VALUES[source])
 
 
 def read_settings(properties: Properties, trigger: TriggerSource) -> CameraSettings:
@@ -186,8 +175,3 @@ def _apply_roi(properties: Properties, device: str, roi: tuple[int, int, int, in
     properties.set_exactly(Property.SUBARRAYVPOS, row0)
     properties.set_exactly(Property.SUBARRAYHPOS, col0)
     properties.set_exactly(Property.SUBARRAYMODE, codes.ON)
-
-
-def _sensor_rows(properties: Properties, settings: CameraSettings) -> float:
-    """Number of sensor rows that are read, before binning."""
-    return properties.get(Property.IMAGE_HEIGHT) * settings.binning

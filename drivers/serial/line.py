@@ -36,11 +36,6 @@ class Probe:
     reply: str
 
 
-def _no_checksum(line: str) -> str:
-    """The check for a device without checksums: always "", no fault."""
-    return ""
-
-
 class SerialLine:
     """A device that talks in ASCII lines; 8 data bits, no parity, 1 stop bit. Safe from several threads.
 
@@ -70,7 +65,7 @@ class SerialLine:
         baudrate: int,
         unsolicited: str = r"(?!)",
         framing: Framing = CRLF,
-        check: Callable[[str], str] = _no_checksum,
+        check: Callable[[str], str] = lambda line: "",
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, probe, clock, timeout
@@ -107,22 +102,21 @@ class SerialLine:
             ) from problem
         self._reader = LineReader(self._port, clock, self._transcript, framing, unsolicited, check)
 
-    def send(self, command: str) -> None:
+    def send(self, command: str | bytes) -> None:
         """Send a command without a reply, at once, even while another thread waits, or the line is out of step.
+
+        Bytes, such as one control character, get no line end.
 
         Raises:
             DeviceError: the port failed. DeviceTimeout: the device accepts no bytes.
         """
-        self._write(command.encode("ascii") + self._framing.command_end, command or "an empty line")
+        self._write(*self._worded(command))
 
-    def send_raw(self, data: bytes) -> None:
-        """`send` for bytes without a line end, such as one control character."""
-        self._write(data, readable(data))
-
-    def query(self, request: str, reply: str, meaning: str, state: str = "") -> re.Match[str]:
+    def query(self, command: str | bytes, reply: str, meaning: str, state: str = "") -> re.Match[str]:
         """Send a request and read its reply.
 
         Args:
+            command: as `send` takes it.
             reply: regular expression that the whole reply must match.
             meaning: the expected reply in words, for error messages.
             state: what has moved and what has not, for error messages.
@@ -130,21 +124,7 @@ class SerialLine:
         Raises:
             DeviceTimeout: no whole reply within the timeout. DeviceError: a reply of another form, or the port failed.
         """
-        return self._query(request.encode("ascii") + self._framing.command_end, request, reply, meaning, state)
-
-    def query_raw(self, data: bytes, reply: str, meaning: str, state: str = "") -> re.Match[str]:
-        """`query` for bytes without a line end, such as one control character."""
-        return self._query(data, readable(data), reply, meaning, state)
-
-    def close(self) -> None:
-        """Close the port once a request of another thread has ended; calling again does nothing."""
-        with self._asking, self._writing:
-            self._closed = True
-            with contextlib.suppress(OSError):  # a failed port needs no closing
-                self._port.close()
-            self._transcript.close()
-
-    def _query(self, data: bytes, request: str, reply: str, meaning: str, state: str) -> re.Match[str]:
+        data, request = self._worded(command)
         with self._asking:
             self._refuse_if_closed(request)
             with self._port_errors(request):
@@ -188,11 +168,25 @@ class SerialLine:
             self._in_step = True
             return match
 
+    def close(self) -> None:
+        """Close the port once a request of another thread has ended; calling again does nothing."""
+        with self._asking, self._writing:
+            self._closed = True
+            with contextlib.suppress(OSError):  # a failed port needs no closing
+                self._port.close()
+            self._transcript.close()
+
+    def _worded(self, command: str | bytes) -> tuple[bytes, str]:
+        """The bytes to send, and their text for messages."""
+        if isinstance(command, bytes):
+            return command, readable(command)
+        return command.encode("ascii") + self._framing.command_end, command
+
     def _resynchronise(self, request: str, state: str) -> None:
         """Discard what arrives, send the probe, skip late replies until its own, and wait for silence."""
         self._transcript.add_line("!", "out of step: probing")
         self._wait_for_quiet(request, state)
-        self._write(self._probe.request.encode("ascii") + self._framing.command_end, self._probe.request)
+        self._write(*self._worded(self._probe.request))
         deadline = self._clock.now() + self._timeout
         while (text := self._reader.line(deadline)) is not None:
             if isinstance(text, str) and re.fullmatch(self._probe.reply, text):
@@ -224,7 +218,7 @@ class SerialLine:
     def _write(self, data: bytes, text: str) -> None:
         with self._writing:
             self._refuse_if_closed(text)
-            self._transcript.add_line(">", text)
+            self._transcript.add_line(">", text or "an empty line")
             self._transcript.log_bytes(">", data)
             with self._port_errors(text):
                 self._port.write(data)

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
 from drivers.flat import flat_fields
+from drivers.serial.line import Probe, SerialLine
 
 FARTHEST = 1e9
 """rad."""
@@ -118,13 +119,7 @@ class StageFigures:
 
 @dataclass(frozen=True)
 class Wiring:
-    """How a stage's controller is connected; s.
-
-    Attributes:
-        baudrate: as set on the controller; nominal over USB and TCP.
-        pulse_width: s; None leaves it to the driver.
-        active_high: polarity of the pulses.
-        transcript: file to which every byte on the wire is appended; None keeps none.
+    """How a stage's controller is connected; s. The baud rate is as set on the controller, nominal over USB and TCP.
 
     Raises:
         ValueError: no reply can come in that timeout.
@@ -143,6 +138,11 @@ class Wiring:
     def __post_init__(self) -> None:
         if not 0 < self.timeout < math.inf:
             raise ValueError(f"a timeout of {self.timeout:g} s is not possible; expected a positive number of seconds")
+
+    def line(self, url: str, name: str, clock: Clock, probe: Probe, **more: Any) -> SerialLine:
+        """The open line to the controller of the stage `name`; `more` as in `SerialLine`."""
+        given: dict[str, Any] = {"timeout": self.timeout, "baudrate": self.baudrate, "transcript": self.transcript}
+        return SerialLine(url, device=name, probe=probe, clock=clock, **given, **more)
 
 
 class StageSettings(Protocol):

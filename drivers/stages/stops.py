@@ -1,11 +1,14 @@
-"""Stops of a stage, from any thread: a stop also ends a move whose command is being sent."""
+"""Stops of a stage, from any thread; the wait until it stands; the refusal of what needs that."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
-from drivers.base.errors import DeviceError
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import StageLimits
 
 
 class Stops:
@@ -56,3 +59,39 @@ class Stops:
             ) from problem
         if problem is not None:
             raise problem
+
+
+POLL = 0.02
+"""s between two status queries of a moving stage."""
+STOP_MARGIN = 2.0
+"""s beyond the longest deceleration after which a stop has failed."""
+Status = TypeVar("Status")
+
+
+def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[Status], bool], timeout: float) -> Status:
+    """The last status: the stage stands, or it still moves after `timeout` s.
+
+    Args:
+        look: asks the controller, at least once.
+        moves: whether the stage moves by what a look has shown.
+    """
+    deadline = clock.now() + timeout
+    while moves(status := look()) and (left := deadline - clock.now()) > 0:
+        clock.sleep(min(POLL, left))
+    return status
+
+
+def longest_stop(limits: StageLimits) -> float:
+    """s after a stop by which every stage stands: it slows down from its full speed."""
+    return limits.max_speed / limits.acceleration + STOP_MARGIN
+
+
+def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> DeviceRefused:
+    """The refusal of what needs a standing stage."""
+    return DeviceRefused(
+        name,
+        f"{purpose} is not possible while it moves",
+        reply=reply,
+        advice="Wait for the move to end, or stop it",
+        state=f"The move under way goes on; it is at {counts} counts",
+    )

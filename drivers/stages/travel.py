@@ -82,6 +82,15 @@ class Travel:
             )
         return self.to_counts(angle)
 
+    def no_such_speed(self, speed: float, slowest: str) -> DeviceRefused:
+        """The refusal of a speed in rad/s."""
+        return DeviceRefused(
+            self.name,
+            f"a speed of {math.degrees(speed):g} deg/s is not possible",
+            expected=f"{slowest}, at most {math.degrees(self.limits.max_speed):g} deg/s",
+            state="Nothing has moved",
+        )
+
     def refuse_train(self, train: TriggerTrain) -> None:
         """Refuses a train without pulses or intervals, or beyond the soft limits.
 

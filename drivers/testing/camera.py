@@ -55,6 +55,10 @@ class CameraConformance:
         bench.pulse(times)
         return times
 
+    def _arm(self, bench: CameraBench, n: int, **changes: Any) -> None:
+        bench.camera.configure(replace(bench.settings, **changes))
+        bench.camera.arm(n)
+
     def _take(self, bench: CameraBench, n: int) -> list[CameraFrame]:
         return [bench.camera.next_frame(timeout=5.0) for _ in range(n)]
 
@@ -83,8 +87,7 @@ class CameraConformance:
             assert bench.camera.timing == before
 
     def test_every_pulse_is_a_frame_in_order(self, bench: CameraBench) -> None:
-        bench.camera.configure(bench.settings)
-        bench.camera.arm(6)
+        self._arm(bench, 6)
         times = self._pulses(bench, 6)
         frames = self._take(bench, 6)
         assert [frame.framestamp for frame in frames] == list(range(6))
@@ -94,8 +97,7 @@ class CameraConformance:
         assert bench.clock.now() >= times[-1] + bench.settings.exposure + bench.camera.timing.readout - 1e-6
 
     def test_pulses_that_come_too_early_are_ignored(self, bench: CameraBench) -> None:
-        bench.camera.configure(bench.settings)
-        bench.camera.arm(6)
+        self._arm(bench, 6)
         times = self._pulses(bench, 9, period=0.6 * bench.camera.timing.min_period)
         frames = self._take(bench, 5)  # every other pulse
         assert [frame.framestamp for frame in frames] == list(range(5))
@@ -104,8 +106,7 @@ class CameraConformance:
             bench.camera.next_frame(timeout=0.2)
 
     def test_an_overrun_ring_is_one_error_and_the_rest_can_be_taken(self, bench: CameraBench) -> None:
-        bench.camera.configure(bench.settings)
-        bench.camera.arm(1)
+        self._arm(bench, 1)
         times = self._pulses(bench, 200)
         bench.clock.sleep(times[-1] - bench.clock.now() + 1.0)
         with pytest.raises(DeviceError, match=r"ring of \d+ frames was overrun and \d+ frames are lost"):
@@ -127,8 +128,7 @@ class CameraConformance:
             bench.camera.next_frame(timeout=0.1)
 
     def test_a_frame_that_does_not_come_is_a_timeout_in_time(self, bench: CameraBench) -> None:
-        bench.camera.configure(bench.settings)
-        bench.camera.arm(1)
+        self._arm(bench, 1)
         start = bench.clock.now()
         with pytest.raises(DeviceTimeout, match=r"0\.3 s"):
             bench.camera.next_frame(timeout=0.3)
@@ -137,8 +137,7 @@ class CameraConformance:
         assert bench.camera.next_frame(timeout=1.0).framestamp == 0
 
     def test_software_triggers(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.SOFTWARE))
-        bench.camera.arm(3)
+        self._arm(bench, 3, trigger=TriggerSource.SOFTWARE)
         for k in range(3):
             at = bench.clock.now()
             bench.camera.software_trigger()
@@ -156,8 +155,7 @@ class CameraConformance:
             bench.camera.software_trigger()
 
     def test_free_run_gives_the_frames_asked_for(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
-        bench.camera.arm(4)
+        self._arm(bench, 4, trigger=TriggerSource.INTERNAL)
         frames = self._take(bench, 4)
         assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
         gaps = np.diff([frame.time for frame in frames])
@@ -172,8 +170,7 @@ class CameraConformance:
             bench.camera.disarm()
 
     def test_frames_own_their_memory(self, bench: CameraBench) -> None:
-        bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))
-        bench.camera.arm(2)
+        self._arm(bench, 2, trigger=TriggerSource.INTERNAL)
         first, second = self._take(bench, 2)
         assert not np.shares_memory(first.counts, second.counts)
         kept = first.counts.copy()
@@ -194,8 +191,7 @@ class CameraConformance:
         bench.camera.configure(bench.settings)
 
     def test_an_armed_camera_takes_no_settings_and_no_second_arm(self, bench: CameraBench) -> None:
-        bench.camera.configure(bench.settings)
-        bench.camera.arm(2)
+        self._arm(bench, 2)
         with pytest.raises(DeviceRefused, match="disarm"):
             bench.camera.configure(replace(bench.settings, exposure=2 * bench.settings.exposure))
         with pytest.raises(DeviceRefused, match="disarm"):
@@ -213,8 +209,7 @@ class CameraConformance:
         assert float(text["conversion_offset"]) >= 0  # counts
 
     def test_a_closed_camera_says_so(self, bench: CameraBench) -> None:
-        bench.camera.configure(bench.settings)
-        bench.camera.arm(1)
+        self._arm(bench, 1)
         bench.camera.close()
         bench.camera.close()
         bench.camera.disarm()

@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Set
 from dataclasses import dataclass
-from enum import IntFlag, StrEnum
+from enum import IntFlag
 
 from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
@@ -28,20 +28,12 @@ class Ended(IntFlag):
     EMERGENCY = 0x80
 
 
-class Output(StrEnum):
-    """Kind of the trigger output between its start and its end."""
-
-    OFF = "off"
-    GATE = "gate"
-    PULSES = "pulses"
-
-
 @dataclass(frozen=True)
 class TriggerSettings:
-    """Pulses of `width` s at start, start + interval, ... not beyond end (counts); end < start turns the other way."""
+    """Pulses of `width` s at start, start + interval, ... not beyond end (counts); end < start turns the other way.
+    Without a width the output is off."""
 
-    output: Output = Output.PULSES
-    width: float = 1e-3
+    width: float | None = 1e-3
     start: int = 1000
     end: int = 10_000
     interval: int = 200
@@ -75,14 +67,9 @@ class MotorOutput:
         self._last_fired = -math.inf
         self._coming: list[float] = []
 
-    def refusal(self, position: int) -> str:
-        """Why it cannot be armed with the axis standing at `position`; "" if it can."""
-        settings = self.settings
-        if settings.output is Output.OFF:
-            return "the output is off"
-        if settings.output is Output.PULSES and settings.sign * (settings.start - position) <= 0:
-            return "the axis stands inside or beyond the start point"
-        return ""
+    def can_arm(self, position: int) -> bool:
+        """Whether it is on, and the axis at `position` stands before its start point."""
+        return self.settings.width is not None and self.settings.sign * (self.settings.start - position) > 0
 
     def arm(self) -> None:
         self.clear()
@@ -93,9 +80,9 @@ class MotorOutput:
         self._fired, self._coming, self._armed = 0, [], False
 
     def ready(self, now: float) -> bool:
-        """Whether it waits for its start point: a pulse output until the axis passes it, a gate always."""
+        """Whether it waits for its start point."""
         self.settle(now)
-        return self._armed and (self.settings.output is Output.GATE or self._fired == 0)
+        return self._armed and self._fired == 0
 
     def settle(self, now: float) -> None:
         """Count all passed points as fired."""
@@ -108,23 +95,19 @@ class MotorOutput:
         """(time, count) of the edges that `move` gives from `now` on; they replace earlier predictions."""
         self.settle(now)
         self._coming = []
-        if not self._armed:
+        width = self.settings.width
+        if not self._armed or width is None or move.direction != self.settings.sign:
             return []
-        forwards = move.direction == self.settings.sign
-        if self.settings.output is Output.GATE:
-            entry = self.settings.start if forwards else self.settings.end
-            time = _arrival(move, entry)
-            return [] if time is None or time <= now else [(time, entry)]
-        edges, high_until = [], self._last_fired + self.settings.width
+        edges, high_until = [], self._last_fired + width
         points = self.settings.points[self._first :]
-        for index, point in enumerate(points[self._fired :] if forwards else (), self._fired):
+        for index, point in enumerate(points[self._fired :], self._fired):
             arrival = _arrival(move, point)
             if arrival is None:
                 break
             time = max(arrival, math.nextafter(now, math.inf))  # not fired yet, so it is still to come
             if time > high_until and self._fired_before + index not in self._lost:
                 edges.append((time, point))
-            high_until = time + self.settings.width
+            high_until = time + width
             self._coming.append(time)
         return edges
 

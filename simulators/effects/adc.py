@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from drivers.orca_quest import BITS
 from simulators.effects.chain import ImageEffect
@@ -25,13 +26,7 @@ class Adc(ImageEffect):
     """
 
     bits: Literal[8, 12, 16] = 16
-    nonlinearity: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.bits not in (8, 12, 16):
-            raise ValueError(f"bits must be 8, 12 or 16, got {self.bits}")
-        if not -0.25 <= self.nonlinearity <= 0.25:
-            raise ValueError(f"nonlinearity must lie in -0.25 ... 0.25 of the full range, got {self.nonlinearity}")
+    nonlinearity: Annotated[float, Field(ge=-0.25, le=0.25)] = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         """Raises CannotExposeError in the photon number readout, unless the converter is linear and has 16 bits."""

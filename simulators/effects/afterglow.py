@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from simulators.effects.chain import SamplingEffect
+from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import Moments, Shot
 
 Reals = NDArray[np.float64]
@@ -35,19 +38,15 @@ class Afterglow(SamplingEffect):
         samples: moments in the past, for all components together.
     """
 
-    shares: tuple[float, ...]
-    decay_times: tuple[float, ...]
-    samples: int = 3
+    shares: tuple[NotNegative, ...]
+    decay_times: tuple[Positive, ...]
+    samples: Annotated[int, Field(ge=1, le=32)] = 3
 
     def __post_init__(self) -> None:
         if not self.shares or len(self.shares) != len(self.decay_times):
             raise ValueError(f"each component needs a share and a decay time, got {self}")
-        if not (min(self.shares) >= 0 and 0 < sum(self.shares) < 1 and min(self.decay_times) > 0):
-            raise ValueError(
-                f"shares must be >= 0 with a sum in 0 ... 1 (both excluded) and decay_times positive in s, got {self}"
-            )
-        if not 1 <= self.samples <= 32:
-            raise ValueError(f"samples must lie in 1 ... 32, got {self.samples}")
+        if not 0 < sum(self.shares) < 1:
+            raise ValueError(f"the sum of the shares must lie in 0 ... 1 (both excluded), got {sum(self.shares)}")
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
         """The given moments with smaller weights, and moments of the past. The moments of the rows must differ only by

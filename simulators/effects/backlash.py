@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.chain import PoseEffect
+from simulators.frame.mapping import Positive
 from simulators.frame.pose import Pose
 from simulators.frame.shot import AngleAt, Shot
 
@@ -30,11 +31,7 @@ class Backlash(PoseEffect):
     view comes after it.
     """
 
-    lost_motion_deg: float
-
-    def __post_init__(self) -> None:
-        if not self.lost_motion_deg > 0:
-            raise ValueError(f"lost_motion_deg must be positive, got {self.lost_motion_deg}")
+    lost_motion_deg: Positive
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         if came_forwards(shot.angle_at, shot.time + float(times[0])):

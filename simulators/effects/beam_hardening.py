@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import Image, Shot
 
 
@@ -25,9 +26,9 @@ class BeamHardening(ImageEffect):
         ratios: the attenuations at the energies, in any unit, in place of the energies.
     """
 
-    weights: tuple[float, ...]
-    energies: tuple[float, ...] | None = None
-    ratios: tuple[float, ...] | None = None
+    weights: tuple[NotNegative, ...]
+    energies: tuple[Positive, ...] | None = None
+    ratios: tuple[Positive, ...] | None = None
 
     def __post_init__(self) -> None:
         given = self.energies if self.ratios is None else self.ratios
@@ -35,8 +36,8 @@ class BeamHardening(ImageEffect):
             raise ValueError(f"give either energies in keV or ratios of attenuations, got {self}")
         if len(given) != len(self.weights) or not self.weights:
             raise ValueError(f"weights must be as many as energies or ratios, and one at least, got {self}")
-        if not (min(given) > 0 and min(self.weights) >= 0 and sum(self.weights) > 0):
-            raise ValueError(f"energies and ratios must be positive, weights >= 0 and one of them positive, got {self}")
+        if not sum(self.weights) > 0:
+            raise ValueError(f"one of the weights must be positive, got {self.weights}")
 
     def terms(self) -> tuple[tuple[float, float], ...]:
         """(w_k, r_k) of the energies that have photons, the most penetrating first."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import BelowOne, Positive
 from simulators.frame.shot import Image, Shot
 
 
@@ -29,20 +30,14 @@ class BeamProfile(ImageEffect):
         wander_period: s.
     """
 
-    sigma: tuple[float, float]
-    stripes: float = 0.0
-    stripe_period: float = 0.1
+    sigma: tuple[Positive, Positive]
+    stripes: BelowOne = 0.0
+    stripe_period: Positive = 0.1
     drift: float = 0.0
     centre: tuple[float, float] = (0.0, 0.0)
     wander_speed: tuple[float, float] = (0.0, 0.0)
     wander: tuple[float, float] = (0.0, 0.0)
-    wander_period: float = 60.0
-
-    def __post_init__(self) -> None:
-        if not (min(self.sigma) > 0 and 0 <= self.stripes < 1 and self.stripe_period > 0):
-            raise ValueError(f"sigma and stripe_period must be positive and stripes in 0 ... 1 (excluded), got {self}")
-        if not self.wander_period > 0:
-            raise ValueError(f"wander_period must be positive, got {self.wander_period} s")
+    wander_period: Positive = 60.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         middle = self.middle(shot.elapsed)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label, Views, check_views, lit_share, within
 from simulators.effects.chain import Anomaly, ImageEffect
+from simulators.frame.mapping import BelowOne, NotNegative, Positive
 from simulators.frame.shot import Image, Shot
 
 
@@ -24,17 +25,12 @@ class BlackBand(ImageEffect, Anomaly):
         views: [first, one after the last] in which the slit is in the beam; None: all.
     """
 
-    width: float
-    penumbra: float = 0.0
-    share: float = 0.0
+    width: Positive
+    penumbra: NotNegative = 0.0
+    share: BelowOne = 0.0
     views: Views | None = None
 
     def __post_init__(self) -> None:
-        if not (self.width > 0 and self.penumbra >= 0 and 0 <= self.share < 1):
-            raise ValueError(
-                f"width must be positive and penumbra >= 0 in mm, and share in 0 ... 1 (excluded), got {self.width}, "
-                f"{self.penumbra} and {self.share}"
-            )
         check_views(self.views)
 
     def apply(self, image: Image, shot: Shot) -> Image:

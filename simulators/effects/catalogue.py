@@ -8,12 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
 from drivers.plugins import plugins
-from simulators.frame.domain import Domain
+
+
+class Domain(IntEnum):
+    """The quantity that an effect acts on, in the order of physics."""
+
+    MOTION = 0
+    OPTICAL_DEPTH = 1
+    PHOTONS = 2
+    ELECTRONS = 3
+    COUNTS = 4
+
+    @property
+    def words(self) -> str:
+        return self.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label
-from simulators.effects.catalogue import CATALOGUE, FINAL, order_error
-from simulators.frame.domain import Domain
+from simulators.effects.catalogue import CATALOGUE, FINAL, Domain, order_error
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Image, Moments, Shot
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative
 from simulators.frame.sensor import DARK_CURRENT
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
@@ -25,11 +26,7 @@ class DarkCurrent(ImageEffect):
     `rate`: electrons a second and sensor pixel.
     """
 
-    rate: float = DARK_CURRENT
-
-    def __post_init__(self) -> None:
-        if not self.rate >= 0:
-            raise ValueError(f"rate must be >= 0 electrons/s, got {self.rate}")
+    rate: NotNegative = DARK_CURRENT
 
     def apply(self, image: Image, shot: Shot) -> Image:
         rng = frame_rng(self.name, shot)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Whole
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import places
 
@@ -22,13 +25,9 @@ class DeadPixels(ImageEffect):
         seed: of their places.
     """
 
-    fraction: float = 1e-4
-    charge: float = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.fraction <= 0.1 and self.charge >= 0 and self.seed >= 0):
-            raise ValueError(f"fraction must lie in 0 ... 0.1 and charge (electrons) and seed be >= 0, got {self}")
+    fraction: Annotated[float, Field(ge=0, le=0.1)] = 1e-4
+    charge: NotNegative = 0.0
+    seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         at, _ = places(self.name, self.seed, self.fraction, shot)

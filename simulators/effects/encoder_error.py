@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.chain import PoseEffect
 from simulators.effects.turn_waves import Wave, check, series
+from simulators.frame.mapping import NotNegative
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
 
@@ -24,12 +25,10 @@ class EncoderError(PoseEffect):
     """
 
     harmonics: tuple[Wave, ...] = ()
-    random_mdeg: float = 0.0
+    random_mdeg: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check("harmonics", self.harmonics)
-        if not self.random_mdeg >= 0:
-            raise ValueError(f"random_mdeg must be >= 0 millidegrees, got {self.random_mdeg}")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         error = series(pose.angle, self.harmonics).real + self.random_mdeg * frame_rng(self.name, shot).normal()

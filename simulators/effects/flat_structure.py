@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from drivers.orca_quest import SENSOR_SHAPE
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import Positive, Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
 
 Reals = NDArray[np.float64]
@@ -35,26 +38,14 @@ class FlatStructure(ImageEffect):
         seed: of places, sizes and depths.
     """
 
-    specks: int = 200
-    radius_um: float = 10.0
-    depth: float = 0.1
-    scratches: int = 5
-    scratch_length_um: float = 2000.0
-    scratch_width_um: float = 3.0
-    scratch_depth: float = 0.05
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.specks <= 100_000 and 0 <= self.scratches <= 1000):
-            raise ValueError(f"specks must lie in 0 ... 100000 and scratches in 0 ... 1000, got {self}")
-        if not min(self.radius_um, self.scratch_length_um, self.scratch_width_um) > 0:
-            raise ValueError(f"radius_um, scratch_length_um and scratch_width_um must be positive, got {self}")
-        if not (0 <= self.depth <= 0.5 and 0 <= self.scratch_depth <= 0.5):
-            raise ValueError(
-                f"depth and scratch_depth (means of up to twice as much) must lie in 0 ... 0.5, got {self}"
-            )
-        if self.seed < 0:
-            raise ValueError(f"seed must be >= 0, got {self.seed}")
+    specks: Annotated[int, Field(ge=0, le=100_000)] = 200
+    radius_um: Positive = 10.0
+    depth: Annotated[float, Field(ge=0, le=0.5)] = 0.1
+    scratches: Annotated[int, Field(ge=0, le=1000)] = 5
+    scratch_length_um: Positive = 2000.0
+    scratch_width_um: Positive = 3.0
+    scratch_depth: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         image *= self.transmission(shot)

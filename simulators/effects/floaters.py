@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.anomaly import VISIBLE, Label, Views, check_views, within
 from simulators.effects.chain import Anomaly, ImageEffect
+from simulators.frame.mapping import Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
 
-MOST, FARTHEST, DEEPEST = 10_000, 1e9, 1e6
-"""Largest number of crumbs, length in mm and optical depth. With larger values a frame takes seconds or overflows."""
+Length = Annotated[float, Field(ge=1e-9, le=1e9)]
+Height = Annotated[float, Field(ge=-1e9, le=1e9)]
+"""mm. With larger values, more crumbs or deeper ones a frame takes seconds or overflows."""
 
 
 @dataclass(frozen=True)
@@ -65,36 +68,22 @@ class Floaters(ImageEffect, Anomaly):
         seed: of sizes, places and depths.
     """
 
-    distance: tuple[float, float]
-    count: int = 3
-    size: tuple[float, float] = (0.01, 0.03)
-    depth: float = 0.5
-    heights: tuple[float, float] = (-0.2, 0.2)
+    distance: tuple[Length, Length]
+    count: Annotated[int, Field(ge=1, le=10_000)] = 3
+    size: tuple[Length, Length] = (0.01, 0.03)
+    depth: Annotated[float, Field(ge=4 * VISIBLE, le=1e6)] = 0.5
+    heights: tuple[Height, Height] = (-0.2, 0.2)
     motion: Literal["turning", "loose"] = "turning"
-    speed: float = 0.05
+    speed: Length = 0.05
     views: Views | None = None
-    seed: int = 0
+    seed: Whole = 0
 
     def __post_init__(self) -> None:
         check_views(self.views)
-        if not (0 < self.distance[0] <= self.distance[1] and 0 < self.size[0] <= self.size[1]):
-            raise ValueError(
-                f"distance and size must be [least, most] > 0 in mm, got {list(self.distance)} and {list(self.size)}"
-            )
-        least = 4 * VISIBLE
-        if not (self.count >= 1 and self.depth >= least and self.speed > 0 and self.heights[0] <= self.heights[1]):
-            raise ValueError(
-                f"count must be >= 1, depth >= {least}, speed positive in mm a view and heights [least, most], got "
-                f"{self.count}, {self.depth}, {self.speed} and {list(self.heights)}"
-            )
-        lengths = (*self.distance, *self.size, *map(abs, self.heights), self.speed)
-        if self.count > MOST or max(lengths) > FARTHEST or min(self.size) < 1 / FARTHEST or self.depth > DEEPEST:
-            raise ValueError(
-                f"count must be {MOST} at most, depth {DEEPEST:g}, lengths {FARTHEST:g} mm and size "
-                f"{1 / FARTHEST:g} mm at least, got {self}"
-            )
-        if self.seed < 0:
-            raise ValueError(f"seed must be >= 0, got {self.seed}")
+        for name in ("distance", "size", "heights"):
+            least, most = getattr(self, name)
+            if not least <= most:
+                raise ValueError(f"{name} must be [least, most] in mm, got {[least, most]}")
         if self.motion == "loose" and self.views is None:
             raise ValueError("loose floaters need views, [first, one after the last], between which they pass the axis")
 

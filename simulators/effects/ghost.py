@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from simulators.effects.anomaly import VISIBLE, Label
 from simulators.effects.chain import Anomaly, ImageEffect
+from simulators.frame.mapping import Positive, Whole
 from simulators.frame.shot import Image, Shot
 
 
@@ -28,19 +31,14 @@ class Ghost(ImageEffect, Anomaly):
         gain: relative change of the light in its middle; negative for a dark ghost.
     """
 
-    view: int
-    width: float
-    speed: float
-    gain: float = 0.3
+    view: Whole
+    width: Positive
+    speed: Positive
+    gain: Annotated[float, Field(ge=-1)] = 0.3
 
     def __post_init__(self) -> None:
-        if not (self.view >= 0 and self.width > 0 and self.speed > 0):
-            raise ValueError(
-                f"view must be >= 0, and width (mm) and speed (mm a view) positive, got {self.view}, {self.width} and "
-                f"{self.speed}"
-            )
-        if self.gain == 0 or not self.gain >= -1:
-            raise ValueError(f"gain must be >= -1 and not 0, got {self.gain}")
+        if self.gain == 0:
+            raise ValueError("gain must be other than 0, which shows nothing")
 
     def apply(self, image: Image, shot: Shot) -> Image:
         first, change = self._change(shot)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import Share
 from simulators.frame.shot import Image, Shot
 
 PHOTOELECTRIC = 3.0**-3
@@ -26,12 +27,8 @@ class Harmonics(ImageEffect):
         ratio: of the two attenuations, 0 ... 1.
     """
 
-    share: float
-    ratio: float = PHOTOELECTRIC
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.share <= 1 and 0 <= self.ratio <= 1):
-            raise ValueError(f"share and ratio must lie in 0 ... 1, got {self}")
+    share: Share
+    ratio: Share = PHOTOELECTRIC
 
     def apply(self, image: Image, shot: Shot) -> Image:
         if self.share == 0:

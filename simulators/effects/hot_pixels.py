@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import Whole
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.pattern import places
 
@@ -21,15 +24,9 @@ class HotPixels(ImageEffect):
         seed: of their places and dark currents.
     """
 
-    fraction: float = 1e-4
-    rate: float = 2000.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.fraction <= 0.1 and 0 <= self.rate <= 1e9 and self.seed >= 0):
-            raise ValueError(
-                f"fraction must lie in 0 ... 0.1, rate (electrons/s) in 0 ... 1e9 and seed be >= 0, got {self}"
-            )
+    fraction: Annotated[float, Field(ge=0, le=0.1)] = 1e-4
+    rate: Annotated[float, Field(ge=0, le=1e9)] = 2000.0
+    seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         at, even = places(self.name, self.seed, self.fraction, shot)

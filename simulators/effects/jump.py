@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.anomaly import Label
 from simulators.effects.chain import Anomaly, PoseEffect
+from simulators.frame.mapping import Whole
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot
 
@@ -31,16 +32,13 @@ class Jump(PoseEffect, Anomaly):
         turn_deg: degrees about the axis, in the sense in which angles grow.
     """
 
-    view: int
+    view: Whole
     shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.view < 0 or not (any(self.shift_um) or self.turn_deg):
-            raise ValueError(
-                f"view must be >= 0, and shift_um or turn_deg other than 0, got {self.view}, {list(self.shift_um)} and "
-                f"{self.turn_deg}"
-            )
+        if not (any(self.shift_um) or self.turn_deg):
+            raise ValueError("shift_um or turn_deg must be other than 0")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         if shot.view < self.view:

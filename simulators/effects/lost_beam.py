@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from simulators.effects.anomaly import Label, Views, check_views, within
 from simulators.effects.chain import Anomaly, ImageEffect
+from simulators.frame.mapping import BelowOne
 from simulators.frame.shot import Image, Shot
 
 
@@ -22,7 +23,7 @@ class LostBeam(ImageEffect, Anomaly):
 
     views: Views | None = None
     seconds: tuple[float, float] | None = None
-    share: float = 0.0
+    share: BelowOne = 0.0
 
     def __post_init__(self) -> None:
         check_views(self.views)
@@ -30,8 +31,6 @@ class LostBeam(ImageEffect, Anomaly):
             raise ValueError("a lost beam needs either views or seconds, and not both")
         if self.seconds is not None and not self.seconds[0] < self.seconds[1]:
             raise ValueError(f"seconds must be [from, to] with from < to, got {list(self.seconds)}")
-        if not 0 <= self.share < 1:
-            raise ValueError(f"share must lie in 0 ... 1 (excluded), got {self.share}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
         lost = self._lost(shot)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.chain import SamplingEffect
+from simulators.frame.mapping import Positive
 from simulators.frame.shot import Moments, Shot
 
 LOOKS = 5
@@ -30,15 +33,8 @@ class MotionBlur(SamplingEffect):
         max_samples: largest number of moments; each costs a frame's line integrals.
     """
 
-    tolerance_px: float = 0.5
-    max_samples: int = 16
-
-    def __post_init__(self) -> None:
-        if not (self.tolerance_px > 0 and self.max_samples >= 2):
-            raise ValueError(
-                f"tolerance_px must be positive and max_samples >= 2 (a mean over the exposure), got "
-                f"{self.tolerance_px} and {self.max_samples}"
-            )
+    tolerance_px: Positive = 0.5
+    max_samples: Annotated[int, Field(ge=2)] = 16
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
         n = self.samples(shot)
@@ -52,10 +48,7 @@ class MotionBlur(SamplingEffect):
         """Number of moments; 0 if the stage stands while the first row is exposed."""
         angles = [shot.angle_at(shot.time + shot.exposure * k / (LOOKS - 1)) for k in range(LOOKS)]
         turned = sum(abs(later - earlier) for earlier, later in pairwise(angles))
-        return math.ceil(min(turned * _rim(shot) / self.tolerance_px, self.max_samples))
-
-
-def _rim(shot: Shot) -> float:
-    """Largest travel of the sample's rim in pixels a radian; in a cone on the side towards the source."""
-    reach, sod = shot.radius / shot.detector.pitch, shot.detector.sod
-    return reach if math.isinf(sod) else reach / max(1 - shot.radius / sod, 0.05)
+        rim, sod = shot.radius / shot.detector.pitch, shot.detector.sod  # its travel, pixels a radian
+        if not math.isinf(sod):
+            rim /= max(1 - shot.radius / sod, 0.05)  # on the side towards the source
+        return math.ceil(min(turned * rim / self.tolerance_px, self.max_samples))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.anomaly import VISIBLE, Label, lit_share
 from simulators.effects.chain import Anomaly, ImageEffect
+from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import Image, Shot
 
 
@@ -26,17 +27,10 @@ class NarrowField(ImageEffect, Anomaly):
         penumbra: mm over which the light rises from none to all.
     """
 
-    width: float
-    height: float | None = None
+    width: Positive
+    height: Positive | None = None
     centre: tuple[float, float] = (0.0, 0.0)
-    penumbra: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.width > 0 and (self.height is None or self.height > 0) and self.penumbra >= 0):
-            raise ValueError(
-                f"width and height must be positive and penumbra >= 0 in mm, got {self.width}, {self.height} and "
-                f"{self.penumbra}"
-            )
+    penumbra: NotNegative = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         down, across = self._light(shot)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Whole
 from simulators.frame.sensor import OFFSET
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
@@ -20,12 +21,8 @@ class Offset(ImageEffect):
         seed: of the pixels' offsets.
     """
 
-    spread: float = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not (self.spread >= 0 and self.seed >= 0):
-            raise ValueError(f"spread (counts) and seed must be >= 0, got {self.spread} and {self.seed}")
+    spread: NotNegative = 0.0
+    seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         image += OFFSET[shot.readout]

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numba import config, njit
 from numpy.typing import NDArray
+from pydantic import Field
 from scipy import fft
 
 from simulators.effects.chain import ImageEffect
 from simulators.frame.detector import Detector
+from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged
@@ -54,19 +56,13 @@ class PhaseFringes(ImageEffect):
         method: "wave" or, near the sample, "transport".
     """
 
-    delta_beta: float
-    distance: float
-    energy: float
-    oversampling: int = 1
+    delta_beta: NotNegative
+    distance: NotNegative
+    energy: Positive
+    oversampling: Annotated[int, Field(ge=1, le=8)] = 1
     method: Literal["wave", "transport"] = "wave"
 
     def __post_init__(self) -> None:
-        if not (self.delta_beta >= 0 and self.distance >= 0 and self.energy > 0):
-            raise ValueError(f"delta_beta and distance (mm) must be >= 0 and energy (keV) positive, got {self}")
-        if not 1 <= self.oversampling <= 8:
-            raise ValueError(f"oversampling must lie in 1 ... 8, got {self.oversampling}")
-        if self.method not in ("wave", "transport"):
-            raise ValueError(f"method must be wave or transport, got {self.method!r}")
         if self.method == "transport" and self.oversampling != 1:
             raise ValueError(f"oversampling is for the method wave only; leave it out, got {self.oversampling}")
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
 
 from simulators.effects.chain import AreaEffect
 
@@ -18,11 +21,7 @@ class PixelArea(AreaEffect):
         rays: a side of the pixel, 2 ... 8; each of the rays² costs the line integrals of a frame.
     """
 
-    rays: int = 2
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.rays <= 8:
-            raise ValueError(f"rays must lie in 2 ... 8 a side of the pixel, got {self.rays}")
+    rays: Annotated[int, Field(ge=2, le=8)] = 2
 
     @property
     def offsets(self) -> tuple[tuple[float, float], ...]:

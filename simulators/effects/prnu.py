@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import Whole
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.pattern import binned, normals
 
@@ -23,12 +26,8 @@ class Prnu(ImageEffect):
         seed: of the pixels' responses.
     """
 
-    spread: float = 0.01
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.spread <= 0.2 and self.seed >= 0):
-            raise ValueError(f"spread must lie in 0 ... 0.2 and seed be >= 0, got {self.spread} and {self.seed}")
+    spread: Annotated[float, Field(ge=0, le=0.2)] = 0.01
+    seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         gain = binned(normals(self.name, self.seed, shot), shot.binning)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import Share
 from simulators.frame.shot import Image, Shot
 
 NM = (300, 350, 400, 425, 450, 475, 500, 550, 600, 650, 700, 750, 800, 850, 900, 950, 1000)
@@ -26,16 +29,12 @@ class QuantumEfficiency(ImageEffect):
         wavelength_nm: 300 ... 1000, for ORCA-Quest's curve, interpolated linearly.
     """
 
-    value: float | None = None
-    wavelength_nm: float | None = None
+    value: Share | None = None
+    wavelength_nm: Annotated[float, Field(ge=NM[0], le=NM[-1])] | None = None
 
     def __post_init__(self) -> None:
         if (self.value is None) == (self.wavelength_nm is None):
             raise ValueError(f"give either value or wavelength_nm, got {self}")
-        if self.value is not None and not 0 <= self.value <= 1:
-            raise ValueError(f"value must lie in 0 ... 1, got {self.value}")
-        if self.wavelength_nm is not None and not NM[0] <= self.wavelength_nm <= NM[-1]:
-            raise ValueError(f"wavelength_nm must lie in {NM[0]} ... {NM[-1]} nm, got {self.wavelength_nm}")
 
     @property
     def efficiency(self) -> float:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Whole
 from simulators.frame.sensor import READ_NOISE
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import add_normal
@@ -23,15 +26,9 @@ class ReadNoise(ImageEffect):
         seed: of the pixels' noise.
     """
 
-    rms: float | None = None
-    spread: float = 0.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.rms is not None and not self.rms >= 0:
-            raise ValueError(f"rms must be >= 0 electrons, got {self.rms}")
-        if not (0 <= self.spread <= 2 and self.seed >= 0):
-            raise ValueError(f"spread must lie in 0 ... 2 and seed be >= 0, got {self.spread} and {self.seed}")
+    rms: NotNegative | None = None
+    spread: Annotated[float, Field(ge=0, le=2)] = 0.0
+    seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         rms = READ_NOISE[shot.readout] if self.rms is None else self.rms

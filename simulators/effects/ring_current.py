@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import Image, Shot
 
 
@@ -25,20 +29,16 @@ class RingCurrent(ImageEffect):
         refill: s that a top-up takes, with a linearly rising current; 0: it is instantaneous.
     """
 
-    lifetime: float
-    top_up_every: float | None = None
-    top_up_below: float | None = None
-    refill: float = 0.0
+    lifetime: Positive
+    top_up_every: Positive | None = None
+    top_up_below: Annotated[float, Field(gt=0, lt=1)] | None = None
+    refill: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        if not self.lifetime > 0:
-            raise ValueError(f"lifetime must be positive, got {self.lifetime} s")
         if self.top_up_every is not None and self.top_up_below is not None:
             raise ValueError("top_up_every and top_up_below exclude each other; give one of them")
-        if self.top_up_below is not None and not 0 < self.top_up_below < 1:
-            raise ValueError(f"top_up_below must lie between 0 and 1, got {self.top_up_below}")
-        if not self.refill >= 0 or (self.refill > 0 and not self.tops_up):
-            raise ValueError(f"refill must be >= 0 s, and 0 without top_up_every or top_up_below, got {self.refill} s")
+        if self.refill > 0 and not self.tops_up:
+            raise ValueError(f"refill must be 0 s without top_up_every or top_up_below, got {self.refill} s")
         if self.top_up_every is not None and not self.top_up_every > self.refill:
             raise ValueError(f"top_up_every must be longer than refill, got {self.top_up_every} and {self.refill} s")
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.chain import PoseEffect
 from simulators.effects.turn_waves import Wave, check, series
+from simulators.frame.mapping import NotNegative
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
 
@@ -28,17 +29,12 @@ class Runout(PoseEffect):
 
     radial: tuple[Wave, ...] = ()
     axial: tuple[Wave, ...] = ()
-    radial_random_um: float = 0.0
-    axial_random_um: float = 0.0
+    radial_random_um: NotNegative = 0.0
+    axial_random_um: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check("radial", self.radial)
         check("axial", self.axial)
-        if not min(self.radial_random_um, self.axial_random_um) >= 0:
-            raise ValueError(
-                f"radial_random_um and axial_random_um must be >= 0 micrometres, got {self.radial_random_um} and "
-                f"{self.axial_random_um}"
-            )
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         radial, axial = series(pose.angle, self.radial), series(pose.angle, self.axial)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import Positive, Share
 from simulators.frame.sensor import FULL_WELL
 from simulators.frame.shot import Image, Shot
 
@@ -23,12 +24,8 @@ class Saturation(ImageEffect):
         knee: share of the full well over which the response bends.
     """
 
-    full_well: float = FULL_WELL
-    knee: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.full_well > 0 and 0 <= self.knee <= 1):
-            raise ValueError(f"full_well must be positive (electrons) and knee lie in 0 ... 1, got {self}")
+    full_well: Positive = FULL_WELL
+    knee: Share = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         well = self.full_well * shot.binning**2

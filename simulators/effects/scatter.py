@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import Image, Shot
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
@@ -23,15 +24,9 @@ class Scatter(ImageEffect):
         background: photons/s on an unbinned sensor pixel; p x photons_per_s is a share p of the open beam.
     """
 
-    ratio: float = 0.0
-    width_mm: float | None = None
-    background: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.ratio >= 0 and self.background >= 0):
-            raise ValueError(f"ratio and background must be >= 0, got {self}")
-        if self.width_mm is not None and not self.width_mm > 0:
-            raise ValueError(f"width_mm must be positive (leave it out to spread evenly), got {self.width_mm} mm")
+    ratio: NotNegative = 0.0
+    width_mm: Positive | None = None
+    background: NotNegative = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         level = self.background * shot.exposure * shot.binning**2

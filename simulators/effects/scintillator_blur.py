@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import BelowOne, NotNegative, Positive
 from simulators.frame.shot import CannotExposeError, Image, Shot
 from simulators.pixels.bands import share_rows
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, exponential, lorentzian
@@ -40,16 +41,10 @@ class ScintillatorBlur(ImageEffect):
             w / 2π(r² + w²)^1.5 with the transfer exp(-2πfw), which reaches much farther.
     """
 
-    fwhm_um: float
-    tail_share: float = 0.0
-    tail_um: float = 100.0
+    fwhm_um: NotNegative
+    tail_share: BelowOne = 0.0
+    tail_um: Positive = 100.0
     tail: Literal["exponential", "lorentzian"] = "exponential"
-
-    def __post_init__(self) -> None:
-        if not (self.fwhm_um >= 0 and self.tail_um > 0 and 0 <= self.tail_share < 1):
-            raise ValueError(f"fwhm_um must be >= 0, tail_um positive and tail_share in 0 ... 1 (excluded), got {self}")
-        if self.tail not in TAILS:
-            raise ValueError(f"tail must be one of {', '.join(TAILS)}, got {self.tail!r}")
 
     def apply(self, image: Image, shot: Shot) -> Image:
         """Raises CannotExposeError if the core is wider than MAX_CORE pixels: the units are probably wrong."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from simulators.effects.chain import PoseEffect
 from simulators.effects.turn_waves import Wave, check, series
+from simulators.frame.mapping import NotNegative
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
 
@@ -25,12 +26,10 @@ class StageWobble(PoseEffect):
     """
 
     harmonics: tuple[Wave, ...] = ()
-    random_urad: float = 0.0
+    random_urad: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check("harmonics", self.harmonics)
-        if not self.random_urad >= 0:
-            raise ValueError(f"random_urad must be >= 0 microradians, got {self.random_urad}")
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         wave = series(pose.angle, self.harmonics)

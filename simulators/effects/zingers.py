@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simulators.effects.chain import ImageEffect
+from simulators.frame.mapping import NotNegative, Positive, Share
 from simulators.frame.shot import CannotExposeError, Image, Shot, frame_rng
 
 DROPS = 200
@@ -27,17 +28,11 @@ class Zingers(ImageEffect):
         radius: standard deviation of the charge around its point or track, pixels of the frame; 0: a single pixel.
     """
 
-    rate: float
-    charge: float = 3000.0
-    tracks: float = 0.0
-    length: float = 20.0
-    radius: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not (self.rate >= 0 and self.charge > 0):
-            raise ValueError(f"rate must be >= 0 a second and charge positive, got {self}")
-        if not (0 <= self.tracks <= 1 and self.length > 0 and self.radius >= 0):
-            raise ValueError(f"tracks must lie in 0 ... 1, length be positive and radius >= 0, got {self}")
+    rate: NotNegative
+    charge: Positive = 3000.0
+    tracks: Share = 0.0
+    length: Positive = 20.0
+    radius: NotNegative = 0.0
 
     def apply(self, image: Image, shot: Shot) -> Image:
         """Raises CannotExposeError if a frame has more than MOST: the units are probably wrong."""

@@ -13,6 +13,7 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     BeforeValidator,
+    Field,
     FiniteFloat,
     StrictBool,
     StrictStr,
@@ -28,6 +29,13 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 K, V = TypeVar("K"), TypeVar("V")
 
+# Types of fields with bounds; `build` refuses other values.
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+BelowOne = Annotated[float, Field(ge=0, lt=1)]
+Whole = Annotated[int, Field(ge=0)]
+
 
 class SceneError(ValueError):
     """A scene's mapping is wrong; the message names the path of the key, its value and the legal values."""
@@ -35,7 +43,7 @@ class SceneError(ValueError):
 
 def build(cls: type[T], where: str, mapping: Any) -> T:
     """`cls(**mapping)` for a dataclass of numbers, text, booleans, tuples and mappings of these, dataclasses of such
-    fields, and None where a field is optional.
+    fields, and None where a field is optional. An annotated type may have bounds.
 
     A number is finite and may be given as text: YAML 1.1 reads 1e5 and 1.0e5 (no sign) as text.
 
@@ -103,13 +111,16 @@ def _checked(kind: Any) -> Any:
     """A field's type with the rules above, for pydantic."""
     if is_dataclass(kind):
         return _checked_dataclass(kind)
+    if get_origin(kind) is Annotated:
+        inner, *bounds = get_args(kind)
+        return Annotated[(_checked(inner), *bounds)]
     if container := _CONTAINERS.get(get_origin(kind)):
         return container[tuple(_checked(part) for part in get_args(kind))]
     return _SCALARS.get(kind, kind)
 
 
 def _checked_dataclass(cls: Any) -> Any:
-    hints, declared = get_type_hints(cls), [field for field in fields(cls) if field.init]
+    hints, declared = get_type_hints(cls, include_extras=True), [field for field in fields(cls) if field.init]
     needed = [field.name for field in declared if field.default is MISSING and field.default_factory is MISSING]
     kinds: dict[str, Any] = {field.name: (_checked(hints[field.name]), None) for field in declared}
 
@@ -153,5 +164,6 @@ def _sentence(where: str, error: ErrorDetails) -> str:
         return f"{path} is missing, got {value!r}"
     if kind == "too_long":
         return f"{path} must be a list of {error['ctx']['max_length']}, got {value!r}"
-    expected = error["ctx"]["expected"] if kind == "literal_error" else _EXPECTED.get(kind.split("_")[0], error["msg"])
+    by_kind = _EXPECTED.get(kind.split("_")[0], error["msg"].removeprefix("Input should be "))
+    expected = error["ctx"]["expected"] if kind == "literal_error" else by_kind
     return f"{path}{': key' if '[key]' in loc else ''} must be {expected}, got {value!r}"

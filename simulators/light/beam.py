@@ -5,6 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+from simulators.frame.mapping import NotNegative, Positive
 
 NEAREST, FARTHEST = 1e-6, 1e9
 """mm, of a cone's source: squares of far larger distances overflow."""
@@ -20,14 +25,8 @@ class Tube:
         filters: mm of each material in the beam; {Al: 1.0, Cu: 0.1}.
     """
 
-    kv: float
-    filters: Mapping[str, float] | None = None
-
-    def __post_init__(self) -> None:
-        if not 5 <= self.kv <= 800:
-            raise ValueError(f"kv must lie in 5 ... 800, got {self.kv}")
-        if bad := {name: mm for name, mm in (self.filters or {}).items() if not mm >= 0}:
-            raise ValueError(f"filters are mm >= 0 of a material, got {bad}")
+    kv: Annotated[float, Field(ge=5, le=800)]
+    filters: Mapping[str, NotNegative] | None = None
 
 
 @dataclass(frozen=True)
@@ -50,18 +49,16 @@ class Beam:
         tube: instead of energy_kev.
     """
 
-    photons_per_s: float
+    photons_per_s: NotNegative
     sod: float | None = None
     sdd: float | None = None
-    energy_kev: float | None = None
-    bandwidth: float | None = None
-    harmonics: Mapping[int, float] | None = None
-    spectrum: tuple[tuple[float, float], ...] | None = None
+    energy_kev: Positive | None = None
+    bandwidth: Annotated[float, Field(gt=0, le=0.2)] | None = None
+    harmonics: Mapping[Annotated[int, Field(ge=2)], NotNegative] | None = None
+    spectrum: tuple[tuple[Positive, NotNegative], ...] | None = None
     tube: Tube | None = None
 
     def __post_init__(self) -> None:
-        if not self.photons_per_s >= 0:
-            raise ValueError(f"photons_per_s must be >= 0, got {self.photons_per_s}")
         if (self.sod is None) != (self.sdd is None):
             raise ValueError("a cone needs both sod and sdd in mm; a parallel beam neither")
         if self.sod is not None and self.sdd is not None and not self.sdd >= self.sod > 0:
@@ -77,18 +74,11 @@ class Beam:
         for name in ("bandwidth", "harmonics"):
             if getattr(self, name) is not None and self.energy_kev is None:
                 raise ValueError(f"{name} needs an energy_kev, which is missing")
-        if self.energy_kev is not None and not 0 < self.energy_kev < math.inf:
-            raise ValueError(f"energy_kev must be positive, got {self.energy_kev}")
-        if self.bandwidth is not None and not 0 < self.bandwidth <= 0.2:
-            raise ValueError(f"bandwidth is a share of the energy above 0 and up to 0.2, got {self.bandwidth}")
         shares = self.harmonics or {}
-        if any(n < 2 or not share >= 0 for n, share in shares.items()) or sum(shares.values()) >= 1:
-            raise ValueError(f"harmonics are shares >= 0 at multiples >= 2, below 1 in sum, got {dict(shares)}")
-        if self.spectrum is not None and not (
-            all(energy > 0 and weight >= 0 for energy, weight in self.spectrum)
-            and sum(weight for _, weight in self.spectrum) > 0
-        ):
-            raise ValueError(f"spectrum is a list of [keV > 0, weight >= 0], not all 0, got {self.spectrum}")
+        if sum(shares.values()) >= 1:
+            raise ValueError(f"harmonics are shares, below 1 in sum, got {dict(shares)}")
+        if self.spectrum is not None and not sum(weight for _, weight in self.spectrum) > 0:
+            raise ValueError(f"spectrum is a list of [keV, weight], not all of weight 0, got {self.spectrum}")
 
     @property
     def source_distance(self) -> float:

@@ -116,13 +116,9 @@ def by_volume(name: str, one: Material, other: Material, share: float) -> Materi
 def layered_oxide(name: str, formula: str, a: float, c: float) -> Material:
     """A layered oxide (space group R-3m, three formula units a hexagonal cell): the crystal's density, by a and c in
     Å."""
-    mass = sum(n * xraylib.AtomicWeight(z) for z, n in zip(*_atoms(formula), strict=True))
+    atoms = xraylib.CompoundParser(formula)
+    mass = sum(n * xraylib.AtomicWeight(z) for z, n in zip(atoms["Elements"], atoms["nAtoms"], strict=True))
     return of_formula(name, formula, 3 * mass / (AVOGADRO * 3**0.5 / 2 * a**2 * c))
-
-
-def _atoms(formula: str) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    parsed = xraylib.CompoundParser(formula)
-    return parsed["Elements"], parsed["nAtoms"]
 
 
 def _fractions(formula: str) -> tuple[tuple[int, float], ...]:

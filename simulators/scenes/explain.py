@@ -13,9 +13,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from simulators.effects.catalogue import CATALOGUE
+from simulators.effects.catalogue import CATALOGUE, Domain
 from simulators.effects.chain import Chain, ImageEffect
-from simulators.frame.domain import Domain
 from simulators.frame.shot import Shot
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
@@ -75,11 +74,11 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCo
     rest = [effect for effect in scene.chain.effects if isinstance(effect, ImageEffect)]
     variants = [replace(scene, chain=Chain.of([*ray_effects[:n], *rest])) for n in range(len(ray_effects) + 1)]
     rounds = [_round(variants, shot, now) for _ in range(repeats + 1)][1:]
-    seconds = {name: statistics.median(each.steps[name] for each in rounds) for name in rounds[0].steps}
+    seconds = {name: statistics.median(steps[name] for steps, _ in rounds) for name in rounds[0][0]}
     sizes, peaks = _sizes(variants[0], shot), [_peak(each, shot) for each in variants]
     costs = [_cost("line_integrals", seconds["line_integrals"], sizes["line_integrals"])]
     for n, effect in enumerate(ray_effects):
-        more = statistics.median(each.whole[n + 1] - each.whole[n] for each in rounds)
+        more = statistics.median(whole[n + 1] - whole[n] for _, whole in rounds)
         costs.append(_cost(effect.name, more, max(peaks[n + 1] - peaks[n], 0)))
     order = [effect.name for effect in rest]
     depth = [effect.name for effect in rest if effect.domain is Domain.OPTICAL_DEPTH]
@@ -88,7 +87,7 @@ def explain(scene: Scene, shot: Shot, now: Seconds, repeats: int = 5) -> FrameCo
             costs.append(_cost(name, seconds[name], sizes[name]))
     named = {effect.name for effect in scene.chain.effects}
     left = tuple((name, entry.summary) for name, entry in CATALOGUE.items() if name not in named)
-    return FrameCost(tuple(costs), statistics.median(each.whole[-1] for each in rounds) * 1e3, left)
+    return FrameCost(tuple(costs), statistics.median(whole[-1] for _, whole in rounds) * 1e3, left)
 
 
 def _cost(name: str, seconds: float, size: int) -> Cost:
@@ -97,16 +96,10 @@ def _cost(name: str, seconds: float, size: int) -> Cost:
     return Cost(name, CATALOGUE[name].domain, seconds * 1e3, size, CATALOGUE[name].summary)
 
 
-@dataclass(frozen=True, eq=False)
-class _Round:
-    """Seconds of one round: of the steps of the first scene by name, and of a whole frame of each."""
+def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> tuple[Mapping[str, float], Sequence[float]]:
+    """Seconds of the first scene's steps by name, and of a whole frame of each scene.
 
-    steps: Mapping[str, float]
-    whole: Sequence[float]
-
-
-def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> _Round:
-    """Times all variants once, in turns, so that a change of the machine's speed affects all of them."""
+    All are timed in turns, so that a change of the machine's speed affects all of them."""
     steps: dict[str, float] = defaultdict(float)
 
     @contextmanager
@@ -121,7 +114,7 @@ def _round(scenes: Sequence[Scene], shot: Shot, now: Seconds) -> _Round:
         start = now()
         expose(scene, shot)
         whole.append(now() - start)
-    return _Round(steps, whole)
+    return steps, whole
 
 
 def _sizes(scene: Scene, shot: Shot) -> dict[str, int]:

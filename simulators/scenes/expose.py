@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.effects.catalogue import Domain
 from simulators.effects.chain import StepHook
-from simulators.frame.domain import Domain
 from simulators.frame.pose import Pose
 from simulators.frame.sensor import digitise, largest_count
 from simulators.frame.shot import Image, Shot
@@ -40,14 +40,9 @@ def expose(scene: Scene, shot: Shot, on_step: StepHook = nullcontext) -> NDArray
         return digitise(counts, largest_count(shot.readout, shot.binning))
 
 
-def _open_beam(scene: Scene, shot: Shot) -> float:
-    """Photons of a pixel in the open beam."""
-    return scene.beam.photons_per_s * shot.exposure * shot.binning**2
-
-
 def _photons(scene: Scene, shot: Shot, on_step: StepHook) -> Image:
     """Photons behind the sample, averaged over the moments of the effects of motion; float64 [row, col]."""
-    open_beam = _open_beam(scene, shot)
+    open_beam = scene.beam.photons_per_s * shot.exposure * shot.binning**2  # photons of a pixel
     if not shot.sample:
         with on_step("beer_lambert"):
             return np.full(shot.detector.shape, open_beam)
@@ -83,19 +78,14 @@ def _transmission(
             depth = scene.sample.line_integrals(pose, detector)
         depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, replace(now, detector=detector), on_step)
         with on_step("beer_lambert"):
-            return _transmitted(depth, open_beam / len(rays))
+            np.exp(np.negative(depth, out=depth), out=depth)
+            depth *= open_beam / len(rays)
+            return depth
 
     photons = through(*rays[0])
     for ray in rays[1:]:
         photons += through(*ray)
     return photons
-
-
-def _transmitted(depth: Image, open_beam: float) -> Image:
-    """open_beam x exp(-line integral), in place."""
-    np.exp(np.negative(depth, out=depth), out=depth)
-    depth *= open_beam
-    return depth
 
 
 def _row_angles(times: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:

@@ -17,18 +17,72 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from pydantic import Field
+
+from drivers.orca_quest import SENSOR_SHAPE
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
-from simulators.frame.mapping import build, located, named
+from simulators.frame.mapping import Positive, build, located, named
 from simulators.light.beam import Beam
 from simulators.samples.composed.phantoms import build_sample
 from simulators.samples.sample import Sample
-from simulators.scenes.settings import DetectorSettings, ScanSettings
 
 if TYPE_CHECKING:
     from simulators.samples.voxels.volume import ReadVolume
+
+
+Frames = Annotated[int, Field(ge=0, le=1_000_000)]  # as in a configuration
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """Attributes:
+    shape: (rows, cols) of the frame, after binning.
+    pixel_size_um: of an unbinned pixel, at the sample.
+    exposure_s: of a frame.
+    binning: sensor pixels summed per side.
+    readout: the camera's mode.
+    electrons_per_count: None: the camera's.
+    """
+
+    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (512, 512)
+    pixel_size_um: Annotated[float, Field(ge=1e-3, le=1e6)] = 4.6
+    exposure_s: Seconds = 0.05
+    binning: Literal[1, 2, 4] = 1
+    readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
+    electrons_per_count: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if any(n * self.binning > whole for n, whole in zip(self.shape, SENSOR_SHAPE, strict=True)):
+            raise ValueError(
+                f"{self.shape} pixels of {self.binning} x {self.binning} do not lie on the sensor of "
+                f"{SENSOR_SHAPE[0]} x {SENSOR_SHAPE[1]}"
+            )
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """Attributes:
+    views: evenly spaced over the range, its end excluded.
+    range_deg: degrees.
+    period_s: s from one trigger to the next.
+    fly: the stage turns steadily; false: it stands while a view is exposed.
+    darks, flats: taken before the views.
+    """
+
+    views: Annotated[int, Field(ge=1, le=1_000_000)] = 180
+    range_deg: Annotated[float, Field(ge=-1e6, le=1e6)] = 180.0
+    period_s: Seconds = 0.1
+    fly: bool = True
+    darks: Frames = 10
+    flats: Frames = 10
+
+    def __post_init__(self) -> None:
+        if self.range_deg == 0:
+            raise ValueError("range_deg must not be 0")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Set
 
 from drivers.base.clock import Clock
 
-IDENTITY = "SIMULATED INSTRUMENTS INC.,MODEL 6485,0000001,A01"
 OVER_RANGE = 9.9e37
 
 
@@ -64,9 +63,7 @@ class ElectrometerWire:
 
     def _do(self, command: str) -> None:
         self.heard.append(command)
-        if command == "*IDN?":
-            self._answer(IDENTITY.encode())
-        elif command == "READ?":
+        if command == "READ?":
             at, self.readings = self.readings, self.readings + 1
             if at in self._spoilt:
                 self._answer(self._spoilt[at])

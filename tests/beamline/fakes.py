@@ -20,7 +20,6 @@ from drivers.base.protocols import (
     CameraTiming,
     Devices,
     StageLimits,
-    StageStatus,
     TriggerSource,
     TriggerTrain,
 )
@@ -140,9 +139,6 @@ class Stage:
     def moving(self) -> bool:
         return self.instrument.clock.now() < self.move.end
 
-    def status(self) -> StageStatus:
-        return StageStatus(round(self.count(self.instrument.clock.now())), self.moving(), None, "")
-
     def start_home(self) -> None:
         raise DeviceRefused(self.name, "it has no reference")
 
@@ -165,10 +161,6 @@ class Stage:
         assert not self.moving()
         self.train = None
         self.pulses = []
-
-    def remaining_pulses(self) -> int | None:
-        now = self.instrument.clock.now()
-        return sum(time > now for time, _ in self.pulses) if self.train is None else self.train.n
 
     def stop(self) -> None:
         self.instrument.log.append("stop stage")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators.frame.domain import Domain
+from simulators.effects.catalogue import Domain
 from simulators.frame.shot import Shot
 from simulators.scenes.scene import Scene
 from tests.simulators import shots

@@ -76,7 +76,7 @@ class TestSiteCamera(CameraConformance):
 class TestSiteStage(StageConformance):
     @pytest.fixture
     def kind(self) -> StageKind:
-        return StageKind(width=1e-3, no_width=0.5e-3, inverts=True, relative_moves=200)
+        return StageKind(width=1e-3, no_width=0.5e-3, inverts=True)
 
     @pytest.fixture
     def build(self, kind: StageKind) -> Iterator[Build]:

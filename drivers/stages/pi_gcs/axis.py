@@ -14,6 +14,7 @@ from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.train import TriggerWindow
+from drivers.stages.stops import while_it_moves
 
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
 ACCELERATION, DECELERATION, NUMERATOR, DENOMINATOR = "0xB", "0xC", "0xE", "0xF"
@@ -26,7 +27,6 @@ class PiAxisStatus:
     """What the axis says. `raw`: the replies, for errors."""
 
     counts: int
-    moving: bool
     homed: bool
     servo: bool
     raw: str
@@ -94,12 +94,11 @@ class PiGcsAxis:
 
     def status(self) -> PiAxisStatus:
         """Where it is and how; what the error register has becomes `fault`."""
-        moving = self.moving()
         self._line.read_error()
         homed, servo, counts = self._line.flag("FRF?"), self._line.flag("SVO?"), self.counts()
         error = meaning(self._line.fault) or "no error"
-        said = f"moving {moving:d}, counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
-        return PiAxisStatus(counts, moving, homed, servo, said)
+        said = f"counts {counts}, referenced {homed:d}, servo {servo:d}, {error}"
+        return PiAxisStatus(counts, homed, servo, said)
 
     def limit_switch(self) -> str:
         """Which limit switch is on, in words; "" without one, or for a model with an unknown register."""
@@ -111,12 +110,7 @@ class PiGcsAxis:
     def standing(self, purpose: str) -> None:
         """Refuses `purpose` while the axis moves; the error register becomes `fault`."""
         if self.moving():
-            raise DeviceRefused(
-                self._name,
-                f"{purpose} is not possible while it moves",
-                advice="Wait for the move to end, or stop it",
-                state=f"The move under way goes on; it is at {self.counts()} counts",
-            )
+            raise while_it_moves(self._name, purpose, self.counts())
         self._line.read_error()
 
     def start(self, target: int, speed: Fraction) -> None:
@@ -140,9 +134,10 @@ class PiGcsAxis:
         self._line.stop(command := f"HLT {self._axis}")
         return command
 
-    def stop_all(self) -> None:
+    def stop_all(self) -> str:
         """All axes of the controller stand at once."""
         self._line.stop(STOP_ALL)
+        return f"#{STOP_ALL[0]}"
 
     def arm(self, window: TriggerWindow, active_high: bool) -> None:
         """Set the trigger line of the standing axis up and switch it on."""

@@ -11,7 +11,7 @@ from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import Probe
 from drivers.serial.line_reader import Framing
 from drivers.stages.pi_gcs.errors import REFUSALS, advice, meaning
 from drivers.stages.settings import Wiring
@@ -53,16 +53,7 @@ class GcsLine:
         """Whether a move has started; error messages depend on it."""
         self._name, self._axis, self._key = name, axis, re.escape(axis) + " ?= ?"
         self._register = threading.RLock()
-        self._serial = SerialLine(
-            url,
-            device=name,
-            probe=PROBE,
-            clock=clock,
-            timeout=wiring.timeout,
-            baudrate=wiring.baudrate,
-            framing=FRAMING,
-            transcript=wiring.transcript,
-        )
+        self._serial = wiring.line(url, name, clock, PROBE, framing=FRAMING)
 
     def set(self, command: str) -> None:
         """Send a set command; raises if the register then has a code."""
@@ -79,10 +70,7 @@ class GcsLine:
 
         A stop sets its own code; codes of earlier errors are accepted, too.
         """
-        if isinstance(command, str):
-            self._serial.send(command)
-        else:
-            self._serial.send_raw(command)
+        self._serial.send(command)
         with self._register:
             code = self.read_error()
         if code in REFUSALS:
@@ -111,8 +99,6 @@ class GcsLine:
 
     def ask(self, request: str | bytes, form: str, meant: str) -> re.Match[str]:
         """Send a query, a text or a control byte. Returns the match of its whole reply with `form`."""
-        if isinstance(request, bytes):
-            return self._serial.query_raw(request, form, meant, self._state())
         return self._serial.query(request, form, meant, self._state())
 
     def flag(self, query: str) -> bool:

@@ -32,13 +32,8 @@ class Reference(StrEnum):
 class PiGcsSettings:
     """Physik Instrumente controller that talks GCS 2.0, with triggers from CTO and TRO, such as a C-863.
 
-    Attributes:
-        axis: identifier as SAI? lists it.
-        trigger_line: digital output of the pulses, from 1.
-        first_pulse: where the firmware puts the first pulse; no manual says, taken from memory.
-        firmware_pulse: s that the firmware holds a pulse, from memory; trains need equal pauses between pulses.
-        tolerance: largest distance in counts of an arrived move from its target (a servo holds to a few counts).
-        settle: s after a move in which the controller may still bring the axis on target.
+    The axis is named as SAI? lists it. `firmware_pulse` is from memory; trains need equal pauses between pulses. A
+    servo holds to a few counts, hence the tolerance.
 
     Raises:
         ValueError: a speed or acceleration that cannot be written, or a pulse width, which the firmware fixes.

@@ -13,29 +13,25 @@ from fractions import Fraction
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
+from drivers.base.protocols import TriggerTrain
 from drivers.stages.pi_gcs.axis import STOP_ALL, PiAxisStatus, PiGcsAxis
 from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
 from drivers.stages.pi_gcs.train import is_spent_by, window_of
-from drivers.stages.standing import POLL, longest_stop, until_standing
-from drivers.stages.stops import Stops
+from drivers.stages.shared import LineStage
+from drivers.stages.stops import POLL, Stops, until_standing
 from drivers.stages.travel import Travel
 
 
-class PiGcsStage:
-    """Implements `drivers.base.protocols.RotationStage`. Opening switches the servo on and the trigger line off.
-    Closing leaves both, and a move under way, as they are.
+class PiGcsStage(LineStage):
+    """Opening switches the servo on and the trigger line off. Closing leaves both, and a move under way, as they are.
 
-    `stop` returns when the stage stands, `abort` at once; it stops all axes of the controller. A move that would emit a
-    train a second time, or turn back inside it, ends the train.
+    `abort` stops all axes of the controller. A move that would emit a train a second time, or turn back inside it, ends
+    the train.
 
     Args:
         url: what pyserial opens.
-
-    Raises:
-        DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
     Settings = PiGcsSettings
@@ -61,37 +57,16 @@ class PiGcsStage:
 
     @staticmethod
     def halt(url: str, settings: PiGcsSettings, clock: Clock) -> None:
-        """See `drivers.stages.settings.StageDriver`."""
         with closing(GcsLine(url, settings.axis, settings.wiring, clock, "stage")) as line:
             line.stop(STOP_ALL)
 
-    @property
-    def limits(self) -> StageLimits:
-        return self._travel.limits
-
-    def to_counts(self, angle: float) -> int:
-        return self._travel.to_counts(angle)
-
-    def to_angle(self, counts: int) -> float:
-        return self._travel.to_angle(counts)
-
-    def position(self) -> float:
-        return self.to_angle(self._axis.counts())
-
-    def status(self) -> StageStatus:
-        status = self._axis.status()
-        held = None if status.moving or not status.servo or self._away(status.counts) else self._target
-        return StageStatus(status.counts, status.moving, status.homed, self._fault(status), held)
+    def _counts(self) -> int:
+        return self._axis.counts()
 
     def start_move(self, angle: float, speed: float) -> None:
         target = self._travel.target(angle)
         if not SLOWEST <= math.degrees(speed) <= math.degrees(self.limits.max_speed) * (1 + 1e-12):
-            raise DeviceRefused(
-                self.name,
-                f"a speed of {math.degrees(speed):g} deg/s is not possible",
-                expected=f"{SLOWEST:g} to {math.degrees(self.limits.max_speed):g} deg/s",
-                state="Nothing has moved",
-            )
+            raise self._travel.no_such_speed(speed, f"{SLOWEST:g} deg/s or more")
         with self._begin("the move"):
             self._axis.standing("a move")
             if self._train is not None and is_spent_by(self._train, self._axis.counts(), target):
@@ -101,7 +76,7 @@ class PiGcsStage:
             self._target = target
 
     def start_home(self) -> None:
-        """See `drivers.base.protocols.Motion`; soft limits do not hold on the way. It ends an armed train."""
+        """Soft limits do not hold on the way. It ends an armed train."""
         with self._begin("the reference move"):
             self._axis.standing("a reference move")
             self._train, self._target, self._homing = None, None, False
@@ -113,7 +88,7 @@ class PiGcsStage:
 
     def wait(self, timeout: float) -> float:
         target, homing = self._target, self._homing
-        if self._until_standing(timeout):
+        if until_standing(self._clock, self.moving, bool, timeout):
             aim = "" if target is None else self._travel.degrees(target)
             raise self._travel.still_moving(timeout, self._axis.counts(), aim, self._axis.last_move)
         if target is not None:
@@ -147,20 +122,6 @@ class PiGcsStage:
         self._axis.disarm()
         self._train = None
 
-    def remaining_pulses(self) -> None:
-        """None: the controller does not count its pulses."""
-
-    def stop(self) -> None:
-        self._stops.came(hard=False)
-        command = self._axis.brake()
-        longest = longest_stop(self.limits)
-        if self._until_standing(longest):
-            raise self._travel.not_stopped(longest, self._axis.counts(), command)
-
-    def abort(self) -> None:
-        self._stops.came(hard=True)
-        self._axis.stop_all()
-
     def describe(self) -> dict[str, str | int | float]:
         return {
             "model": "PI GCS 2.0",
@@ -175,11 +136,6 @@ class PiGcsStage:
         }
 
     def digital_output(self, number: int) -> GcsOutput:
-        """Another output of the controller, such as one that opens a shutter.
-
-        Raises:
-            DeviceRefused: this output gives the trigger pulses.
-        """
         if number == self._settings.trigger_line:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
         return GcsOutput(self._line, number, f"{self.name} output {number}")
@@ -194,15 +150,8 @@ class PiGcsStage:
         with self._stops.none_while(purpose):
             yield
 
-    def _send_stop(self, hard: bool) -> None:
-        if hard:
-            self._axis.stop_all()
-        else:
-            self._axis.brake()
-
-    def _until_standing(self, timeout: float) -> bool:
-        """Wait until it stands; returns whether it still moves when the time is over."""
-        return until_standing(self._clock, self.moving, bool, timeout)
+    def _send_stop(self, hard: bool) -> str:
+        return self._axis.stop_all() if hard else self._axis.brake()
 
     def _until_settled(self, target: int) -> None:
         """Wait for the servo to reach the target, if the stage is near it."""
@@ -216,7 +165,7 @@ class PiGcsStage:
     def _fault(self, status: PiAxisStatus) -> str:
         """Why the last move ended early, or what stands, in words; "" for nothing."""
         code, words = self._line.fault, []
-        early = not status.moving and (self._away(status.counts) or (self._homing and not status.homed))
+        early = self._away(status.counts) or (self._homing and not status.homed)
         if code and code != STOPPED:
             words.append(meaning(code))
         elif early and (code == STOPPED or self._stops.count != self._stops_before):

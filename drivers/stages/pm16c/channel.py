@@ -14,6 +14,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.stages.pm16c.line import PM16CLine
 from drivers.stages.pm16c.train import TriggerPoints
 from drivers.stages.settings import Wiring
+from drivers.stages.stops import while_it_moves
 
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)
@@ -98,13 +99,7 @@ class PM16CChannel:
         """The status; refuses `purpose` while the motor moves or the panel is in LOCAL."""
         status = self.status()
         if status.moving:
-            raise DeviceRefused(
-                self._name,
-                f"{purpose} is not possible while it moves",
-                reply=status.raw,
-                advice="Wait for the move to end, or stop it",
-                state=f"The move under way goes on; it is at {status.counts} counts",
-            )
+            raise while_it_moves(self._name, purpose, status.counts, status.raw)
         if not status.remote:
             raise DeviceRefused(
                 self._name,
@@ -156,14 +151,9 @@ class PM16CChannel:
         self.standing("disarming")
         self._line.make_ready(f"TMGC{self._digit}", f"TMGR?{self._digit}", "NO")
 
-    def slow_stop(self) -> str:
-        """Send the stop command without waiting; returns it."""
-        self._line.send(command := f"SSTP{self._digit}")
-        return command
-
-    def emergency_stop(self) -> str:
-        """As `slow_stop`, without deceleration."""
-        self._line.send(command := f"ESTP{self._digit}")
+    def stop(self, hard: bool) -> str:
+        """Send a stop (hard: without deceleration) without waiting; returns the command."""
+        self._line.send(command := f"{'ESTP' if hard else 'SSTP'}{self._digit}")
         return command
 
     def close(self) -> None:
@@ -215,3 +205,61 @@ class PM16CChannel:
                 advice="Check limit switches, the motor's driver and that the panel is in REMOTE",
                 state=f"The stage stands at {status.counts} counts",
             )
+
+
+class HomeSearch:
+    """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
+
+    `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
+    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel, the
+    speed is the selected one, and a search that has found the switch may end some counts beyond it.
+
+    Args:
+        home: the count that the reference gets.
+    """
+
+    def __init__(self, channel: PM16CChannel, name: str, home: int) -> None:
+        self._channel, self._name, self._home = channel, name, home
+        self._found: int | None = None
+        self._cancelled = False
+
+    def begin(self, speed: int) -> None:
+        """Start to search at `speed` pulses/s."""
+        self._channel.find_home(speed)
+
+    def cancel(self) -> None:
+        """End the search: no further step. Call it before the stop is sent, from any thread."""
+        self._cancelled = True
+
+    def go_on(self, status: ChannelStatus) -> bool:
+        """Take the next step after the motor has come to rest. False if there is no further step.
+
+        Raises:
+            DeviceError: the search ended without the switch, or was stopped.
+        """
+        found = self._channel.home() if self._found is None else self._found
+        if found is None or self._cancelled or status.stopped:
+            raise self._failed(status)
+        if self._found is None and status.counts != found:
+            self._found = found
+            try:
+                self._channel.go_home(found)
+            finally:
+                if self._cancelled:  # the stop may have gone out just before the move
+                    self._channel.stop(hard=False)
+            return True
+        if status.counts != found:
+            raise self._failed(status)
+        self._channel.preset(self._home)
+        return False
+
+    def _failed(self, status: ChannelStatus) -> DeviceError:
+        why = status.ending or ("stopped" if self._cancelled else "no reason given")
+        return DeviceError(
+            self._name,
+            f"the search for the home switch stopped short ({why})",
+            reply=status.raw,
+            expected="to stand on the home switch",
+            advice="Check the switch and its settings on the controller's panel, then search again",
+            state=f"It stands at {status.counts} counts, which are not those of the reference",
+        )

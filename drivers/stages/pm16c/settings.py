@@ -36,12 +36,6 @@ def steepest_code(acceleration: float) -> int:
 class PM16CSettings:
     """Tsuji PM16C-04XD pulse-motor controller on a serial port, a TCP port or simulated.
 
-    Attributes:
-        channel: motor channel.
-        first_pulse: where the firmware puts the first pulse; that it is the start point is from memory.
-        home: angle of the home switch in rad; None without a switch: a search is then refused.
-        home_speed: rad/s for the search; None is a tenth of the full speed.
-
     Raises:
         ValueError: a speed, a place, a width, a polarity or a channel that the controller does not have, or an
             acceleration below its gentlest.

@@ -11,27 +11,20 @@ import math
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import DigitalOutput, StageLimits, StageStatus, TriggerTrain
-from drivers.stages.pm16c.channel import ChannelStatus, PM16CChannel
-from drivers.stages.pm16c.home import HomeSearch
+from drivers.base.protocols import DigitalOutput, TriggerTrain
+from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.train import MODES, points_of
-from drivers.stages.standing import longest_stop, until_standing
-from drivers.stages.stops import Stops
+from drivers.stages.shared import LineStage
+from drivers.stages.stops import Stops, until_standing
 from drivers.stages.travel import Travel
 
 
-class PM16CStage:
-    """Implements `drivers.base.protocols.RotationStage`. Closing it leaves a move under way to end by itself.
-
-    `stop` returns when the stage stands, `abort` at once. A `wait` for a stopped move raises, whoever stopped it: no
-    thread takes the move as complete. Arming and disarming need a standing stage.
+class PM16CStage(LineStage):
+    """Closing it leaves a move under way to end by itself. Arming and disarming need a standing stage.
 
     Args:
         url: what pyserial opens; the controller's LAN port is "socket://host:7777".
-
-    Raises:
-        DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
     Settings = PM16CSettings
@@ -57,22 +50,11 @@ class PM16CStage:
 
     @staticmethod
     def halt(url: str, settings: PM16CSettings, clock: Clock) -> None:
-        """See `drivers.stages.settings.StageDriver`."""
         with contextlib.closing(PM16CChannel(url, settings.channel, settings.wiring, clock, "stage")) as channel:
-            channel.slow_stop()
+            channel.stop(hard=False)
 
-    @property
-    def limits(self) -> StageLimits:
-        return self._travel.limits
-
-    def to_counts(self, angle: float) -> int:
-        return self._travel.to_counts(angle)
-
-    def to_angle(self, counts: int) -> float:
-        return self._travel.to_angle(counts)
-
-    def position(self) -> float:
-        return self.to_angle(self._channel.counts())
+    def _counts(self) -> int:
+        return self._channel.counts()
 
     def start_move(self, angle: float, speed: float) -> None:
         target, pps = self._travel.target(angle), self._pps(speed)
@@ -81,7 +63,7 @@ class PM16CStage:
         self._target, self._search = target, None
 
     def start_home(self) -> None:
-        """See `drivers.base.protocols.Motion`; `wait` does the later steps. An armed train is disarmed."""
+        """`wait` does the later steps of the search. An armed train is disarmed."""
         if self._home is None:
             raise DeviceRefused(
                 self.name,
@@ -93,12 +75,6 @@ class PM16CStage:
         with self._stops.none_while("the search"):
             search.begin(self._settings.search_rate)
         self._target, self._search = self._home, search
-
-    def status(self) -> StageStatus:
-        """See `drivers.base.protocols.Motion`; `homed` is None without a home switch."""
-        status = self._channel.status()
-        homed = None if self._home is None else self._channel.home() is not None
-        return StageStatus(status.counts, status.moving, homed, status.ending)
 
     def moving(self) -> bool:
         return self._channel.status().moving
@@ -135,21 +111,6 @@ class PM16CStage:
     def disarm(self) -> None:
         self._channel.disarm()
 
-    def remaining_pulses(self) -> None:
-        """None: the controller says only whether the first pulse is still to come."""
-
-    def stop(self) -> None:
-        self._stops.came(hard=False)
-        command = self._send_stop(hard=False)
-        longest = longest_stop(self.limits)
-        status = self._until_standing(longest)
-        if status.moving:
-            raise self._travel.not_stopped(longest, status.counts, command, status.raw)
-
-    def abort(self) -> None:
-        self._stops.came(hard=True)
-        self._send_stop(hard=True)
-
     def describe(self) -> dict[str, str | int | float]:
         return {
             "model": "Tsuji PM16C-04XD(L)",
@@ -170,13 +131,11 @@ class PM16CStage:
                 self._channel.close()
 
     def _send_stop(self, hard: bool) -> str:
-        """Send a stop; returns the command."""
         if (search := self._search) is not None:
             search.cancel()
-        return self._channel.emergency_stop() if hard else self._channel.slow_stop()
+        return self._channel.stop(hard)
 
     def digital_output(self, number: int) -> DigitalOutput:
-        """See `drivers.base.protocols.RotationStage`: no output of the controller can be set."""
         raise DeviceRefused(
             self.name,
             f"the controller has no digital output {number} to set",
@@ -189,12 +148,7 @@ class PM16CStage:
         possible = 0 < speed < 2 * self.limits.max_speed
         pps = round(speed * self.limits.counts_per_turn / (2 * math.pi)) if possible else 0
         if not 1 <= pps <= self._fastest:
-            raise DeviceRefused(
-                self.name,
-                f"a speed of {math.degrees(speed):g} deg/s is not possible",
-                expected=f"1 to {self._fastest} pulses/s, at most {math.degrees(self.limits.max_speed):g} deg/s",
-                state="Nothing has moved",
-            )
+            raise self._travel.no_such_speed(speed, f"1 to {self._fastest} pulses/s")
         return pps
 
     def _until_standing(self, timeout: float) -> ChannelStatus:

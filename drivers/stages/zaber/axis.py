@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
-from drivers.serial.line import Probe, SerialLine
+from drivers.serial.line import Probe
+from drivers.stages.stops import while_it_moves
 from drivers.stages.zaber.packet import (
     REASONS,
     UNREFERENCED,
@@ -89,16 +90,13 @@ class ZaberAxis:
         """The command of the last move or search, for errors."""
         self._found: dict[str, str] = {}
         self._checksums_found = "1"
-        self._line = SerialLine(
+        self._line = wiring.line(
             url,
-            device=name,
-            probe=Probe(encode(device, 0, PROBE_ID, ""), reply_form(device, 0, PROBE_ID, TEXT)),
-            clock=clock,
-            timeout=wiring.timeout,
-            baudrate=wiring.baudrate,
+            name,
+            clock,
+            Probe(encode(device, 0, PROBE_ID, ""), reply_form(device, 0, PROBE_ID, TEXT)),
             unsolicited=passed_over_form(STOP_ID),
             check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
-            transcript=wiring.transcript,
         )
 
     def open(self) -> Identity:
@@ -143,13 +141,7 @@ class ZaberAxis:
         """The status; refuses `purpose` while the axis moves."""
         status = self.status()
         if status.moving:
-            raise DeviceRefused(
-                self._name,
-                f"{purpose} is not possible while it moves",
-                reply=status.raw,
-                advice="Wait for the move to end, or stop it",
-                state=f"The move under way goes on; it is at {status.counts} counts",
-            )
+            raise while_it_moves(self._name, purpose, status.counts, status.raw)
         return status
 
     def move(self, target: int) -> None:

@@ -16,7 +16,7 @@ ADVICE = (
 
 
 class ZaberPulses:
-    """Sets up, takes away and counts pulse trains.
+    """Sets up and takes away pulse trains.
 
     Raises (in all methods):
         DeviceRefused, DeviceError, DeviceTimeout: as `ZaberAxis`.
@@ -61,12 +61,6 @@ class ZaberPulses:
                 self._axis.ask(command)
             self._train, self._touched = None, False
 
-    def remaining(self) -> int:
-        """Pulses still to come."""
-        if self._train is None:
-            return 0
-        return remaining(self.settings, self._train, self._shown())
-
     def before_move(self, counts: int, target: int) -> None:
         """Keep a train correct before a move from `counts` against it, because distance counts both ways.
 
@@ -75,7 +69,7 @@ class ZaberPulses:
         train = self._train
         if train is None or train.interval * (target - counts) >= 0 or not has_started(self.settings, self._shown()):
             return
-        if self.settings.triggers.chained and self.remaining() == train.n:
+        if self.settings.triggers.chained and remaining(self.settings, train, self._shown()) == train.n:
             self.arm(train, counts, _nowhere)
         else:
             self.disarm()

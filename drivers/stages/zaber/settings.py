@@ -17,13 +17,8 @@ SPEED_UNIT = 1.6384
 class ZaberSettings:
     """Zaber stage that talks ASCII, firmware 7.06 or later, with triggers on a digital output.
 
-    Attributes:
-        figures: counts_per_turn must be the device's own limit.cycle.dist.
-        wiring: pulse_width is whole milliseconds; None is 1 ms, or half an interval with `toggle`.
-        device, axis: address in the chain, axis of the device.
-        output: digital output of the pulses, from 1.
-        toggle: fires toggle the output (for firmware without `schedule`); intervals must then be even.
-        speed_unit: see `SPEED_UNIT` [memory: the vendor's long-standing convention].
+    counts_per_turn must be the device's own limit.cycle.dist. The pulse width is whole milliseconds; None is 1 ms, or
+    half an interval with `toggle`.
 
     Raises:
         ValueError: a speed or an acceleration below one native unit, an address that no device has, or pulses that no

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
-from drivers.base.protocols import StageLimits, StageStatus, TriggerTrain
-from drivers.stages.standing import longest_stop, until_standing
-from drivers.stages.stops import Stops
+from drivers.base.protocols import TriggerTrain
+from drivers.stages.shared import LineStage
+from drivers.stages.stops import Stops, until_standing
 from drivers.stages.travel import Travel
-from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
+from drivers.stages.zaber.axis import ZaberAxis
 from drivers.stages.zaber.packet import meaning_of
 from drivers.stages.zaber.pulses import ZaberOutput, ZaberPulses
 from drivers.stages.zaber.settings import ZaberSettings
@@ -25,20 +25,15 @@ STANDING_IN_PLACE = 10.0
 """s beyond twice the time of a short move after which it has failed."""
 
 
-class ZaberStage:
-    """Implements `drivers.base.protocols.RotationStage`. Closing it lets a move under way end by itself, disarms a
-    train, and restores speed, acceleration and checksums.
+class ZaberStage(LineStage):
+    """Closing it lets a move under way end by itself, disarms a train, and restores speed, acceleration and checksums.
 
-    `stop` returns when the stage stands, `abort` at once; a `wait` for a stopped move raises, whoever stopped it. A
-    move against a train under way ends the train: the controller counts distance both ways. If triggers are not
+    A move against a train under way ends the train: the controller counts distance both ways. If triggers are not
     `chained`, `arm` itself turns the stage to one step before the first pulse and waits. It then speeds up over the
     first pulses.
 
     Args:
         url: what pyserial opens; a controller's LAN port is "socket://host:55550".
-
-    Raises:
-        DeviceRefused: the settings do not fit the controller, or it is moving. DeviceError, DeviceTimeout: no contact.
     """
 
     Settings = ZaberSettings
@@ -67,27 +62,11 @@ class ZaberStage:
 
     @staticmethod
     def halt(url: str, settings: ZaberSettings, clock: Clock) -> None:
-        """See `drivers.stages.settings.StageDriver`."""
         with contextlib.closing(ZaberAxis(url, settings, clock, "stage")) as axis:
             axis.stop("stop")
 
-    @property
-    def limits(self) -> StageLimits:
-        return self._travel.limits
-
-    def to_counts(self, angle: float) -> int:
-        return self._travel.to_counts(angle)
-
-    def to_angle(self, counts: int) -> float:
-        return self._travel.to_angle(counts)
-
-    def position(self) -> float:
-        return self.to_angle(self._axis.status().counts)
-
-    def status(self) -> StageStatus:
-        status = self._axis.status()
-        fault = meaning_of(status.flags)
-        return StageStatus(status.counts, status.moving, status.referenced, "" if fault is None else fault.text)
+    def _counts(self) -> int:
+        return self._axis.status().counts
 
     def start_move(self, angle: float, speed: float) -> None:
         self._start_move(angle, speed, self._stops.count)
@@ -98,12 +77,7 @@ class ZaberStage:
         per_radian = self.limits.counts_per_turn / (2 * math.pi) * self._settings.speed_unit
         native = round(speed * per_radian) if 0 < speed < 2 * self.limits.max_speed else 0
         if not 1 <= native <= self._fastest:
-            raise DeviceRefused(
-                self.name,
-                f"a speed of {math.degrees(speed):g} deg/s is not possible",
-                expected=f"native 1 to {self._fastest}, at most {math.degrees(self.limits.max_speed):g} deg/s",
-                state="Nothing has moved",
-            )
+            raise self._travel.no_such_speed(speed, f"native 1 to {self._fastest}")
         with self._stops.none_while("the move", stops):
             status = self._axis.standing("a move")
             if not status.referenced:
@@ -135,7 +109,7 @@ class ZaberStage:
         return self._axis.status().moving
 
     def wait(self, timeout: float) -> float:
-        status = self._until_standing(timeout)
+        status = until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)
         aim = "its reference" if self._homing else "" if self._target is None else self._travel.degrees(self._target)
         if status.moving:
             raise self._travel.still_moving(timeout, status.counts, aim, self._axis.last_move, status.raw)
@@ -176,22 +150,6 @@ class ZaberStage:
         """Legal in every state. The output is put at rest."""
         self._pulses.disarm()
 
-    def remaining_pulses(self) -> int:
-        """By the fires that the controller's triggers still count."""
-        return self._pulses.remaining()
-
-    def stop(self) -> None:
-        self._stops.came(hard=False)
-        packet = self._send_stop(hard=False)
-        longest = longest_stop(self.limits)
-        status = self._until_standing(longest)
-        if status.moving:
-            raise self._travel.not_stopped(longest, status.counts, packet, status.raw)
-
-    def abort(self) -> None:
-        self._stops.came(hard=True)
-        self._send_stop(hard=True)
-
     def describe(self) -> dict[str, str | int | float]:
         pulses = self._pulses.settings
         return {
@@ -209,11 +167,6 @@ class ZaberStage:
         }
 
     def digital_output(self, number: int) -> ZaberOutput:
-        """Another output of the device, such as one that opens a shutter.
-
-        Raises:
-            DeviceRefused: this output gives the trigger pulses.
-        """
         if number == self._pulses.settings.output:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
         return ZaberOutput(self._axis, number, f"{self.name} output {number}")
@@ -227,7 +180,6 @@ class ZaberStage:
                 self._axis.close()
 
     def _send_stop(self, hard: bool) -> str:
-        """Send a stop; returns the command."""
         return self._axis.stop("estop" if hard else "stop")
 
     def _stand_at(self, counts: int, stops: int) -> None:
@@ -247,7 +199,3 @@ class ZaberStage:
                 state="Nothing has moved",
             )
         self._travel.refuse_narrower(*self._axis.travel(), advice="widen the controller's limits")
-
-    def _until_standing(self, timeout: float) -> ZaberAxisStatus:
-        """The status once the stage stands, or when the time is over."""
-        return until_standing(self._clock, self._axis.status, lambda status: status.moving, timeout)

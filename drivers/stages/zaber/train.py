@@ -19,15 +19,8 @@ SHORTEST = 1e-3
 
 @dataclass(frozen=True)
 class TriggerUse:
-    """Use of the device's triggers; the behaviour of its firmware is from memory.
-
-    Attributes:
-        measured: distance and position by the encoder, not as commanded [its unit from memory: microsteps, too].
-        chained: an action may enable another trigger [from memory].
-        fires_when_enabled: a distance trigger fires at the place of enabling, too, not only one distance further. From
-        memory it does not.
-        starter, repeater: numbers of the two triggers used.
-        shortest: least s between two fires at full speed.
+    """Use of the device's triggers. Defaults are its firmware's behaviour from memory; so is the encoder's unit,
+    microsteps.
 
     Raises:
         ValueError: triggers that cannot work together.

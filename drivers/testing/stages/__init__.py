@@ -8,15 +8,12 @@ import pytest
 
 from drivers.testing.stages.bench import Build, StageBench, StageKind
 from drivers.testing.stages.moves import Moves
-from drivers.testing.stages.pulses import Pulses
-from drivers.testing.stages.reference import ReferenceTests
-from drivers.testing.stages.stops import StopTests
 from drivers.testing.stages.trains import Trains
 
 __all__ = ["Build", "StageBench", "StageConformance", "StageKind"]
 
 
-class StageConformance(Moves, StopTests, Trains, Pulses, ReferenceTests):
+class StageConformance(Moves, Trains):
     """A subclass gives the fixtures `kind` and `build`; the stage of `build` stands at angle 0."""
 
     @pytest.fixture

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.base.clock import Clock
-from drivers.base.protocols import Motion, RotationStage, TriggerTrain
+from drivers.base.protocols import RotationStage, TriggerTrain
 
 SPEED = math.radians(10)
 LONG = 60.0
-FARTHEST = 1e9
-"""rad; no stage goes further."""
 
 
 class EmittedPulse(Protocol):
@@ -47,20 +45,16 @@ class StageKind:
         no_width: a width that it lacks, or that excludes other settings.
         inverts: its pulses may be active low.
         homes: it has a reference, within its limits.
-        stops_are_told: `status` tells that the last move was stopped.
         turning_back_ends: a train ends if the stage turns back inside it; otherwise its rest comes later.
         disarms_moving: a train can be ended while the stage moves.
-        relative_moves: number of moves in the long test; fewer if bytes cost time and the law is tested elsewhere.
     """
 
     width: float | None = 100e-6
     no_width: float = 0.0
     inverts: bool = False
     homes: bool = True
-    stops_are_told: bool = True
     turning_back_ends: bool = True
     disarms_moving: bool = True
-    relative_moves: int = 1000
 
 
 @dataclass
@@ -74,6 +68,10 @@ class StageBench:
     def pulses(self) -> list[EmittedPulse]:
         """Those that have been emitted by now."""
         return emitted(self.line, self.clock)
+
+    def pulse_counts(self) -> list[int]:
+        """Where they came, in counts."""
+        return [self.stage.to_counts(pulse.angle) for pulse in self.pulses()]
 
     def go(self, degrees: float) -> float:
         """Move and wait; returns its place in degrees."""
@@ -105,21 +103,3 @@ def emitted(line: Cable, clock: Clock) -> list[EmittedPulse]:
         found.append(pulse)
         after = pulse.time
     return found
-
-
-def start_move_by(stage: Motion, angle: float, speed: float) -> None:
-    """Begin a move by `angle` (rad, rounded once to whole counts) from the count where the stage stands, or is held by
-    its servo. Deviations of the servo do not add up.
-
-    n such moves make exactly n times these counts. If the angle is not a whole number of counts, its multiples differ
-    from this: for equally spaced views give `start_move` the multiples.
-
-    Raises:
-        DeviceRefused, DeviceError: as `start_move`.
-    """
-    if not abs(angle) < FARTHEST:
-        stage.start_move(angle, speed)  # refuses in the stage's own words
-        return
-    status = stage.status()
-    here = status.counts if status.held is None else status.held
-    stage.start_move(stage.to_angle(here + stage.to_counts(angle)), speed)

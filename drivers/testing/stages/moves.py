@@ -1,13 +1,14 @@
-"""Every stage: identity, position, absolute and relative moves, status, closing."""
+"""Every stage: identity, position, moves, stops, the search for the reference, closing."""
 
 from __future__ import annotations
 
 import math
+import threading
 
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind, start_move_by
+from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
 
 
 class Moves:
@@ -98,57 +99,119 @@ class Moves:
         assert bench.stage.moving()
         assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
 
-    @pytest.mark.slow
-    def test_a_thousand_relative_moves_of_a_third_of_a_degree_land_on_exact_counts(
-        self, kind: StageKind, bench: StageBench
-    ) -> None:
-        """A third of a degree is no whole count; no move may add another rounding, up, down, or at the turns."""
-        stage = bench.stage
-        third = math.radians(1 / 3)
-        counts = stage.to_counts(third)
-        assert third != stage.to_angle(counts)
-        speed = stage.limits.max_speed
-        expected = 0
-        for sign, share in ((1, 0.29), (-1, 0.3), (1, 0.295), (-1, 0.115)):
-            moves = round(share * kind.relative_moves)
-            for _ in range(moves):
-                start_move_by(stage, sign * third, speed)
-                stage.wait(LONG)
-            expected += sign * moves * counts
-            assert stage.status().counts == expected
-            assert stage.to_counts(stage.position()) == expected
-        assert bench.line.angle_at(bench.clock.now()) == pytest.approx(stage.to_angle(expected), rel=1e-9)
-
-    @pytest.mark.parametrize("degrees", [-5.5, 101.0, math.nan, math.inf])
-    def test_a_relative_move_beyond_the_limits_is_refused(self, bench: StageBench, degrees: float) -> None:
-        bench.go(1.0)
-        with pytest.raises(DeviceRefused, match="Nothing has moved"):
-            start_move_by(bench.stage, math.radians(degrees) - math.radians(1.0), SPEED)
-        assert math.degrees(bench.stage.position()) == pytest.approx(1.0, abs=bench.count)
-
-    def test_a_relative_move_is_refused_while_it_moves(self, bench: StageBench) -> None:
-        bench.stage.start_move(math.radians(20), SPEED)
-        bench.clock.sleep(0.5)
-        with pytest.raises(DeviceRefused, match="moves"):
-            start_move_by(bench.stage, 0.1, SPEED)
-        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
-
-    def test_its_status_is_where_it_is_and_what_it_does(self, bench: StageBench) -> None:
-        stage = bench.stage
-        status = stage.status()
-        assert (status.counts, status.moving, status.fault) == (0, False, "")
-        stage.start_move(math.radians(30), SPEED)
-        bench.clock.sleep(1.5)
-        status = stage.status()
-        assert status.moving
-        assert 0 < status.counts < bench.counts(30)
-        assert status.counts == pytest.approx(bench.counts(math.degrees(bench.line.angle_at(bench.clock.now()))), abs=2)
-        stage.wait(LONG)
-        status = stage.status()
-        assert (status.counts, status.moving, status.fault) == (bench.counts(30), False, "")
-
     def test_closing_twice_is_fine_and_a_closed_stage_says_so(self, bench: StageBench) -> None:
         bench.stage.close()
         bench.stage.close()
         with pytest.raises(DeviceError):
             bench.stage.position()
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_stop_on_the_way_stands_short_and_gives_no_more_pulses(self, bench: StageBench, hard: bool) -> None:
+        bench.stage.arm(bench.train(1.0, 1.0, 40))
+        bench.stage.start_move(math.radians(50), SPEED)
+        bench.clock.sleep(2.0)
+        asked_at = bench.clock.now()
+        (bench.stage.abort if hard else bench.stage.stop)()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(LONG)
+        assert not bench.stage.moving()
+        where = bench.stage.position()
+        braking = 0.0 if hard else SPEED / bench.stage.limits.acceleration
+        assert bench.clock.now() - asked_at == pytest.approx(braking, abs=0.3)
+        bench.clock.sleep(30.0)
+        assert bench.stage.position() == where
+        assert 5.0 < math.degrees(where) < 25.0
+        assert len(bench.pulses()) == math.floor(math.degrees(where) + 1e-9)
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_stop_is_legal_while_it_stands_and_it_moves_afterwards(self, bench: StageBench, hard: bool) -> None:
+        (bench.stage.abort if hard else bench.stage.stop)()
+        assert bench.stage.wait(1.0) == 0.0
+        assert bench.go(2.0) == pytest.approx(2.0, abs=bench.count)
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_after_a_stop_it_goes_on_elsewhere(self, bench: StageBench, hard: bool) -> None:
+        bench.stage.start_move(math.radians(50), SPEED)
+        bench.clock.sleep(1.0)
+        (bench.stage.abort if hard else bench.stage.stop)()
+        assert bench.go(-2.0) == pytest.approx(-2.0, abs=bench.count)
+
+    def test_a_stop_from_another_thread_ends_the_wait_with_an_error(self, bench: StageBench) -> None:
+        bench.stage.start_move(math.radians(90), math.radians(1))
+        bench.clock.sleep(5.0)
+        stopper = threading.Thread(target=bench.stage.stop)
+        stopper.start()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(1e4)
+        stopper.join()
+        assert not bench.stage.moving()
+
+    def test_a_search_ends_at_the_same_place_from_either_side(self, kind: StageKind, bench: StageBench) -> None:
+        if not kind.homes:
+            _refused(bench, 20.0)
+            return
+        places, counts = [], []
+        for degrees in (20.0, -4.0, 0.0):
+            bench.go(degrees)
+            before = bench.clock.now()
+            bench.stage.start_home()
+            assert bench.clock.now() - before < 0.5
+            where = bench.stage.wait(LONG)
+            assert bench.stage.position() == where
+            assert not bench.stage.moving()
+            places.append(bench.line.angle_at(bench.clock.now()))
+            counts.append(bench.stage.to_counts(where))
+        assert places == pytest.approx([places[0]] * 3, abs=math.radians(bench.count))
+        assert counts == [counts[0]] * 3
+        assert bench.go(5.0) == pytest.approx(5.0, abs=bench.count)
+        assert bench.pulses() == []
+
+    def test_a_search_may_need_more_than_one_wait(self, kind: StageKind, bench: StageBench) -> None:
+        if not kind.homes:
+            _refused(bench, 30.0)
+            return
+        bench.go(30.0)
+        bench.stage.start_home()
+        with pytest.raises(DeviceTimeout, match="left moving"):
+            bench.stage.wait(0.1)
+        bench.stage.wait(LONG)
+
+    @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
+    def test_a_search_that_is_stopped_is_not_taken_for_done(
+        self, kind: StageKind, bench: StageBench, hard: bool
+    ) -> None:
+        if not kind.homes:
+            _refused(bench, 90.0)
+            return
+        bench.go(90.0)
+        bench.stage.start_home()
+        bench.clock.sleep(0.3)
+        (bench.stage.abort if hard else bench.stage.stop)()
+        with pytest.raises(DeviceError, match="stopped short"):
+            bench.stage.wait(LONG)
+        where = bench.stage.position()
+        bench.clock.sleep(30.0)
+        assert bench.stage.position() == where
+        bench.stage.start_home()
+        bench.stage.wait(LONG)
+
+    def test_a_search_is_refused_while_it_moves_or_without_a_reference(
+        self, kind: StageKind, bench: StageBench
+    ) -> None:
+        if not kind.homes:
+            _refused(bench, 0.0)
+            return
+        bench.stage.start_move(math.radians(20), SPEED)
+        bench.clock.sleep(0.5)
+        with pytest.raises(DeviceRefused, match="moves"):
+            bench.stage.start_home()
+        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(20.0, abs=bench.count)
+
+
+def _refused(bench: StageBench, degrees: float) -> None:
+    """A stage without a reference refuses a search where it stands, and stays there."""
+    bench.go(degrees)
+    before = bench.stage.position()
+    with pytest.raises(DeviceRefused, match="Nothing has moved"):
+        bench.stage.start_home()
+    assert bench.stage.position() == before

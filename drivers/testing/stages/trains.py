@@ -10,7 +10,7 @@ import pytest
 
 from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.testing.stages.bench import LONG, SPEED, StageBench, StageKind
+from drivers.testing.stages.bench import LONG, SPEED, Build, StageBench, StageKind
 
 
 class Trains:
@@ -25,8 +25,7 @@ class Trains:
         bench.clock.sleep(1.0)
         assert bench.pulses() == []
         bench.go(first + n * step + math.copysign(1.0, step))
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [train.start + k * train.interval for k in range(n)]
+        assert bench.pulse_counts() == [train.start + k * train.interval for k in range(n)]
         for k, pulse in enumerate(bench.pulses()):
             asked = bench.stage.to_angle(train.start + k * train.interval)
             assert pulse.angle == pytest.approx(asked, abs=math.radians(bench.count))
@@ -36,7 +35,7 @@ class Trains:
     def test_a_single_pulse_may_have_any_interval(self, bench: StageBench, sign: int) -> None:
         bench.stage.arm(TriggerTrain(sign * 100, sign, 1))
         bench.go(sign * 3.0)
-        assert [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()] == [sign * 100]
+        assert bench.pulse_counts() == [sign * 100]
 
     def test_at_constant_speed_pulses_are_equally_spaced_in_time(self, bench: StageBench) -> None:
         bench.stage.arm(bench.train(5.0, 0.5, 21))
@@ -62,8 +61,7 @@ class Trains:
         bench.go(5.0)
         bench.stage.arm(bench.train(4.5, -1.0, 4))
         bench.go(0.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 4.5, 3.5, 2.5, 1.5)]
+        assert bench.pulse_counts() == [bench.counts(at) for at in (1.0, 2.0, 3.0, 4.5, 3.5, 2.5, 1.5)]
 
     def test_no_pulse_without_arming(self, bench: StageBench) -> None:
         bench.go(10.0)
@@ -85,8 +83,7 @@ class Trains:
         assert len(bench.pulses()) == 3
         bench.stage.arm(bench.train(21.0, 1.0, 4))
         bench.go(30.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 21.0, 22.0, 23.0, 24.0)]
+        assert bench.pulse_counts() == [bench.counts(at) for at in (1.0, 2.0, 3.0, 21.0, 22.0, 23.0, 24.0)]
 
     @pytest.mark.parametrize("sign", [1, -1])
     def test_a_train_that_is_stopped_in_the_middle_goes_on_with_the_next_move(
@@ -97,15 +94,13 @@ class Trains:
         bench.stage.arm(bench.train(first, sign * 0.5, 20))
         for degrees in (first + sign * 1.25, first + sign * 3.1, first + sign * 10.0):
             bench.go(degrees)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [bench.counts(first) + sign * k * bench.counts(0.5) for k in range(20)]
+        assert bench.pulse_counts() == [bench.counts(first) + sign * k * bench.counts(0.5) for k in range(20)]
 
     def test_arming_again_replaces_the_train(self, bench: StageBench) -> None:
         bench.stage.arm(bench.train(1.0, 1.0, 9))
         bench.stage.arm(bench.train(2.0, 3.0, 2))
         bench.go(20.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [bench.counts(2.0), bench.counts(5.0)]
+        assert bench.pulse_counts() == [bench.counts(2.0), bench.counts(5.0)]
 
     def test_arming_again_in_the_middle_of_a_train_replaces_it(self, bench: StageBench) -> None:
         bench.stage.arm(bench.train(1.0, 1.0, 9))
@@ -113,22 +108,11 @@ class Trains:
         bench.stage.arm(bench.train(2.0, -1.0, 2))
         bench.go(0.0)
         bench.go(20.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [bench.counts(at) for at in (1.0, 2.0, 3.0, 2.0, 1.0)]
+        assert bench.pulse_counts() == [bench.counts(at) for at in (1.0, 2.0, 3.0, 2.0, 1.0)]
 
     def test_disarming_what_is_not_armed_is_fine(self, bench: StageBench) -> None:
         bench.stage.disarm()
         bench.stage.disarm()
-
-    def test_pulses_still_to_come_are_counted_where_the_controller_tells(self, bench: StageBench) -> None:
-        told = [bench.stage.remaining_pulses()]
-        bench.stage.arm(bench.train(1.0, 1.0, 5))
-        told.append(bench.stage.remaining_pulses())
-        bench.go(2.5)
-        told.append(bench.stage.remaining_pulses())
-        bench.go(10.0)
-        told.append(bench.stage.remaining_pulses())
-        assert told in ([0, 5, 3, 0], [None] * 4)
 
     def test_a_train_under_which_the_stage_is_stopped_goes_on_with_the_next_move(self, bench: StageBench) -> None:
         train = bench.train(1.0, 1.0, 30)
@@ -138,10 +122,8 @@ class Trains:
         bench.stage.stop()
         before = len(bench.pulses())
         assert 10 < before < 20
-        assert bench.stage.remaining_pulses() in (30 - before, None)
         bench.go(40.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [train.start + train.interval * k for k in range(30)]
+        assert bench.pulse_counts() == [train.start + train.interval * k for k in range(30)]
 
     @pytest.mark.parametrize("stopped", [False, True], ids=["at the end of a move", "after a stop"])
     def test_turning_back_inside_a_train_gives_no_pulse_and_ends_it_where_it_cannot_go_on(
@@ -159,10 +141,10 @@ class Trains:
         assert before == 10 or (stopped and 5 < before < 15)
         bench.go(2.0)
         assert len(bench.pulses()) == before
-        assert bench.stage.remaining_pulses() in (0 if kind.turning_back_ends else 30 - before, None)
         bench.go(40.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [train.start + train.interval * k for k in range(before if kind.turning_back_ends else 30)]
+        assert bench.pulse_counts() == [
+            train.start + train.interval * k for k in range(before if kind.turning_back_ends else 30)
+        ]
 
     @pytest.mark.parametrize("stop", [-2.0, 0.5, 1.5, 1.9])
     def test_turning_back_before_the_first_pulse_keeps_the_train(self, bench: StageBench, stop: float) -> None:
@@ -170,10 +152,8 @@ class Trains:
         bench.stage.arm(train)
         bench.go(stop)
         bench.go(-4.0)
-        assert bench.stage.remaining_pulses() in (5, None)
         bench.go(20.0)
-        counts = [bench.stage.to_counts(pulse.angle) for pulse in bench.pulses()]
-        assert counts == [train.start + train.interval * k for k in range(5)]
+        assert bench.pulse_counts() == [train.start + train.interval * k for k in range(5)]
 
     def test_disarming_on_the_way_ends_the_pulses_or_is_refused_and_lets_it_move(
         self, kind: StageKind, bench: StageBench
@@ -191,3 +171,79 @@ class Trains:
         assert 10 < before < 20
         assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(40.0, abs=bench.count)
         assert len(bench.pulses()) == (before if kind.disarms_moving else 30)
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_at_a_speed_that_is_low_enough_pulses_come_at_each_of_the_smallest_intervals(
+        self, build: Build, sign: int
+    ) -> None:
+        """A count where pulses have a width, two where fires toggle the output."""
+        bench = build(max_speed=math.radians(0.2))
+        interval = 1
+        try:
+            bench.stage.arm(TriggerTrain(sign * 20, sign, 50))
+        except DeviceRefused as refusal:
+            assert "even number" in str(refusal)
+            interval = 2
+            bench.stage.arm(TriggerTrain(sign * 20, sign * 2, 50))
+        bench.stage.start_move(bench.stage.to_angle(sign * 200), math.radians(0.2))
+        bench.stage.wait(LONG)
+        assert bench.pulse_counts() == [sign * (20 + interval * k) for k in range(50)]
+        bench.stage.close()
+
+    @pytest.mark.parametrize(("first", "step"), [(2.0, 0.5), (3.0, 0.5), (3.0, -0.5), (4.0, -0.5)])
+    def test_arming_at_or_past_the_first_pulse_is_refused(self, bench: StageBench, first: float, step: float) -> None:
+        bench.go(3.0)
+        with pytest.raises(DeviceRefused, match="at or past the first pulse"):
+            bench.stage.arm(bench.train(first, step, 3))
+        bench.go(0.0)
+        bench.go(10.0)
+        assert bench.pulses() == []
+
+    @pytest.mark.parametrize(
+        ("first", "step", "n"), [(99.0, 1.0, 3), (-6.0, 1.0, 3), (1.0, 1.0, 0), (1.0, 0.0, 5), (-1.0, -1.0, 6)]
+    )
+    def test_a_train_that_cannot_be_emitted_is_refused(
+        self, bench: StageBench, first: float, step: float, n: int
+    ) -> None:
+        with pytest.raises(DeviceRefused, match="cannot be emitted"):
+            bench.stage.arm(bench.train(first, step, n))
+        bench.go(5.0)
+        assert bench.pulses() == []
+
+    def test_arming_while_it_moves_is_refused_and_the_move_goes_on(self, bench: StageBench) -> None:
+        bench.stage.start_move(math.radians(5), SPEED)
+        with pytest.raises(DeviceRefused, match="moves"):
+            bench.stage.arm(bench.train(8.0, 1.0, 3))
+        assert math.degrees(bench.stage.wait(LONG)) == pytest.approx(5.0, abs=bench.count)
+
+    def test_a_pulse_width_is_kept_or_refused_and_trains_that_would_run_together_are_refused(
+        self, kind: StageKind, build: Build
+    ) -> None:
+        with pytest.raises((DeviceRefused, ValueError)):
+            build(pulse_width=kind.no_width)
+        if kind.width is None:  # it has no choice, as the refusal shows
+            return
+        bench = build(pulse_width=kind.width)
+        described = bench.stage.describe()["pulse_width_s"]
+        assert described == pytest.approx(kind.width)
+        per_count = 2 * math.pi / bench.stage.limits.counts_per_turn / bench.stage.limits.max_speed
+        touching, apart = math.floor(kind.width / per_count), math.ceil(2.5 * kind.width / per_count)
+        if touching > 0:
+            with pytest.raises(DeviceRefused, match="cannot be emitted"):
+                bench.stage.arm(TriggerTrain(bench.counts(2.0), touching, 5))
+        bench.stage.arm(TriggerTrain(bench.counts(2.0), apart, 50))
+        bench.stage.start_move(math.radians(90), bench.stage.limits.max_speed)
+        bench.stage.wait(LONG)
+        assert bench.pulse_counts() == [bench.counts(2.0) + k * apart for k in range(50)]
+        bench.stage.close()
+
+    def test_inverted_pulses_are_as_many_and_at_the_same_angles_or_refused(self, kind: StageKind, build: Build) -> None:
+        if not kind.inverts:
+            with pytest.raises((DeviceRefused, ValueError)):
+                build(active_high=False)
+            return
+        bench = build(active_high=False)
+        bench.stage.arm(bench.train(1.0, 0.5, 10))
+        bench.go(10.0)
+        assert bench.pulse_counts() == [bench.counts(1.0) + k * bench.counts(0.5) for k in range(10)]
+        bench.stage.close()

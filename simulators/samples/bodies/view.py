@@ -56,7 +56,12 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
     rows = detector.shape[0]
     if pose.angle.shape != (rows,):
         raise ValueError(f"the pose has {pose.angle.size} angles and the detector {rows} rows; give one a row")
-    axes, origin = (pose if not _one_pose(pose) else _of_row(pose, 0)).frames()
+    shift, tilt = pose.shift, pose.tilt
+    if all(a is None or bool((a == a[:1]).all()) for a in (pose.angle, shift, tilt)):  # one pose for all rows
+        shift, tilt = None if shift is None else shift[:1], None if tilt is None else tilt[:1]
+        axes, origin = Pose(pose.angle[:1], shift, tilt).frames()
+    else:
+        axes, origin = pose.frames()
     upright = math.isinf(detector.sod) and (pose.tilt is None or not pose.tilt.any())
     low, high = _reach(p, axes, origin, 2)
     ahead = np.ones(p.kind.size, dtype=np.bool_)
@@ -72,20 +77,6 @@ def view_of(p: Packed, names: Sequence[str], pose: Pose, detector: Detector) -> 
     first, bodies = _by_row(above, below, rows)
     pitch, sod = float(detector.pitch), float(detector.sod)
     return View(detector.u(), detector.v(), pitch, sod, axes, origin, bool(upright), first, bodies)
-
-
-def _one_pose(pose: Pose) -> bool:
-    """Whether all rows have the same pose."""
-    return all(a is None or bool((a == a[:1]).all()) for a in (pose.angle, pose.shift, pose.tilt))
-
-
-def _of_row(pose: Pose, j: int) -> Pose:
-    part = slice(j, j + 1)
-    return Pose(
-        pose.angle[part],
-        None if pose.shift is None else pose.shift[part],
-        None if pose.tilt is None else pose.tilt[part],
-    )
 
 
 def _reach(p: Packed, axes: Reals, origin: Reals, k: int) -> tuple[Reals, Reals]:

@@ -4,29 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid, kind_of
 from simulators.samples.builders.grains import octahedron
+from simulators.samples.builders.piece import Millimetres
 
 # Attenuation times the can's radius: for any size of the can the largest line integral is between 1.5 and 3. At least
 # 5 % of the beam is then transmitted.
 WALL, ELECTROLYTE, PARTICLE = 0.9, 0.15, 1.9
 
 CANDIDATES, ROUNDS = 256, 40
-MOST_PARTICLES = 5000
-"""Largest number of particles: this many take a minute, and the work grows as their square."""
 
 
 @dataclass(frozen=True)
 class Battery:
-    """Arguments of `battery` and the seed of its generator, as keys of a scene."""
+    """Arguments of `battery` and the seed of its generator, as keys of a scene.
 
-    field_of_view: tuple[float, float]
-    n_particles: int = 150
-    fill: float = 0.12
+    5000 particles take a minute, and the work grows as their square.
+    """
+
+    field_of_view: tuple[Millimetres, Millimetres]
+    n_particles: Annotated[int, Field(ge=0, le=5000)] = 150
+    fill: Annotated[float, Field(gt=0, le=1)] = 0.12
     seed: int = 0
 
     def solids(self) -> tuple[Solid, ...]:
@@ -57,18 +61,9 @@ def battery(
         fill: share of the electrolyte's volume that spheres of the particles' median radius would take.
 
     Raises:
-        ValueError: a field of view that is not positive or out of range, too many particles, or too little room for
-        them.
+        ValueError: too little room for the particles.
     """
     width, height = field_of_view
-    if not (width > 0 and height > 0):
-        raise ValueError(f"field_of_view must be (width, height) > 0 in mm, got {field_of_view}")
-    if not (LEAST <= width <= MOST and LEAST <= height <= MOST):
-        raise ValueError(f"field_of_view must lie in {LEAST:g} ... {MOST:g} mm, got {field_of_view}")
-    if not (0 <= n_particles <= MOST_PARTICLES and 0 < fill <= 1):
-        raise ValueError(
-            f"n_particles must be 0 ... {MOST_PARTICLES}, fill above 0 and 1 at most, got {n_particles} and {fill}"
-        )
     radius, inside, tall = 0.44 * width, 0.95 * 0.44 * width, 0.9 * height
     wall = WALL / radius
     can = (Cylinder(radius, tall, wall), Cylinder(inside, tall, -wall), Cylinder(inside, tall, ELECTROLYTE / radius))

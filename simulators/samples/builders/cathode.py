@@ -6,17 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from pydantic import Field
 
-from simulators.samples.bodies.solids import LEAST, MOST, Cylinder
+from simulators.frame.mapping import BelowOne, NotNegative, Positive, Share
+from simulators.samples.bodies.solids import Cylinder
 from simulators.samples.builders.arrangement import arrange, bodies_of
-from simulators.samples.builders.grains import HABITS, Sizes, core, crack, grains
-from simulators.samples.builders.piece import Piece, check_roles
-
-WIDEST = 2.0
-"""Largest spread of the logarithm of the grains' diameters: the largest are then 20 000 times the smallest."""
+from simulators.samples.builders.grains import Habit, Sizes, core, crack, grains
+from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
 
 MADE_OF: Mapping[str, str] = MappingProxyType(
     {
@@ -39,7 +38,7 @@ transmits about 5 % at its thickest part."""
 
 
 @dataclass(frozen=True)
-class Cathode:
+class Cathode(PieceBuilder):
     """A cell around the rotation axis.
 
     The largest fill depends on the grains: 0.55 for spheres, 0.45 for the default habits, 0.35 for octahedra or plates
@@ -49,70 +48,46 @@ class Cathode:
         diameter, height: mm, of the can outside; it has neither lid nor bottom.
         wall_um: thickness of the can's wall.
         size_um: median diameter of spheres of the grains' volumes.
-        spread: standard deviation of the logarithm of the diameter, 2 at most; it is cut off at 2.5 of them.
-        fill: share of the volume between collector and separator that grains take, pores and cracks included.
+        spread: standard deviation of the logarithm of the diameter; it is cut off at 2.5 of them. With 2 the largest
+            are 20 000 times the smallest.
+        fill: share of the volume between collector and separator that grains take, pores and cracks included. Balls
+            jam at 0.64.
         habits: shares of the number of sphere, ellipsoid, octahedron, truncated_octahedron and plate.
         irregularity: largest relative change of a grain's axes.
         aspect: width over thickness of plates.
         hollow, cracked: shares of the grains that have a hole, of half their size, or a crack.
         gap_um: between two grains, at least.
         collector_um, separator_um: thickness of the foil below and of the film above; 0: none.
-        made_of: other materials for parts: {particle: NMC622, wall: steel}; for a beam with energies.
-        attenuation: 1/mm of parts, for a beam without energies, or in place of all materials.
         seed: of all random numbers.
     """
 
-    diameter: float = 0.6
-    height: float = 0.5
-    wall_um: float = 20.0
-    size_um: float = 25.0
-    spread: float = 0.25
-    fill: float = 0.4
-    habits: Mapping[str, float] = field(
+    diameter: Positive = 0.6
+    height: Positive = 0.5
+    wall_um: Positive = 20.0
+    size_um: Micrometres = 25.0
+    spread: Annotated[float, Field(ge=0, le=2)] = 0.25
+    fill: Annotated[float, Field(ge=0, lt=0.64)] = 0.4
+    habits: Mapping[Habit, Annotated[float, Field(ge=0, le=1e9)]] = field(
         default_factory=lambda: MappingProxyType(
             {"octahedron": 0.4, "truncated_octahedron": 0.25, "ellipsoid": 0.2, "plate": 0.15}
         )
     )
-    irregularity: float = 0.1
-    aspect: float = 3.0
-    hollow: float = 0.0
-    cracked: float = 0.0
-    gap_um: float = 0.0
-    collector_um: float = 0.0
-    separator_um: float = 0.0
-    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    irregularity: BelowOne = 0.1
+    aspect: Positive = 3.0
+    hollow: Share = 0.0
+    cracked: Share = 0.0
+    gap_um: Gap = 0.0
+    collector_um: NotNegative = 0.0
+    separator_um: NotNegative = 0.0
     seed: int = 0
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF
 
     def __post_init__(self) -> None:
-        for name in ("diameter", "height", "wall_um", "size_um"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("spread", "gap_um", "collector_um", "separator_um"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}")
-        if not LEAST <= self.size_um * 1e-3 <= MOST:
-            raise ValueError(f"size_um must lie in {LEAST * 1e3:g} ... {MOST * 1e3:g}, got {self.size_um}")
-        if self.gap_um * 1e-3 > MOST:
-            raise ValueError(f"gap_um must be {MOST * 1e3:g} at most, got {self.gap_um}")
-        if self.spread > WIDEST:
-            raise ValueError(f"spread must be {WIDEST:g} at most, got {self.spread}")
-        if not 0 <= self.fill < 0.64:
-            raise ValueError(f"fill must be >= 0 and below 0.64, where balls jam, got {self.fill}")
-        if not 0 <= self.irregularity < 1 or not self.aspect > 0:
-            raise ValueError(
-                f"irregularity must be in 0 ... 1, aspect positive, got {self.irregularity}, {self.aspect}"
-            )
-        if not (min(self.hollow, self.cracked) >= 0 and self.hollow + self.cracked <= 1):
+        if self.hollow + self.cracked > 1:
             raise ValueError(f"hollow and cracked are shares, 1 at most in sum, got {self.hollow} and {self.cracked}")
-        if unknown := [habit for habit in self.habits if habit not in HABITS]:
-            raise ValueError(f"habits: {unknown[0]!r} is unknown; known: {', '.join(HABITS)}")
-        if not (sum(self.habits.values()) > 0 and min(self.habits.values()) >= 0):
-            raise ValueError(f"habits are shares >= 0, not all 0, got {dict(self.habits)}")
-        if sum(self.habits.values()) > MOST:
-            raise ValueError(f"habits are shares, {MOST:g} at most in sum, got {dict(self.habits)}")
+        if not sum(self.habits.values()) > 0:
+            raise ValueError(f"habits are shares, not all 0, got {dict(self.habits)}")
         if not (self.inner_radius > 0 and self.bed_height > 0):
             raise ValueError(f"there is no room for the cathode inside {self.diameter} x {self.height} mm")
         check_roles(self)
@@ -129,7 +104,6 @@ class Cathode:
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
         return {role: value * 2 / self.diameter for role, value in GREY.items()}
 
     def pieces(self) -> tuple[Piece, ...]:

@@ -9,29 +9,28 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from pydantic import Field
 
-from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid
-from simulators.samples.builders.piece import Piece, check_roles
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid
+from simulators.samples.builders.piece import Gap, Micrometres, Millimetres, Piece, PieceBuilder, check_roles
 
 Reals = NDArray[np.float64]
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"matter": "polypropylene", "hole": "air"})
-MOST_HOLES, MOST_CANDIDATES = 200_000, 10_000_000
-"""Largest numbers: these take minutes, and 2 GB of memory."""
 POINTS_A_CELL = 8
 GREY = 2.0
 """Attenuation of the matter times half its width, in a beam without energies."""
 
 
 @dataclass(frozen=True)
-class Foam:
+class Foam(PieceBuilder):
     """A foam around the rotation axis.
 
     Attributes:
@@ -40,56 +39,29 @@ class Foam:
         n_holes: largest number; fewer if no further hole of `smallest_um` fits.
         largest_um, smallest_um: diameters of holes.
         gap_um: least thickness of matter between holes and to the outside.
-        candidates: number of random points; more of them make a denser foam.
-        made_of: other materials for matter and hole, for a beam with energies.
-        attenuation: 1/mm of them, for a beam without energies, or in place of materials.
+        candidates: number of random points; more of them make a denser foam. The largest number takes minutes and 2 GB.
         seed: of all random numbers.
     """
 
-    diameter: float = 0.6
-    height: float = 0.5
-    edges: tuple[float, float, float] | None = None
-    n_holes: int = 1000
-    largest_um: float = 60.0
-    smallest_um: float = 5.0
-    gap_um: float = 1.0
-    candidates: int = 200_000
-    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    diameter: Millimetres = 0.6
+    height: Millimetres = 0.5
+    edges: tuple[Millimetres, Millimetres, Millimetres] | None = None
+    n_holes: Annotated[int, Field(ge=0, le=200_000)] = 1000
+    largest_um: Micrometres = 60.0
+    smallest_um: Micrometres = 5.0
+    gap_um: Gap = 1.0
+    candidates: Annotated[int, Field(ge=1, le=10_000_000)] = 200_000
     seed: int = 0
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF
 
     def __post_init__(self) -> None:
-        if not min(self.diameter, self.height, *(self.edges or ())) > 0:
-            raise ValueError(
-                f"diameter, height and edges must be positive, got {self.diameter}, {self.height}, {self.edges}"
-            )
-        if not (self.largest_um >= self.smallest_um > 0 and self.gap_um >= 0):
-            raise ValueError(
-                f"holes go from largest_um down to smallest_um > 0 with gap_um >= 0 between them, got "
-                f"{self.largest_um}, {self.smallest_um} and {self.gap_um}"
-            )
-        lengths = (self.diameter, self.height, *(self.edges or ()))
-        if not LEAST <= min(lengths) <= max(lengths) <= MOST:
-            raise ValueError(f"diameter, height and edges must lie in {LEAST:g} ... {MOST:g} mm, got {lengths}")
-        if not (self.smallest_um * 0.5e-3 >= LEAST and self.gap_um * 1e-3 <= MOST):
-            raise ValueError(
-                f"smallest_um must be {2e3 * LEAST:g} at least and gap_um {1e3 * MOST:g} at most, got "
-                f"{self.smallest_um} and {self.gap_um}"
-            )
-        if not (self.n_holes >= 0 and self.candidates >= 1):
-            raise ValueError(f"n_holes must be >= 0, candidates positive, got {self.n_holes} and {self.candidates}")
-        if self.n_holes > MOST_HOLES or self.candidates > MOST_CANDIDATES:
-            raise ValueError(
-                f"n_holes must be {MOST_HOLES} and candidates {MOST_CANDIDATES} at most, got {self.n_holes} and "
-                f"{self.candidates}"
-            )
+        if not self.largest_um >= self.smallest_um:
+            raise ValueError(f"holes go from largest_um down to smallest_um, got {self.largest_um}, {self.smallest_um}")
         check_roles(self)
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
         width = self.diameter if self.edges is None else max(self.edges[:2])
         return {"matter": GREY * 2 / width, "hole": 0.0}
 

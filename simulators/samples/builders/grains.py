@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from simulators.samples.bodies.solids import Ellipsoid, Polyhedron, Quaternion, 
 
 Grain = Ellipsoid | Polyhedron
 
-HABITS = ("sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate")
+Habit = Literal["sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate"]
 TAIL = 2.5
 """Standard deviations beyond which no size is drawn."""
 HOLLOW, CRACK = 0.5, (0.95, 0.06)
@@ -46,7 +47,7 @@ class Sizes:
         return self.median * math.exp(self.spread * deviation)
 
 
-def grain(rng: np.random.Generator, habit: str, diameter: float, irregularity: float, aspect: float) -> Grain:
+def grain(rng: np.random.Generator, habit: Habit, diameter: float, irregularity: float, aspect: float) -> Grain:
     """A grain at the origin, of the volume of a sphere of `diameter` (mm), in any orientation.
 
     Args:
@@ -105,7 +106,7 @@ def grains(
     rng: np.random.Generator,
     volume: float,
     sizes: Sizes,
-    habits: Mapping[str, float],
+    habits: Mapping[Habit, float],
     irregularity: float,
     aspect: float,
 ) -> list[Grain]:
@@ -132,7 +133,8 @@ def grains(
                 f"{volume:.3g} mm3 of grains of {1e3 * sizes.median:g} um are more than {MOST} grains; make the cell "
                 "smaller, the grains larger or the fill lower"
             )
-        drawn.append(grain(rng, str(rng.choice(names, p=shares / shares.sum())), diameter, irregularity, aspect))
+        habit: Habit = str(rng.choice(names, p=shares / shares.sum()))  # type: ignore[assignment]
+        drawn.append(grain(rng, habit, diameter, irregularity, aspect))
         taken += own
 
 

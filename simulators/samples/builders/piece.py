@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Annotated, ClassVar, Protocol
 
-from simulators.samples.bodies.solids import Solid
+from pydantic import Field
+
+from simulators.samples.bodies.solids import LEAST, MOST, Solid
+
+Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
+Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]
+Gap = Annotated[float, Field(ge=0, le=1e3 * MOST)]
+"""um."""
 
 
 @dataclass(frozen=True)
@@ -22,21 +30,21 @@ class Piece:
     instead_of: str | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
 class PieceBuilder(Protocol):
-    """Settings of a phantom made of pieces, as a frozen dataclass."""
+    """Settings of a phantom made of pieces.
+
+    Attributes:
+        made_of: other materials for parts: {particle: NMC622, wall: steel}; for a beam with energies.
+        attenuation: 1/mm of parts, for a beam without energies, or in place of all materials. If the scene gives any,
+            no part has a material.
+        default_materials: of each role, in a beam with energies.
+    """
+
+    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     default_materials: ClassVar[Mapping[str, str]]
-    """Material of each role, in a beam with energies."""
-
-    @property
-    def made_of(self) -> Mapping[str, str]:
-        """Materials of the scene, in place of defaults."""
-        ...
-
-    @property
-    def attenuation(self) -> Mapping[str, float]:
-        """1/mm by role, in place of defaults. If the scene gives any, no role has a material."""
-        ...
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:

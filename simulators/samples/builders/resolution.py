@@ -9,23 +9,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from simulators.samples.bodies.solids import LEAST, MOST, Box, Cylinder, Ellipsoid, Polyhedron, Vector
-from simulators.samples.builders.piece import Piece, check_roles
+from pydantic import Field
+
+from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Vector
+from simulators.samples.builders.piece import Gap, Micrometres, Piece, PieceBuilder, check_roles
 
 MADE_OF: Mapping[str, str] = MappingProxyType({"carrier": "polypropylene", "bar": "Al", "star": "Al", "ball": "Al"})
 GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star": 2.0, "ball": 2.0})
 """Attenuation times the carrier's radius, in a beam without energies."""
-MOST_BARS, MOST_SPOKES = 100, 1000
+MOST_LISTED = 100
 MARGIN = 1.1
 """The carrier's size over that of its contents."""
 
 
 @dataclass(frozen=True)
-class Resolution:
+class Resolution(PieceBuilder):
     """A pattern around the rotation axis.
 
     Attributes:
@@ -35,43 +37,29 @@ class Resolution:
         spokes: of the star.
         star_height_um: its thickness.
         balls_um: diameters; empty: no balls.
-        made_of: other materials for carrier, bar, star and ball, for a beam with energies.
-        attenuation: 1/mm of them, for a beam without energies, or in place of materials.
     """
 
-    widths_um: tuple[float, ...] = (30.0, 20.0, 14.0, 10.0, 7.0, 5.0)
-    bars: int = 4
-    star_um: float = 500.0
-    spokes: int = 36
-    star_height_um: float = 60.0
-    balls_um: tuple[float, ...] = (60.0, 40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
-    made_of: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    attenuation: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    widths_um: tuple[Micrometres, ...] = (30.0, 20.0, 14.0, 10.0, 7.0, 5.0)
+    bars: Annotated[int, Field(ge=2, le=100)] = 4
+    star_um: Gap = 500.0
+    spokes: Annotated[int, Field(ge=3, le=1000)] = 36
+    star_height_um: Micrometres = 60.0
+    balls_um: tuple[Micrometres, ...] = (60.0, 40.0, 28.0, 20.0, 14.0, 10.0, 7.0, 5.0)
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF
 
     def __post_init__(self) -> None:
-        if not min(*self.widths_um, *self.balls_um, self.star_height_um, 1.0) > 0:
-            raise ValueError(f"widths, diameters and heights must be positive in um, got {self}")
-        lengths = [um * 1e-3 for um in (*self.widths_um, *self.balls_um, self.star_height_um, self.star_um or 1.0)]
-        if not LEAST <= min(map(abs, lengths)) <= max(lengths) <= MOST:
+        if max(len(self.widths_um), len(self.balls_um)) > MOST_LISTED:
             raise ValueError(
-                f"widths, diameters and heights must lie in {1e3 * LEAST:g} ... {1e3 * MOST:g} um, got {self}"
+                f"a pattern has {MOST_LISTED} widths and balls at most, got {len(self.widths_um)} and "
+                f"{len(self.balls_um)}"
             )
-        if max(len(self.widths_um), len(self.balls_um), self.bars) > MOST_BARS or self.spokes > MOST_SPOKES:
-            raise ValueError(
-                f"a pattern has {MOST_BARS} widths, bars of each and balls at most, and {MOST_SPOKES} spokes, got "
-                f"{len(self.widths_um)}, {self.bars}, {len(self.balls_um)} and {self.spokes}"
-            )
-        if self.bars < 2 or self.spokes < 3 or self.star_um < 0:
-            raise ValueError(f"a group needs 2 bars and a star 3 spokes, got {self.bars} and {self.spokes}")
         if not (self.widths_um or self.balls_um or self.star_um):
             raise ValueError("a pattern needs widths_um, a star_um or balls_um")
         check_roles(self)
 
     @property
     def default_attenuation(self) -> Mapping[str, float]:
-        """1/mm of each role, in a beam without energies."""
         radius = self._size()[0]
         return {role: value / radius for role, value in GREY.items()}
 
@@ -81,7 +69,9 @@ class Resolution:
         z = -height / MARGIN / 2
         pieces = [Piece(Cylinder(radius, height, 1.0), "carrier")]
         for solids, role, tall in self._layers():
-            pieces += [Piece(_raised(solid, z + tall / 2), role, "carrier") for solid in solids]
+            for solid in solids:
+                x, y, own = solid.centre
+                pieces.append(Piece(replace(solid, centre=(x, y, own + (z + tall / 2))), role, "carrier"))
             z += tall
         return tuple(pieces)
 
@@ -143,8 +133,3 @@ def _reach(solid: Box | Ellipsoid | Polyhedron) -> float:
         case Ellipsoid():
             return math.hypot(x, y) + max(solid.semi_axes)
     return max(math.hypot(px, py) for px, py, _ in solid.vertices)
-
-
-def _raised(solid: Box | Ellipsoid | Polyhedron, z: float) -> Box | Ellipsoid | Polyhedron:
-    x, y, own = solid.centre
-    return replace(solid, centre=(x, y, own + z))

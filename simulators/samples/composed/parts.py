@@ -6,6 +6,7 @@ parts have the same attenuation at every energy.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -17,8 +18,8 @@ from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.frame.pose import Pose
 from simulators.light.beam import Beam
-from simulators.light.effective_depth import effective_depth
 from simulators.light.spectrum import Attenuation, Spectrum, light
+from simulators.pixels.bands import share_rows
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Solid, kind_of
 from simulators.samples.sample import Sample
@@ -107,7 +108,7 @@ class Mixture:
         return np.stack([c.chords.line_integrals(angle, detector) for c in self.constituents])
 
     def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> Reals:
-        """The effective depth; see simulators.light.effective_depth and Sample.line_integrals."""
+        """The effective depth; see simulators.samples.composed.parts and Sample.line_integrals."""
         attenuation = np.stack([c.attenuation(self.spectrum.energies) for c in self.constituents], axis=1)
         return effective_depth(self.thickness(angle, detector), attenuation, self.spectrum.weights)
 
@@ -150,3 +151,39 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
     ]
     whole = Phantom.of(solids, names)
     return whole if spectrum.energies.size == 1 else Mixture(groups, spectrum, whole)
+
+
+ROUNDING = 1e-14
+"""A smaller depth counts as no matter."""
+
+
+def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Reals:
+    """The optical depth that a detector measures which integrates over all energies, float64 [row, col].
+
+    It is -log(sum_e w_e exp(-sum_m attenuation[e, m] thickness[m])).
+
+    Args:
+        thickness: mm, float64 [constituent, row, col].
+        attenuation: 1/mm, float64 [energy, constituent].
+        weights: float64 [energy], of sum 1.
+    """
+    out = np.zeros(thickness.shape[1:])
+
+    def work(first: int, end: int) -> None:
+        chords = thickness[:, first:end]
+        hit = (chords != 0.0).any(axis=0)  # air is exactly 0
+        matter = chords[:, hit]
+        least = functools.reduce(np.minimum, (_through(matter, mu) for mu in attenuation))
+        light = np.zeros_like(least)  # with the hardest energy factored out, against underflow
+        for weight, mu in zip(weights, attenuation, strict=True):
+            light += weight * np.exp(least - _through(matter, mu))
+        depth = least - np.log(light)
+        out[first:end][hit] = np.where(np.abs(depth) < ROUNDING, 0.0, depth)
+
+    share_rows(work, (thickness.shape[1], thickness.shape[2]))
+    return out
+
+
+def _through(matter: Reals, attenuation: Reals) -> Reals:
+    """Optical depth at one energy; not by BLAS, whose sums depend on where a ray lies in the array."""
+    return functools.reduce(np.add, (mu * thickness for mu, thickness in zip(attenuation, matter, strict=True)))

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from simulators.frame.mapping import SceneError, build, located, named
+from simulators.frame.mapping import SceneError, build, choose, located, named
 from simulators.light.beam import Beam
 from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import SOLIDS
 from simulators.samples.builders.piece import Piece, PieceBuilder
+from simulators.samples.composed.parts import Part, sample_of
 from simulators.samples.sample import Sample
 
 if TYPE_CHECKING:
+    from simulators.light.palette import Palette
     from simulators.samples.voxels.volume import ReadVolume
 
     _Builder = Callable[[str, Mapping[str, Any], Beam, ReadVolume | None], Sample]
+
+
+_OWN_KEYS = ("material", "instead_of", "name")
 
 
 def build_sample(where: str, entry: Any, beam: Beam, read: ReadVolume | None = None) -> Sample:
@@ -43,10 +49,42 @@ def _battery(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolum
     return Phantom.of(solids, labels_of(solids))
 
 
-def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
-    from simulators.samples.composed.solids import sample_of_solids
+@dataclass(frozen=True)
+class _Keys:
+    """The keys of a phantom of solids. A solid's keys depend on its kind."""
 
-    return sample_of_solids(where, mapping, beam)
+    solids: tuple[Any, ...] | None
+    materials: Any = None
+
+
+def _solids(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
+    """The sample of a phantom's `solids` and `materials`; see simulators.light.palette for the latter."""
+    keys = build(_Keys, where, mapping)
+    entries = [(f"{where}.solids[{i}]", entry) for i, entry in enumerate(keys.solids or ())]
+    used = {key for _, entry in entries if isinstance(entry, Mapping) for key in entry}
+    palette = None
+    if "materials" in mapping or used & {"material", "instead_of"}:
+        from simulators.light.palette import palette_of
+
+        palette = palette_of(f"{where}.materials", keys.materials)
+    parts = [_part(at, entry, palette) for at, entry in entries]
+    return sample_of(parts, beam, None if palette is None else palette.filters)
+
+
+def _part(where: str, entry: Any, palette: Palette | None) -> Part:
+    """`palette`: None where the scene names no material."""
+    if not isinstance(entry, Mapping):
+        return Part(choose(where, SOLIDS, entry))
+    own = {key: entry[key] for key in _OWN_KEYS if key in entry}
+    rest = {key: value for key, value in entry.items() if key not in _OWN_KEYS}
+    if wrong := {key: value for key, value in own.items() if not isinstance(value, str)}:
+        raise SceneError(f"{where}: {', '.join(wrong)} must be text, got {wrong}")
+    if "material" in own and "attenuation" in rest:
+        raise SceneError(f"{where}: attenuation and material exclude each other; give one of them")
+    with located(where):
+        materials = {key: palette(own[key]) for key in ("material", "instead_of") if palette and key in own}
+        solid = choose(where, SOLIDS, rest | ({"attenuation": 1.0} if materials else {}))
+        return Part(solid, **materials, name=own.get("name"))
 
 
 def _volume(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:

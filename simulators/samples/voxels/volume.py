@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.frame.detector import Detector
+from simulators.frame.mapping import Positive
 from simulators.frame.pose import Pose
 from simulators.samples.voxels.voxels import Voxels
 
@@ -67,11 +68,11 @@ class VolumeSettings:
     file: str
     dataset: str | None = None
     axes: str = "zyx"
-    voxel_mm: float | None = None
+    voxel_mm: Positive | None = None
     window: tuple[float, float] | None = None
-    scale: float | None = None
-    attenuation_max: float | None = None
-    largest_line_integral: float | None = None
+    scale: Positive | None = None
+    attenuation_max: Positive | None = None
+    largest_line_integral: Positive | None = None
     thresholds: tuple[float, ...] = ()
     labels: str | None = None
     labels_dataset: str | None = None
@@ -80,22 +81,14 @@ class VolumeSettings:
     def __post_init__(self) -> None:
         if sorted(self.axes) != ["x", "y", "z"]:
             raise ValueError(f"axes must name x, y and z in the file's order, got {self.axes!r}")
-        if self.voxel_mm is not None and not self.voxel_mm > 0:
-            raise ValueError(f"voxel_mm must be positive, got {self.voxel_mm}")
         if self.window is not None and not self.window[0] < self.window[1]:
             raise ValueError(f"window must be (low, high) in the file's values, got {self.window}")
-        factors = {
-            "scale": self.scale,
-            "attenuation_max": self.attenuation_max,
-            "largest_line_integral": self.largest_line_integral,
-        }
-        given = {name: value for name, value in factors.items() if value is not None}
+        factors = ("scale", "attenuation_max", "largest_line_integral")
+        given = [name for name in factors if getattr(self, name) is not None]
         if len(given) > 1:
             raise ValueError(f"{' and '.join(given)} exclude each other; give one of them")
         if self.window is not None and not given:
             raise ValueError("a window needs attenuation_max, largest_line_integral or scale")
-        if any(not value > 0 for value in given.values()):
-            raise ValueError(f"{next(iter(given))} must be positive, got {next(iter(given.values()))}")
 
 
 def voxels_of(settings: VolumeSettings, read: ReadVolume) -> Voxels:

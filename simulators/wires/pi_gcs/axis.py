@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pi_gcs.output import Firmware, PiOutput, WiredOutput
-from simulators.wires.pi_gcs.trigger import FirstPulse
+from simulators.wires.pi_gcs.output import Firmware, FirstPulse, PiOutput, WiredOutput
 
 MOVES_REMEMBERED = 4096
+REFERENCE_VELOCITY = 5.0  # degrees/s
 
 
 class GcsError(Exception):
@@ -85,7 +85,7 @@ class GcsAxis:
         self.per_degree = build.counts_per_turn / 360.0
         self.error = 0
         self.referenced = build.referenced
-        self.velocity, self.acceleration, self.deceleration, self.reference_velocity = 10.0, 100.0, 100.0, 5.0
+        self.velocity, self.acceleration, self.deceleration = 10.0, 100.0, 100.0
         self._servo = False
         self._clock = clock
         firmware = Firmware(build.first_pulse, build.pulse_width, build.servo_period, build.lost, build.rising)
@@ -173,7 +173,7 @@ class GcsAxis:
             raise GcsError(5)
         at = {"FRF": 0.0, "FNL": self.build.low, "FPL": self.build.high}[kind]
         self.referenced, self._referencing = False, True
-        self._begin(round(at * self.per_degree), self.reference_velocity)
+        self._begin(round(at * self.per_degree), REFERENCE_VELOCITY)
         self._at_end = self._found
 
     def brake(self) -> None:

@@ -44,7 +44,7 @@ class PiGcsBox:
         return self.outputs[number], arguments[1:]
 
     def status(self) -> int:
-        """The register of #4 and SRG?."""
+        """The register of #4."""
         axis = self.axis
         negative, reference, positive = axis.switches()
         bits = {15: axis.on_target(), 14: axis.referencing(), 13: axis.moving(), 12: axis.servo(), 8: axis.error != 0}
@@ -73,6 +73,10 @@ def _number(text: str, low: float, high: float, out_of_range: int = 17) -> float
     if not low <= float(text) <= high:
         raise GcsError(out_of_range)
     return float(text)
+
+
+def _place(box: PiGcsBox, arguments: list[str]) -> float:
+    return _number(box.axis_of(arguments, 1)[0], -1e12, 1e12, 7)
 
 
 def _plain(value: float) -> str:
@@ -108,14 +112,6 @@ def _rate(attribute: str, highest: Callable[[PiAxisBuild], float], error: int = 
     return do
 
 
-def _move_to(box: PiGcsBox, arguments: list[str]) -> None:
-    box.axis.move_to(_number(box.axis_of(arguments, 1)[0], -1e12, 1e12, 7))
-
-
-def _move_by(box: PiGcsBox, arguments: list[str]) -> None:
-    box.axis.move_to(box.axis.target() + _number(box.axis_of(arguments, 1)[0], -1e12, 1e12, 7))
-
-
 def _reference(kind: str) -> Action:
     def do(box: PiGcsBox, arguments: list[str]) -> None:
         box.axis_of(arguments)
@@ -133,12 +129,11 @@ def _halt(box: PiGcsBox, arguments: list[str] | None = None) -> None:
     box.axis.halt()
 
 
-PARAMETERS = {0xB: "acceleration", 0xC: "deceleration", 0x50: "reference_velocity"}
+PARAMETERS = {0xB: "acceleration", 0xC: "deceleration"}
 
 
 def _parameter(box: PiGcsBox, number: int) -> float:
     fixed = {0xE: box.axis.build.counts_per_turn, 0xF: 360}
-    fixed |= {0x4A: int(box.axis.build.max_acceleration), 0x4B: int(box.axis.build.max_acceleration)}
     if number in fixed:
         return fixed[number]
     if number not in PARAMETERS:
@@ -181,8 +176,6 @@ def _set_trigger(box: PiGcsBox, arguments: list[str]) -> None:
             output.start = _number(value, -1e12, 1e12)
         case 9:
             output.stop = _number(value, -1e12, 1e12)
-        case 10:
-            output.position = _number(value, -1e12, 1e12)
         case 3 | 7:
             raise GcsError(17)
         case _:
@@ -198,7 +191,6 @@ def _tell_trigger(box: PiGcsBox, arguments: list[str]) -> list[str]:
         7: str(output.polarity),
         8: _plain(output.start),
         9: _plain(output.stop),
-        10: _plain(output.position),
     }
     if _integer(parameter) not in values:
         raise GcsError(54)
@@ -225,11 +217,9 @@ def _trigger_is_on(box: PiGcsBox, arguments: list[str]) -> list[str]:
 
 
 SINGLE: dict[int, Callable[[PiGcsBox], list[str] | None]] = {
-    0x03: lambda box: [f"{box.name}={_plain(box.axis.position())}"],
     0x04: lambda box: [f"0x{box.status():04X}"],
     0x05: lambda box: [f"{box.axis.moving():X}"],
     0x07: lambda box: ["\xb0" if box.axis.referencing() else "\xb1"],
-    0x08: lambda box: ["0"],
     0x18: _halt,
 }
 
@@ -238,7 +228,6 @@ COMMANDS: dict[str, Action] = {
     "CSV?": lambda box, arguments: ["2.0"],
     "ERR?": lambda box, arguments: [str(box.read_error())],
     "SAI?": lambda box, arguments: [box.name],
-    "CST?": _of_axis(lambda box: "SIMULATED"),
     "SVO": _switch(lambda box, on: box.axis.switch_servo(on)),
     "SVO?": _of_axis(lambda box: f"{box.axis.servo():d}"),
     "FRF": _reference("FRF"),
@@ -250,8 +239,8 @@ COMMANDS: dict[str, Action] = {
     "POS?": _of_axis(lambda box: _plain(box.axis.position())),
     "TMN?": _of_axis(lambda box: _plain(box.axis.build.low)),
     "TMX?": _of_axis(lambda box: _plain(box.axis.build.high)),
-    "MOV": _move_to,
-    "MVR": _move_by,
+    "MOV": lambda box, arguments: box.axis.move_to(_place(box, arguments)),
+    "MVR": lambda box, arguments: box.axis.move_to(box.axis.target() + _place(box, arguments)),
     "MOV?": _of_axis(lambda box: _plain(box.axis.target())),
     "ONT?": _of_axis(lambda box: f"{box.axis.on_target():d}"),
     "VEL": _rate("velocity", lambda build: build.max_velocity, 8),
@@ -262,10 +251,8 @@ COMMANDS: dict[str, Action] = {
     "DEC?": _of_axis(lambda box: _plain(box.axis.deceleration)),
     "SPA": _set_parameter,
     "SPA?": _tell_parameter,
-    "SRG?": lambda box, arguments: [f"{box.name} 1=0x{box.status():X}"],
     "HLT": _brake,
     "STP": _halt,
-    "TIO?": lambda box, arguments: [f"I={len(box.outputs)}", f"O={len(box.outputs)}"],
     "DIO": _put_output,
     "CTO": _set_trigger,
     "CTO?": _tell_trigger,

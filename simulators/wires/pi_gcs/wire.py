@@ -19,17 +19,12 @@ from drivers.stages.pi_gcs.settings import PiGcsSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.axis import GcsAxis, GcsError, PiAxisBuild
 from simulators.wires.pi_gcs.commands import COMMANDS, SINGLE, PiGcsBox
-from simulators.wires.pi_gcs.output import PiOutput
-from simulators.wires.pi_gcs.trigger import FirstPulse
+from simulators.wires.pi_gcs.output import FirstPulse, PiOutput
 
 OUTPUTS = 4
 LONGEST_LINE = 256
 
 Spoil = Callable[[int, bytes], bytes]
-
-
-def _as_sent(number: int, reply: bytes) -> bytes:
-    return reply
 
 
 def _degrees(angle: float) -> float:
@@ -57,7 +52,7 @@ class PiGcsBuild:
     output: int = 1
     latency: float = 0.0
     unknown: Set[str] = frozenset()
-    spoil: Spoil = _as_sent
+    spoil: Spoil = lambda number, reply: reply
     specimen: PiAxisBuild = field(default=PiAxisBuild())
 
     def __post_init__(self) -> None:

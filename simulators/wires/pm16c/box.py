@@ -7,29 +7,22 @@ flag.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Set
 from dataclasses import dataclass
 from enum import IntFlag
 
 from drivers.base.clock import Clock
-from simulators.devices.motor import Output, PulseMotor, TriggerSettings
+from simulators.devices.motor import PulseMotor, TriggerSettings
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.home import HomeSwitch
 
 VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
 MAX_COUNT = 2_147_483_647
 MAX_SPEED = 5_000_000
 MAX_PULSES = 200_000
 """Most pulses of a train: a limit of this simulation, which computes all of them when a move begins."""
-MODES = (
-    (Output.OFF, 0.0),
-    (Output.GATE, 0.0),
-    (Output.PULSES, 200e-9),
-    (Output.PULSES, 10e-6),
-    (Output.PULSES, 100e-6),
-    (Output.PULSES, 1e-3),
-)
-"""TMGM digit -> what the output does and its pulse width in s."""
+WIDTHS = {"0": None, "2": 200e-9, "3": 10e-6, "4": 100e-6, "5": 1e-3}
+"""TMGM digit -> the output's pulse width in s; None: off. The gate of digit 1 is not simulated."""
 
 _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
 
@@ -54,6 +47,43 @@ class Refused(Exception):  # noqa: N818 - not an error of this program
     def __init__(self, flag: Pm16cError) -> None:
         super().__init__(flag)
         self.flag = flag
+
+
+class HomeSwitch:
+    """The home switch of a channel. `at`: its place in pulses since power-on; None without a switch.
+
+    The run of a search is from memory: it starts towards the switch, which tells the side, passes it, slows down and
+    stands beyond. A preset of the counter does not change the remembered place.
+    """
+
+    def __init__(self, motor: PulseMotor, at: int | None) -> None:
+        self._motor, self.at = motor, at
+        self._found: int | None = None
+        self._searched_for: int | None = None
+        self._incomplete = -math.inf
+
+    def search(self, speed: float, acceleration: float) -> None:
+        """Begin to search (pulses/s, pulses/s²) and forget the result of an earlier search."""
+        assert self.at is not None, "the box refuses a search without a switch"
+        here, home = self._motor.position(), self.at + self._motor.zero
+        self._found, self._searched_for = None, home
+        beyond = math.ceil(speed**2 / (2 * acceleration)) if home != here else 0
+        self._motor.start(home + (beyond if home > here else -beyond), speed, acceleration)
+        self._incomplete = self._motor.move.begin
+
+    def found(self) -> int | None:
+        """Where the search passed the switch, in counts; None if it did not."""
+        move, home = self._motor.move, self._searched_for
+        if home is not None and move.begin == self._incomplete:
+            low, high = sorted((round(move.start), self._motor.position()))
+            if low <= home <= high:
+                self._found, self._searched_for = home, None
+        return self._found
+
+    def forget_search(self) -> None:
+        """Another move begins: the search is over."""
+        self.found()
+        self._searched_for = None
 
 
 class Channel:
@@ -252,25 +282,17 @@ class PM16CBox:
     def arm(self, c: str) -> None:
         motor = self.standing(c).motor
         too_many = len(motor.trigger.settings.points) > MAX_PULSES
-        if c not in self.mapped or motor.trigger.refusal(motor.position()) or too_many:
+        if c not in self.mapped or not motor.trigger.can_arm(motor.position()) or too_many:
             raise Refused(Pm16cError.COMMAND)
         motor.trigger.arm()
 
-    def mode(self, c: str) -> int:
-        settings = self.channels[c].motor.trigger.settings
-        return MODES.index((settings.output, settings.width))
+    def mode(self, c: str) -> str:
+        width = self.channels[c].motor.trigger.settings.width
+        return next(digit for digit, own in WIDTHS.items() if own == width)
 
     @property
     def place(self) -> str:
         return "R" if self.remote else "L"
-
-    def status(self) -> str:
-        """The reply to STS?, for the four mapped channels."""
-        now, shown = self.clock.now(), [self.channels[c] for c in self.mapped]
-        letters = "".join(channel.letter for channel in shown)
-        bits = "".join(f"{channel.status(now):02X}" for channel in shown)
-        positions = "/".join(f"{channel.motor.position():+08d}" for channel in shown)
-        return f"{self.place}{self.mapped}/{letters}/0000/{bits}/{positions}"
 
     def channel_status(self, c: str) -> str:
         """The reply to STSx?; a channel without a position controller shows no switches and no status."""

@@ -16,7 +16,7 @@ from drivers.base.clock import Clock
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.train import Pm16cFirstPulse
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.pm16c.box import MODES, BoxBuild, PM16CBox, Pm16cError, Refused
+from simulators.wires.pm16c.box import WIDTHS, BoxBuild, PM16CBox, Pm16cError, Refused
 
 END = b"\r\n"
 LONGEST_LINE = 256
@@ -33,10 +33,6 @@ Query = Callable[..., str]
 Setting = Callable[..., None]
 
 
-def _error_text(box: PM16CBox) -> str:
-    return next((text for flag, text in ERROR_TEXT.items() if flag in box.errors), "NO ERROR")
-
-
 def _clear_errors(box: PM16CBox) -> None:
     box.errors = Pm16cError(0)
 
@@ -50,13 +46,11 @@ def _set_switches(box: PM16CBox, c: str, bits: str) -> None:
 
 
 def _set_mode(box: PM16CBox, c: str, digit: str) -> None:
-    output, width = MODES[int(digit)]
-    box.set_trigger(c, lambda settings: replace(settings, output=output, width=width))
+    box.set_trigger(c, lambda settings: replace(settings, width=WIDTHS[digit]))
 
 
 QUERIES: tuple[tuple[str, Query], ...] = (
     (r"VER\?", lambda box: box.version),
-    (r"VERH\?", lambda box: "HD-VER2"),
     (r"SETCH\?", lambda box: box.mapped),
     (rf"PS\?{_C}", lambda box, c: f"{box.channels[c].motor.position():+08d}"),
     (rf"SHP\?{_C}", PM16CBox.home),
@@ -65,12 +59,11 @@ QUERIES: tuple[tuple[str, Query], ...] = (
     (rf"RTE\?{_C}", lambda box, c: f"{box.channels[c].rate:03d}"),
     (rf"([FB])L\?{_C}", lambda box, side, c: f"{box.channels[c].soft[side]:+08d}"),
     (rf"SETLS\?{_C}", lambda box, c: box.channels[c].switches),
-    (r"STS\?", PM16CBox.status),
     (rf"STS{_C}\?", PM16CBox.channel_status),
     (r"STQ\?", lambda box: f"{box.place}{4 - box.moving()}"),
-    (r"ERR\?", _error_text),
+    (r"ERR\?", lambda box: next((text for flag, text in ERROR_TEXT.items() if flag in box.errors), "NO ERROR")),
     (r"ERRF\?", lambda box: f"{box.errors:02X}"),
-    (rf"TMGM\?{_C}", lambda box, c: f"{box.mode(c)}"),
+    (rf"TMGM\?{_C}", PM16CBox.mode),
     (rf"TMGS\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.start:+08d}"),
     (rf"TMGE\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.end:+08d}"),
     (rf"TMGI\?{_C}", lambda box, c: f"{box.channels[c].motor.trigger.settings.interval:07d}"),
@@ -99,7 +92,7 @@ REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
     (rf"RTE{_C}(\d{{1,3}})", lambda box, c, d: box.set_rate(c, int(d))),
     (rf"([FB])L{_C}{_D}", _set_limit),
     (rf"SETLS{_C}([01]{{4}}0[01]{{3}})", _set_switches),
-    (rf"TMGM{_C}([0-5])", _set_mode),
+    (rf"TMGM{_C}([02-5])", _set_mode),
     (rf"TMGS{_C}{_D}", lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, start=int(d)))),
     (rf"TMGE{_C}{_D}", lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, end=int(d)))),
     (

@@ -113,7 +113,8 @@ class ZaberDevice:
                     self.axis.flags.clear()
                 return " ".join([f"{len(flags):02d}", *flags])
             case ["trigger", "show"] if self._has_triggers:
-                return " ".join(_shown(trigger.left) for trigger in self.triggers.triggers)
+                states = {0: "d", -1: "e"}  # disabled, enabled without end; else the fires that are left
+                return " ".join(states.get(trigger.left, str(trigger.left)) for trigger in self.triggers.triggers)
             case ["io", "get", "do", channel] if number_in(channel, OUTPUTS):
                 return str(self.triggers.outputs[int(channel) - 1])
             case ["io", "get", "do"]:
@@ -248,11 +249,6 @@ class ZaberDevice:
 
     def _is_pulse(self, edge: Edge) -> bool:
         return (edge.channel, edge.value) == (self._output, self._active)
-
-
-def _shown(left: int) -> str:
-    """`d` disabled, `e` enabled without end, or the fires that are left."""
-    return {0: "d", -1: "e"}.get(left, str(left))
 
 
 def _whole(text: str) -> int:

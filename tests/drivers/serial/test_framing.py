@@ -156,15 +156,15 @@ def test_every_line_of_a_reply_is_checked_and_so_are_notes() -> None:
 def test_control_bytes_go_out_bare_and_may_be_answered() -> None:
     wire = Script(b"", b"0\n")
     line = connect(wire)
-    line.send_raw(b"\x18")
-    assert line.query_raw(b"\x05", "[0-9A-F]", "a motion status")[0] == "0"
+    line.send(b"\x18")
+    assert line.query(b"\x05", "[0-9A-F]", "a motion status")[0] == "0"
     assert wire.heard == [b"\x18", b"\x05"]
 
 
 def test_an_error_about_a_control_byte_can_be_read() -> None:
     line = connect(Script(b""))
     with pytest.raises(DeviceTimeout) as error:
-        line.query_raw(b"\x05", "[0-9A-F]", "a motion status")
+        line.query(b"\x05", "[0-9A-F]", "a motion status")
     assert r"Asked '\x05'" in str(error.value)
     assert r"> \x05 (" in error.value.wire
     assert str(error.value).isprintable()
@@ -213,7 +213,7 @@ def test_the_transcript_has_every_byte_and_when_it_went(
         try:
             line.query(f"N?{k}", r"\d", "a digit")
         except DeviceError:
-            line.send_raw(b"\x18")
+            line.send(b"\x18")
     line.close()
     entries = read_transcript(path)
     assert b"".join(data for _, mark, data in entries if mark == ">") == b"".join(wire.heard)

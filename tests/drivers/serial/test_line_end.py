@@ -64,9 +64,9 @@ def test_a_closed_line_says_so_whatever_it_is_asked(serve: Callable[[Wire], Abst
             line.close()
             for ask in (
                 lambda: line.query("N?", "1", "one"),
-                lambda: line.query_raw(b"\x05", "1", "one"),
+                lambda: line.query(b"\x05", "1", "one"),
                 lambda: line.send("GO"),
-                lambda: line.send_raw(b"\x18"),
+                lambda: line.send(b"\x18"),
             ):
                 with pytest.raises(DeviceError, match=r"it was closed.*Nothing was sent"):
                     ask()

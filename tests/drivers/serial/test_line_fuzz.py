@@ -76,11 +76,11 @@ def test_fuzz_every_call_ends_in_time_and_the_line_finds_its_step_again(
             found = allowed(lambda: line.query(f"A?{number}", form, "a reply", "Nothing moved"), wire.clock, LONGEST)  # noqa: B023
             assert isinstance(found, DeviceError) or found.re.pattern == form
         elif call == 6:
-            allowed(lambda: line.query_raw(b"\x05", r"N5", "a reply"), wire.clock, LONGEST)
+            allowed(lambda: line.query(b"\x05", r"N5", "a reply"), wire.clock, LONGEST)
         elif call == 7:
             line.send("GO")
         elif call == 8:
-            line.send_raw(b"\x18" + framing.command_end)
+            line.send(b"\x18" + framing.command_end)
         else:
             wire.clock.sleep(1.0)
     wire.end()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.base.errors import DeviceError
-from drivers.base.protocols import RotationStage, StageStatus, TriggerTrain
+from drivers.base.protocols import RotationStage, TriggerTrain
 from simulators.wires.serial_url import register
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed
 from tests.drivers.stages.rigs import NAMES, AnyRig
@@ -25,13 +25,11 @@ AFTER = 10.0
 Call = Callable[[RotationStage], Any]
 CALLS: list[Call] = [
     lambda stage: stage.position(),
-    lambda stage: stage.status(),
     lambda stage: stage.moving(),
     lambda stage: stage.start_move(math.radians(20), math.radians(20)),
     lambda stage: stage.start_home(),
     lambda stage: stage.wait(LONG),
     lambda stage: stage.arm(TriggerTrain(stage.to_counts(math.radians(2)), stage.to_counts(math.radians(0.1)), 20)),
-    lambda stage: stage.remaining_pulses(),
     lambda stage: stage.disarm(),
     lambda stage: stage.stop(),
     lambda stage: stage.abort(),
@@ -87,14 +85,16 @@ def every_call_ends_in_time_and_the_stage_can_be_used_again(
     assert wire.replies == fuzzed.replies_to_open
     for call in calls:
         result = allowed(lambda: call(stage), rig.clock, WITHIN)  # noqa: B023
-        assert isinstance(result, None | bool | int | float | StageStatus | DeviceError)
+        assert isinstance(result, None | bool | int | float | DeviceError)
     wire.end()
     rig.clock.sleep(AFTER)
     for _ in range(3):  # what had come before, its remains, and then the stop itself
         stopped = allowed(stage.stop, rig.clock, WITHIN)
     assert not isinstance(stopped, DeviceError)
     where = rig.line.angle_at(rig.clock.now())
-    assert stage.status().counts == (stage.to_counts(where) if fuzzed.counts is None else fuzzed.counts(rig))
+    assert stage.to_counts(stage.position()) == (
+        stage.to_counts(where) if fuzzed.counts is None else fuzzed.counts(rig)
+    )
     rig.clock.sleep(AFTER)
     assert rig.line.angle_at(rig.clock.now()) == where
     stage.disarm()
@@ -104,5 +104,5 @@ def every_call_ends_in_time_and_the_stage_can_be_used_again(
     stage.start_move(math.radians(1), math.radians(20))
     degree = stage.limits.counts_per_turn // 360
     assert stage.to_counts(stage.wait(LONG)) == degree
-    assert stage.status().counts == degree
+    assert stage.to_counts(stage.position()) == degree
     stage.close()

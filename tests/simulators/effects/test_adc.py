@@ -56,11 +56,3 @@ def test_photon_numbers_are_not_resolved_with_a_lesser_converter(adc: dict[str, 
         shots.frame(shots.scene("photon_noise", {"kind": "adc", **adc}), shot)
     straight, plain = (shots.frame(shots.scene("photon_noise", *also, flux=4e3), shot) for also in (["adc"], []))
     np.testing.assert_array_equal(straight, plain)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"), [({"bits": 10}, "bits must be 8, 12 or 16"), ({"nonlinearity": 1.0}, r"-0.25 \.\.\. 0.25")]
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        Adc(**wrong)  # type: ignore[arg-type]

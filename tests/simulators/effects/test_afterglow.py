@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -103,19 +102,3 @@ def test_a_gauss_rule_of_fewer_points_than_asked_for_is_the_points() -> None:
     points, weights = gauss_rule(np.array([-1.0, 2.0, 2.0]), np.array([0.2, 0.3, 0.5]), 5)
     np.testing.assert_allclose(points, [-1.0, 2.0])
     np.testing.assert_allclose(weights, [0.2, 0.8])
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"shares": (), "decay_times": ()}, "each component needs a share and a decay time"),
-        ({"shares": (0.1,), "decay_times": (1.0, 2.0)}, "each component needs a share and a decay time"),
-        ({"shares": (0.6, 0.4), "decay_times": (1.0, 2.0)}, "with a sum in 0 ... 1"),
-        ({"shares": (-0.1, 0.4), "decay_times": (1.0, 2.0)}, "shares must be >= 0"),
-        ({"shares": (0.1,), "decay_times": (0.0,)}, "decay_times positive in s"),
-        ({"shares": (0.1,), "decay_times": (1.0,), "samples": 0}, "samples must lie in 1 ... 32, got 0"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        Afterglow(**wrong)

@@ -6,14 +6,13 @@ import math
 from itertools import pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.motor import PulseMotor
-from simulators.effects.backlash import Backlash, came_forwards
+from simulators.effects.backlash import came_forwards
 from tests.simulators import shots
 
 
@@ -74,9 +73,3 @@ def test_a_stage_that_goes_by_counts_is_understood() -> None:
         motor.start(target, 10_000.0, 50_000.0)
         clock.sleep(motor.move.end - clock.now() + 5.0)
         assert came_forwards(motor.angle_at, clock.now()) is (target == 5000)
-
-
-@pytest.mark.parametrize("wrong", [0.0, -1.0, math.nan])
-def test_a_wrong_parameter_is_refused(wrong: float) -> None:
-    with pytest.raises(ValueError, match="lost_motion_deg must be positive"):
-        Backlash(wrong)

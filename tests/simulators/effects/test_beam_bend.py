@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -23,8 +21,3 @@ def test_views_have_the_stated_surface_of_line_integrals() -> None:
 
 def test_flats_stay_as_they_are() -> None:
     assert (BEND.apply(np.ones((6, 8)), shots.shot(sample=False)) == 1).all()
-
-
-def test_numbers_that_are_not_finite_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be finite"):
-        BeamBend(level=math.nan)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -55,20 +54,3 @@ def test_one_energy_is_beer_lambert_and_no_depth_is_too_large() -> None:
     assert _seen(BeamHardening((2.0,), energies=(30.0,)), [0.0, 1.0, 900.0]) == pytest.approx([0.0, 1.0, 900.0])
     (deep,) = _seen(BeamHardening((0.0, 3.0, 1.0), ratios=(1e-9, 8.0, 1.0)), [5000.0])
     assert deep == pytest.approx(5000 * 4 / 25 - math.log(0.25), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"weights": (1.0,)}, "give either energies in keV or ratios"),
-        ({"weights": (1.0,), "energies": (20.0,), "ratios": (1.0,)}, "give either energies in keV or ratios"),
-        ({"weights": (1.0, 2.0), "energies": (20.0,)}, "weights must be as many as energies or ratios"),
-        ({"weights": (), "energies": ()}, "weights must be as many as energies or ratios"),
-        ({"weights": (1.0,), "energies": (0.0,)}, "energies and ratios must be positive"),
-        ({"weights": (0.0,), "ratios": (1.0,)}, "weights >= 0 and one of them positive"),
-        ({"weights": (-1.0, 2.0), "ratios": (1.0, 2.0)}, "weights >= 0 and one of them positive"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        BeamHardening(**wrong)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -56,16 +53,3 @@ def test_the_sample_stays_where_it_is_while_the_beam_wanders() -> None:
 def test_a_swing_comes_back_after_its_period(elapsed: float, turns: int) -> None:
     profile = BeamProfile((1.0, 1.0), wander=(0.1, 0.2), wander_period=7.0)
     np.testing.assert_allclose(profile.middle(elapsed + 7.0 * turns), profile.middle(elapsed), atol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"sigma": (1.0, 0.0)}, "sigma and stripe_period must be positive"),
-        ({"sigma": (1.0, 1.0), "stripes": 1.0}, "stripes in 0 ... 1"),
-        ({"sigma": (1.0, 1.0), "wander_period": 0.0}, "wander_period must be positive, got 0.0 s"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        BeamProfile(**wrong)

@@ -38,15 +38,3 @@ def test_it_is_there_always_without_views() -> None:
     band = BlackBand(0.05)
     assert band.labels(shots.shot(view=10_000)) == [Label("black_band", (0, 60, 0, 5))]
     assert BlackBand(2.0).labels(shots.shot()) == [Label("black_band", (0, 60, 0, 80))]
-
-
-@pytest.mark.parametrize("wrong", [{"width": 0.0}, {"width": 0.1, "penumbra": -1.0}, {"width": 0.1, "share": 1.0}])
-def test_wrong_parameters_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"width must be positive and penumbra >= 0 in mm, and share in 0 \.\.\. 1"):
-        BlackBand(**wrong)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("views", [(5, 5), (-1, 3)])
-def test_wrong_views_are_refused(views: tuple[int, int]) -> None:
-    with pytest.raises(ValueError, match=r"views must be \[first, one after the last\] with 0 <= first < last"):
-        BlackBand(0.1, views=views)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from simulators.effects.anomaly import Label
+from simulators.effects.catalogue import Domain
 from simulators.effects.chain import Chain
 from simulators.effects.motion_blur import MotionBlur
-from simulators.frame.domain import Domain
 from simulators.frame.shot import Image, Shot
 from tests.simulators import shots
 

@@ -29,8 +29,3 @@ def test_it_adds_new_electrons_to_each_frame() -> None:
     one, other = (DarkCurrent(5.0).apply(np.full((60, 80), 10.5), shots.shot(frame=k)) for k in (1, 2))
     assert set(np.unique(one)) <= {10.5, 11.5, 12.5}
     assert (one != other).any()
-
-
-def test_a_wrong_parameter_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"rate must be >= 0 electrons/s, got -1.0"):
-        DarkCurrent(-1.0)

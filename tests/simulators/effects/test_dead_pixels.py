@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from simulators.effects.dead_pixels import DeadPixels
 from simulators.effects.hot_pixels import HotPixels
@@ -34,9 +33,3 @@ def test_a_binned_pixel_loses_the_share_of_its_dead_pixels() -> None:
         share = dead + charge * (dead == 0)
         binned = DeadPixels(0.1, charge).apply(np.full((30, 40), 4.0), shot)
         np.testing.assert_allclose(binned, share.reshape(30, 2, 40, 2).sum(axis=(1, 3)))
-
-
-@pytest.mark.parametrize("wrong", [{"fraction": 2.0}, {"charge": -1.0}, {"seed": -1}])
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"fraction must lie in 0 ... 0.1"):
-        DeadPixels(**wrong)  # type: ignore[arg-type]

@@ -32,10 +32,3 @@ def test_the_rest_is_drawn_for_each_frame() -> None:
     # Mean and variance of 400 Gaussian draws; 5 standard errors fail once in 1.7 million.
     assert abs(error[:, 0].mean()) < 5 * 3.0 / math.sqrt(400)
     assert error[:, 0].var() == pytest.approx(9.0, rel=5 * math.sqrt(2 / 400))
-
-
-def test_wrong_parameters_are_refused() -> None:
-    with pytest.raises(ValueError, match="harmonics must be"):
-        EncoderError(((1, -8.0, 0.0),))
-    with pytest.raises(ValueError, match=r"random_mdeg must be >= 0 millidegrees, got -3\.0"):
-        EncoderError(random_mdeg=-3.0)

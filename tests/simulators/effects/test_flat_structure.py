@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -110,19 +109,3 @@ def test_a_flat_divides_it_out() -> None:
                                .transmission(shots.shot()), atol=2e-5)  # fmt: skip
     assert flat.std() / flat.mean() > 0.02
     np.testing.assert_allclose(shots.frame(scene) / flat, np.exp(-shots.depth(scene, 0.4)), rtol=3e-3)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"specks": -1}, "specks must lie in 0 ... 100000"),
-        ({"scratches": 1001}, "scratches in 0 ... 1000"),
-        ({"radius_um": 0.0}, "radius_um, scratch_length_um and scratch_width_um must be positive"),
-        ({"depth": 0.6}, "must lie in 0 ... 0.5"),
-        ({"scratch_depth": math.nan}, "must lie in 0 ... 0.5"),
-        ({"seed": -1}, "seed must be >= 0, got -1"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        FlatStructure(**wrong)

@@ -168,26 +168,3 @@ def test_a_crumb_beyond_all_whole_numbers_is_out_of_the_frame() -> None:
     assert Crumb(row=1e40, col=3.0, sigma=1.0, depth=0.5, which=0).box((8, 9))[0:2] == (8, 8)
     assert Crumb(row=-1e40, col=3.0, sigma=1.0, depth=0.5, which=0).box((8, 9))[0:2] == (0, 0)
     assert Crumb(row=-1e20, col=4.0, sigma=1e20, depth=0.5, which=0).box((8, 9)) == (0, 8, 0, 9)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"distance": (0.0, 1.0)}, r"distance and size must be \[least, most\] > 0"),
-        ({"size": (0.2, 0.1)}, r"distance and size must be \[least, most\] > 0"),
-        ({"count": 0}, "count must be >= 1"),
-        ({"count": 10**30}, "count must be 10000 at most"),
-        ({"distance": (0.7, 1e308)}, r"lengths 1e\+09 mm"),
-        ({"size": (1e-308, 0.1)}, "size 1e-09 mm at least"),
-        ({"heights": (-1e308, 0.0)}, "lengths"),
-        ({"depth": 1e308}, r"depth 1e\+06"),
-        ({"depth": 0.0}, "depth >= 0.004"),
-        ({"heights": (0.2, -0.2)}, "heights"),
-        ({"views": (2, 2)}, "views must be"),
-        ({"seed": -1}, "seed must be >= 0, got -1"),
-        ({"motion": "loose"}, "loose floaters need views"),
-    ],
-)
-def test_wrong_parameters_are_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        Floaters(**({"distance": (0.7, 0.9)} | wrong))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simulators.effects.ghost import Ghost
 from tests.simulators import anomalies, shots
 
 GHOST = {"kind": "ghost", "view": 4, "width": 0.2, "speed": 0.3, "gain": 0.5}
@@ -37,10 +36,3 @@ def test_flats_and_darks_do_not_have_it() -> None:
     for state in ({"sample": False}, {"beam": False}):
         assert not anomalies.labels(GHOST, shots.shot(view=5, **state))
     assert not anomalies.change(GHOST, shots.shot(view=5, sample=False)).any()
-
-
-@pytest.mark.parametrize("wrong", [{"view": -1}, {"width": 0.0}, {"speed": -0.1}, {"gain": 0.0}, {"gain": -1.5}])
-def test_wrong_parameters_are_refused(wrong: dict[str, float]) -> None:
-    words = "gain must be >= -1 and not 0" if "gain" in wrong else "view must be >= 0, and width"
-    with pytest.raises(ValueError, match=words):
-        Ghost(**({"view": 4, "width": 0.2, "speed": 0.3} | wrong))  # type: ignore[arg-type]

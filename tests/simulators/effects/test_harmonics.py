@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from decimal import Decimal, getcontext
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,9 +38,3 @@ def test_a_frame_has_a_twenty_seventh_of_the_attenuation_at_the_third_harmonic()
 def test_an_opaque_sample_lets_the_harmonic_through() -> None:
     seen = Harmonics(0.01).apply(np.array([[80.0]]), shots.shot())
     assert seen[0, 0] == pytest.approx(80 / 27 - math.log(0.01), rel=1e-12)
-
-
-@pytest.mark.parametrize("wrong", [{"share": -0.1}, {"share": 1.1}, {"share": 0.1, "ratio": 1.5}, {"share": math.nan}])
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"share and ratio must lie in 0 ... 1, got"):
-        Harmonics(**wrong)

@@ -40,9 +40,3 @@ def test_each_frame_has_other_electrons_of_the_same_pixels() -> None:
     assert (one != other).any()
     hot = one > 0
     assert np.abs(one - other)[hot].max() < 10 * np.sqrt(one.max())
-
-
-@pytest.mark.parametrize("wrong", [{"fraction": 2.0}, {"rate": -1.0}, {"rate": 1e10}, {"seed": -1}])
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"fraction must lie in 0 ... 0.1"):
-        HotPixels(**wrong)  # type: ignore[arg-type]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -39,18 +37,3 @@ def test_a_frame_within_the_loss_is_dark_to_the_last_photon(elapsed: float, expo
     """Not darker: photons cannot be fewer than none."""
     shot = shots.shot(elapsed=elapsed, exposure=exposure)
     assert not LostBeam(seconds=(-1.0, 2e6)).apply(np.ones((60, 80)), shot).any()
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({}, "either views or seconds, and not both"),
-        ({"views": (0, 1), "seconds": (0.0, 1.0)}, "either views or seconds, and not both"),
-        ({"views": (3, 1)}, "views must be"),
-        ({"seconds": (1.0, 1.0)}, r"seconds must be \[from, to\] with from < to, got \[1.0, 1.0\]"),
-        ({"views": (0, 1), "share": 1.0}, r"share must lie in 0 \.\.\. 1"),
-    ],
-)
-def test_wrong_parameters_are_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        LostBeam(**wrong)

@@ -87,9 +87,3 @@ def test_a_cone_sees_the_side_of_its_source_move_faster() -> None:
 
 def test_a_tolerance_of_next_to_nothing_takes_all_samples_allowed() -> None:
     assert MotionBlur(1e-320, 7).samples(shots.shot(angle_at=_turning(0.1))) == 7
-
-
-@pytest.mark.parametrize("wrong", [{"tolerance_px": 0.0}, {"max_samples": 1}])
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="tolerance_px must be positive and max_samples >= 2"):
-        MotionBlur(**wrong)  # type: ignore[arg-type]

@@ -58,9 +58,3 @@ def test_projections_are_as_narrow_and_darks_show_nothing() -> None:
     assert anomalies.check_regions(field, shots.shot())
     assert not anomalies.labels(field, shots.shot(beam=False))
     assert not anomalies.labels({"kind": "narrow_field", "width": 2.0}, shots.shot())
-
-
-@pytest.mark.parametrize("wrong", [{"width": 0.0}, {"width": 0.1, "height": 0.0}, {"width": 0.1, "penumbra": -1.0}])
-def test_wrong_parameters_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="width and height must be positive and penumbra >= 0 in mm"):
-        NarrowField(**wrong)  # type: ignore[arg-type]

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulators.effects.catalogue import CATALOGUE, load_effect
-from simulators.frame.domain import Domain
+from simulators.effects.catalogue import CATALOGUE, Domain, load_effect
 from simulators.frame.shot import Shot, fixed_rng, frame_rng
 from tests.simulators.effects import on_demand
 from tests.simulators.effects.parameters import PARAMETERS

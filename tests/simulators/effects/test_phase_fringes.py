@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -222,19 +221,3 @@ def test_a_propagator_that_would_alias_is_refused() -> None:
         PhaseFringes(1.0, far * 1.001, 20.0).apply(np.zeros((64, 80)), shot)
     with pytest.raises(ValueError, match="propagator would alias"):
         PhaseFringes(1.0, far * 0.6, 20.0, oversampling=2).apply(np.zeros((64, 80)), shot)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"delta_beta": -1.0}, "must be >= 0 and energy"),
-        ({"distance": math.nan}, "must be >= 0 and energy"),
-        ({"energy": 0.0}, r"energy \(keV\) positive"),
-        ({"method": "ray"}, "method must be wave or transport, got 'ray'"),
-        ({"method": "transport", "oversampling": 2}, "oversampling is for the method wave"),
-        ({"oversampling": 9}, "oversampling must lie in 1 ... 8, got 9"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        PhaseFringes(**({"delta_beta": 100.0, "distance": 50.0, "energy": 20.0} | wrong))

@@ -33,9 +33,3 @@ def test_rays_are_evenly_spread_about_the_middle() -> None:
     offsets = np.array(PixelArea(4).offsets)
     np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=1e-15)
     assert sorted(set(offsets[:, 0])) == [-0.375, -0.125, 0.125, 0.375] and len(offsets) == 16
-
-
-@pytest.mark.parametrize("rays", [1, 9, 0])
-def test_one_ray_and_very_many_are_refused(rays: int) -> None:
-    with pytest.raises(ValueError, match=rf"2 ... 8 a side of the pixel, got {rays}"):
-        PixelArea(rays)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -41,18 +38,3 @@ def test_thinned_light_is_poisson() -> None:
     for seen in (counts, direct):
         found = np.bincount(np.minimum(seen, 11).reshape(-1), minlength=12)
         assert ((found - expected) ** 2 / expected).sum() < stats.chi2.isf(1e-6, 11)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({}, "give either value or wavelength_nm"),
-        ({"value": 0.5, "wavelength_nm": 500.0}, "give either value or wavelength_nm"),
-        ({"value": 1.2}, "value must lie in 0 ... 1, got 1.2"),
-        ({"value": math.nan}, "value must lie in 0 ... 1, got nan"),
-        ({"wavelength_nm": 0.55}, "wavelength_nm must lie in 300 ... 1000 nm, got 0.55"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        QuantumEfficiency(**wrong)

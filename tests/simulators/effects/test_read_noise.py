@@ -58,12 +58,3 @@ def test_spread_amplifiers_add_up_where_pixels_are_summed() -> None:
         np.zeros((300, 400)), shots.shot(roi=(0, 0, 600, 800), binning=2, detector=shots.sized(300, 400).detector)
     )
     assert (noise**2).mean() == pytest.approx(4 * 0.43**2 * math.exp(2 * 0.3**2), rel=0.03)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [({"rms": -1.0}, "rms must be >= 0 electrons"), ({"spread": 3.0}, "spread must lie in 0"), ({"seed": -1}, "seed")],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        ReadNoise(**wrong)  # type: ignore[arg-type]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -71,19 +70,3 @@ def test_top_ups_start_and_end_when_they_are_said_to() -> None:
     falls = TAU * math.log(1 / 0.8)
     assert share.mean(5 * falls - SHORT, SHORT) == pytest.approx(0.8, rel=1e-5)
     assert share.mean(5 * falls + SHORT, SHORT) == pytest.approx(1.0, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"lifetime": 0.0}, "lifetime must be positive, got 0.0 s"),
-        ({"lifetime": 9.0, "top_up_every": 5.0, "top_up_below": 0.9}, "exclude each other"),
-        ({"lifetime": 9.0, "top_up_below": 1.0}, "between 0 and 1, got 1.0"),
-        ({"lifetime": 9.0, "refill": 1.0}, "0 without top_up_every or top_up_below, got 1.0 s"),
-        ({"lifetime": 9.0, "top_up_below": 0.9, "refill": -1.0}, "refill must be >= 0"),
-        ({"lifetime": 9.0, "top_up_every": 2.0, "refill": 2.0}, "longer than refill, got 2.0 and 2.0 s"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        RingCurrent(**wrong)

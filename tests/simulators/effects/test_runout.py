@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 from simulators.effects.runout import Runout
 from simulators.frame.pose import Pose
@@ -48,12 +47,3 @@ def test_a_frame_is_seen_shifted_by_whole_pixels() -> None:
     moved = shots.frame(shots.scene({"kind": "runout", "radial": [[0, 20.0, 0.0]], "axial": [[0, 30.0, 0.0]]}))
     np.testing.assert_array_equal(moved[3:, 2:], plain[:-3, :-2])  # 20 and 30 um, pixels of 10 um
     assert (moved != plain).any()
-
-
-def test_wrong_parameters_are_refused() -> None:
-    with pytest.raises(ValueError, match="radial must be"):
-        Runout(radial=((2, -5.0, 0.0),))
-    with pytest.raises(ValueError, match="axial must be"):
-        Runout(axial=((2, 5.0, 0.0), (2, 5.0, 0.0)))
-    with pytest.raises(ValueError, match=r"must be >= 0 micrometres, got 0\.0 and -1\.0"):
-        Runout(axial_random_um=-1.0)

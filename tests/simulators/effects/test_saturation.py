@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -39,9 +38,3 @@ def test_the_knee_bends_smoothly_towards_the_full_well(knee: float, well: float)
 def test_it_does_not_touch_the_light_that_fits() -> None:
     charge = np.linspace(0, 6999, 500)
     np.testing.assert_array_equal(_response(Saturation(), charge), charge)
-
-
-@pytest.mark.parametrize("wrong", [{"full_well": 0.0}, {"knee": -0.1}, {"knee": 1.1}])
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=r"full_well must be positive \(electrons\) and knee lie in 0 ... 1"):
-        Saturation(**wrong)

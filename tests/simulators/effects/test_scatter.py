@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -42,17 +39,3 @@ def test_a_broad_blur_keeps_the_mean_and_is_the_gaussian(width_mm: float, small:
     assert added.mean() == pytest.approx(0.2 * primary.mean(), rel=1e-12)
     expected = gaussian_filter(primary, width_mm / 0.01, mode="reflect", truncate=8)
     np.testing.assert_allclose(added / 0.2, expected, atol=0.2 / small**2)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"ratio": -0.1}, "ratio and background must be >= 0"),
-        ({"background": -1.0}, "ratio and background must be >= 0"),
-        ({"ratio": math.nan}, "ratio and background must be >= 0"),
-        ({"ratio": 0.1, "width_mm": 0.0}, "width_mm must be positive .* got 0.0 mm"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        Scatter(**wrong)

@@ -115,21 +115,6 @@ def test_glare_lights_up_what_lies_behind_an_opaque_edge() -> None:
         assert between / 0.1 == pytest.approx(0.5 - math.atan(x / 200) / math.pi, abs=0.008)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"fwhm_um": -1.0}, "fwhm_um must be >= 0"),
-        ({"fwhm_um": math.nan}, "fwhm_um must be >= 0"),
-        ({"fwhm_um": 5.0, "tail_share": 1.0}, r"tail_share in 0 ... 1 \(excluded\)"),
-        ({"fwhm_um": 5.0, "tail_um": 0.0}, "tail_um positive"),
-        ({"fwhm_um": 5.0, "tail": "gaussian"}, "tail must be one of exponential, lorentzian, got 'gaussian'"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        ScintillatorBlur(**wrong)
-
-
 def test_a_core_as_wide_as_a_slip_of_units_is_refused() -> None:
     image: NDArray[np.float64] = np.ones((8, 8))
     with pytest.raises(ValueError, match=r"a core of 5000 um FWHM is 212 pixels .* give a wide blur as the tail"):

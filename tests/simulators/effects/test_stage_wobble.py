@@ -66,10 +66,3 @@ def test_the_rest_is_drawn_for_each_frame_and_the_same_at_every_moment_of_it() -
     # Mean and variance of 800 Gaussian draws; 5 standard errors fail once in 1.7 million.
     assert abs(tilts[:, 0].mean()) < 5 * 7e-6 / math.sqrt(800)
     assert tilts[:, 0].var() == pytest.approx(49e-12, rel=5 * math.sqrt(2 / 800))
-
-
-def test_wrong_parameters_are_refused() -> None:
-    with pytest.raises(ValueError, match="harmonics must be"):
-        StageWobble(((2, -5.0, 0.0),))
-    with pytest.raises(ValueError, match=r"random_urad must be >= 0 microradians, got -1\.0"):
-        StageWobble(random_urad=-1.0)

@@ -78,18 +78,3 @@ def test_more_zingers_than_a_frame_can_hold_are_refused() -> None:
     """They would fill the memory."""
     with pytest.raises(CannotExposeError, match=r"1e\+12 a second are 1e\+10 in a frame of 0.01 s"):
         _frame(Zingers(1e12), 0)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"rate": -2.0}, "rate must be >= 0"),
-        ({"rate": 1.0, "charge": 0.0}, "charge positive"),
-        ({"rate": 1.0, "tracks": 2.0}, "tracks must lie in 0"),
-        ({"rate": 1.0, "length": 0.0}, "length be positive"),
-        ({"rate": 1.0, "radius": -1.0}, "radius >= 0"),
-    ],
-)
-def test_a_wrong_parameter_is_refused(wrong: dict[str, float], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        Zingers(**wrong)

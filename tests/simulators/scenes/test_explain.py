@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from simulators.effects.catalogue import CATALOGUE
-from simulators.frame.domain import Domain
+from simulators.effects.catalogue import CATALOGUE, Domain
 from simulators.scenes.explain import explain
 from simulators.scenes.scene import load_scene
 from tests.simulators.shots import PHANTOM, shot

@@ -12,11 +12,10 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from simulators.effects.catalogue import CATALOGUE, load_effect
+from simulators.effects.catalogue import CATALOGUE, Domain, load_effect
 from simulators.effects.chain import Chain
 from simulators.frame import sensor
 from simulators.frame.detector import Detector
-from simulators.frame.domain import Domain
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Shot
 from simulators.scenes.expose import expose

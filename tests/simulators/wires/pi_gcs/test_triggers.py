@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simulators.wires.pi_gcs.trigger import FirstPulse
+from simulators.wires.pi_gcs.output import FirstPulse
 from tests.simulators.pi_gcs_host import ACCELERATION, VELOCITY, Wire
 
 RAMP = VELOCITY**2 / (2 * ACCELERATION)

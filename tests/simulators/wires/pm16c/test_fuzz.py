@@ -15,7 +15,7 @@ COMMANDS = [
     f"{command}\r\n".encode()
     for command in (
         "VER?", "SETCH?", "SETCH3210", "PS?0", "PS0+100", "SPD?0", "SPDH0100", "SPDH0", "RTE0115", "FL0+100", "BL0-100",
-        "SETLS010000000", "STS?", "STS0?", "STSF?", "STQ?", "ERR?", "ERRF?", "TMGM03", "TMGS0+100", "TMGE0+2147483647",
+        "SETLS010000000", "STS0?", "STSF?", "STQ?", "ERR?", "ERRF?", "TMGM03", "TMGS0+100", "TMGE0+2147483647",
         "TMGI01", "TMGR0", "TMGR?0", "TMGC0", "REM", "LOC", "SSTP0", "ESTP0", "ASSTP", "AESTP", "ERRC",
         "ABS0+2147483647", "ABS0-999999999999", "REL0+90000", "FDHP0", "GTHP0", "SHP?0",
     )

@@ -121,16 +121,6 @@ def test_a_width_not_shorter_than_the_interval_time_leaves_the_output_high(wire:
         wire.run("ABS0-30000")
 
 
-def test_a_gate_rises_on_entry_from_either_side_and_stays_armed(wire: Wire) -> None:
-    wire.tell("TMGM01")
-    wire.train(1000, 2000, 10)
-    wire.run("ABS0+5000")
-    wire.run("ABS0+0")
-    wire.run("ABS0+1500")
-    assert wire.counts() == [1000, 2000, 1000]
-    assert wire.ask("TMGR?0") == "YES"
-
-
 def test_only_the_channel_on_position_controller_a_reaches_the_cable(wire: Wire) -> None:
     wire.tell("SETCH10--")
     wire.train(100, 1000, 100)

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from simulators.light.effective_depth import effective_depth
 from simulators.light.spectrum import Spectrum
+from simulators.samples.composed.parts import effective_depth
 
 Reals = NDArray[np.float64]
 
