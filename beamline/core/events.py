@@ -12,7 +12,7 @@ from typing import Any, ClassVar, dataclass_transform
 import numpy as np
 
 KINDS: dict[str, list[type[Event]]] = {}
-"""The classes of each kind; each class below enters itself. Forms of one kind are told apart by their fields."""
+"""The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
 _SPREAD = {"spread": True}  # of a field whose own values stand in the line, a mapping or a dataclass
 
 
