@@ -15,8 +15,8 @@ from pydantic import ValidationError
 
 from beamline.config.checks import faults
 from beamline.config.errors import explain
+from beamline.config.models import Config as Config
 from beamline.config.models import (
-    Config,
     Fields,
     FileAngles,
     GoldenAngles,
@@ -27,22 +27,10 @@ from beamline.config.models import (
 from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
-from beamline.core.shipped import config_folder
+from beamline.core.shipped import config_folder as config_folder
 from beamline.core.version import version
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, ScanPlan
-
-__all__ = [
-    "Config",
-    "changed",
-    "config_folder",
-    "load",
-    "override_of",
-    "plan_of",
-    "resolved_yaml",
-    "scene_mapping",
-    "schema",
-]
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:
@@ -73,11 +61,7 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
-    """The configuration with other values; neither its file nor the environment is looked at again.
-
-    Raises:
-        ConfigError: as `load`.
-    """
+    """The configuration with other values, without its file and the environment. ConfigError as `load`."""
     name = "the configuration"
     return _validated(override(read(resolved_yaml(config), name), overrides, {}), name)
 

@@ -14,7 +14,7 @@ from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.doctor import camera, disk
 from beamline.doctor.check import Diagnosis, Grade, of_error
-from beamline.doctor.needs import ScanNeeds, needs, ring_bytes
+from beamline.doctor.disk import ScanNeeds, needs, ring_bytes
 from beamline.doctor.ports import port, ports
 from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run

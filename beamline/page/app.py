@@ -12,7 +12,7 @@ import json
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import partial
 from importlib.resources import files
 from typing import Any
@@ -48,17 +48,11 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Access:
-    """Who may do what.
+    """Who may do what."""
 
-    Attributes:
-        hosts: what a browser may call this server, each with the port, as in `localhost:8642`.
-        look: the token for looking.
-        act: the token for verbs to the scan; None: nobody may act from the page.
-    """
-
-    hosts: Sequence[str]
-    look: str = field(default_factory=partial(secrets.token_hex, 16))
-    act: str | None = None
+    hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
+    look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
+    act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
 
 
 class Guard:
@@ -180,8 +174,7 @@ class _Server:
 
         def read() -> Response:
             values, shown, factor = self._reader.do(lambda file: file.picture(frame, region, corrected=corrected))
-            edges = [shown.first_row, shown.last_row, shown.first_col, shown.last_col]
-            return _tile(values, {"frame": frame, "region": edges, "bin": factor})
+            return _tile(values, {"frame": frame, "region": astuple(shown), "bin": factor})
 
         return await self._kept(("frame", frame, region, corrected), read)
 
