@@ -30,24 +30,16 @@ MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not k
 
 @dataclass(frozen=True, eq=False)
 class SampleChange:
-    """The change from the view before.
+    """The change from the view before."""
 
-    Attributes:
-        gain: relative change of the light, of all cells alike.
-        across, down: pixels of the frame by which the sample is displaced to the right, and downwards.
-        turn: excess rotation of the stage, in steps; NaN if nothing turns visibly.
-        residual: float32 [row, col], change of the depth that these do not explain.
-        noise: robust standard deviation of the residual times the square root of the weight, over the lit cells.
-        causes: inputs of the fit, for `beside_columns`.
-    """
-
-    gain: float
+    gain: float  # relative change of the light, of all cells alike
+    # across, down: pixels of the frame by which the sample is displaced to the right, and downwards
     across: float
     down: float
-    turn: float
-    residual: CellValues
-    noise: float
-    causes: Causes | None = None
+    turn: float  # excess rotation of the stage, in steps; NaN if nothing turns visibly
+    residual: CellValues  # float32 [row, col], change of the depth that these do not explain
+    noise: float  # robust standard deviation of the residual times the square root of the weight, over the lit cells
+    causes: Causes | None = None  # inputs of the fit, for `beside_columns`
 
     def beside_columns(self) -> tuple[float, float, float] | None:
         """Across, down and turn by differences between rows; None if the rows are too much alike.
@@ -72,20 +64,14 @@ class SampleChange:
 
 @dataclass(frozen=True, eq=False)
 class Causes:
-    """Inputs of the fit of a view to earlier ones.
+    """Inputs of the fit of a view to earlier ones."""
 
-    Attributes:
-        image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed.
-        weight: float32 [row, col].
-        steps: since the view before.
-        cell: pixels a side.
-    """
-
+    # image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed
     image: CellValues
     turning: CellValues
-    weight: CellValues
-    steps: float
-    cell: int
+    weight: CellValues  # float32 [row, col]
+    steps: float  # since the view before
+    cell: int  # pixels a side
 
     def basis(self) -> CellValues:
         """[cause, row, col]: changes by a pixel across, a pixel down and a turn of a step."""

@@ -53,27 +53,20 @@ FASTEST = 1e3  # cells a view: what moves faster is in one view only
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    """State of the check.
+    """State of the check."""
 
-    Attributes:
-        raw: the last two views.
-        indices: rows in the file of the SPAN views before the last.
-        depths: their line integrals, without zingers and smoothed along the columns; oldest first.
-        filters: for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight
-            `light`.
-        usual: usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely.
-        peaks: of the last views.
-    """
-
-    raw: tuple[CellView, ...] = ()
-    indices: tuple[int, ...] = ()
+    raw: tuple[CellView, ...] = ()  # the last two views
+    indices: tuple[int, ...] = ()  # rows in the file of the SPAN views before the last
+    # their line integrals, without zingers and smoothed along the columns; oldest first
     depths: tuple[CellValues, ...] = ()
+    # for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight `light`
     filters: Filters | None = None
     step: float = math.nan
     rim: float = math.nan
     light: float = 1.0
+    # usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely
     usual: CellValues | None = None
-    peaks: Peaks = field(default_factory=no_peaks)
+    peaks: Peaks = field(default_factory=no_peaks)  # of the last views
 
 
 @dataclass(frozen=True)
@@ -88,8 +81,7 @@ class FloaterCheck:
 
     peak: Annotated[float, Field(ge=0, description="standard deviations of a peak that may be part of a trail")] = 4.5
 
-    def start(self) -> FloaterState:
-        return FloaterState()
+    start = FloaterState
 
     def look(self, state: FloaterState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FloaterState]:
         view, change, grid = context.view, context.change, context.grid
