@@ -16,14 +16,7 @@ from pydantic import ValidationError
 from beamline.config.checks import faults
 from beamline.config.errors import explain
 from beamline.config.models import Config as Config
-from beamline.config.models import (
-    Fields,
-    FileAngles,
-    GoldenAngles,
-    InterlacedAngles,
-    RandomAngles,
-    SectorAngles,
-)
+from beamline.config.models import Fields, FileAngles, GoldenAngles, InterlacedAngles, RandomAngles, SectorAngles
 from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
@@ -67,11 +60,7 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 
 
 def override_of(key: str, value: object) -> str:
-    """The override that sets a key to a plain value, a NumPy scalar or a path.
-
-    Raises:
-        ConfigError: another kind of value.
-    """
+    """The override that sets a key to a plain value, a NumPy scalar or a path. ConfigError: another kind of value."""
     plain = value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
     plain = list(plain) if isinstance(plain, tuple) else plain
     try:

@@ -62,11 +62,7 @@ Sink = Callable[[Event], None]
 
 
 def event_of(values: Mapping[str, Any]) -> Event:
-    """The event of a JSON line of another process.
-
-    Raises:
-        ValueError: no kind of event has these values.
-    """
+    """The event of a JSON line of another process. ValueError: no kind of event has these values."""
     given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
         spread = [item.name for item in fields(each) if item.metadata == _SPREAD]

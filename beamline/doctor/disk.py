@@ -18,7 +18,6 @@ import numpy as np
 from beamline.core.text import size
 from beamline.doctor.check import Diagnosis, Grade
 from beamline.plan.limits import ROOM as MARGIN
-from beamline.plan.plan import Timeline
 from beamline.scan.preflight import DryRun, disk_of
 from beamline.scan.recorder import room as waiting_room
 from drivers.base.clock import Clock
@@ -61,28 +60,20 @@ class ScanNeeds:
         return most
 
 
-def needs(worked: DryRun, ring_bytes: int) -> ScanNeeds:
-    """The needs of a planned scan.
+def needs(worked: DryRun, most_ring: int) -> ScanNeeds:
+    """The needs of a planned scan; `most_ring`: bytes that the camera's ring may take, 0 without one.
 
-    Args:
-        ring_bytes: memory of the camera's ring buffer.
+    The ring holds the longest block, with one slot more than frames and at least 16, like the driver.
     """
     timeline = worked.timeline
+    slots = max(max(block.n for block in timeline.blocks) + 1, 16)
     per_row = timeline.total_bytes // timeline.n_frames
     return ScanNeeds(
         stretches=tuple((block.n * per_row, block.n * block.period) for block in timeline.blocks),
         waiting_bytes=waiting_room(timeline) * timeline.frame_bytes,
-        ring_bytes=ring_bytes,
+        ring_bytes=max(2, min(slots, most_ring // timeline.frame_bytes)) * timeline.frame_bytes if most_ring else 0,
         file_bytes=math.ceil(timeline.total_bytes * MARGIN),
     )
-
-
-def ring_bytes(timeline: Timeline, most: int) -> int:
-    """Memory of the camera's ring buffer for the longest block, at most `most` bytes. One slot more than frames and at
-    least 16, like the driver."""
-    frames = max(block.n for block in timeline.blocks)
-    slots = max(2, min(max(frames + 1, 16), most // timeline.frame_bytes))
-    return slots * timeline.frame_bytes
 
 
 @dataclass(frozen=True)

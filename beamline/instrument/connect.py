@@ -100,11 +100,7 @@ def connect(
 
 @contextmanager
 def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
-    """The configured stage without the rest of the instrument. Nothing moves.
-
-    Raises:
-        DeviceError: it does not answer.
-    """
+    """The configured stage without the rest of the instrument. Nothing moves. DeviceError: it does not answer."""
     if config.simulation is not None:
         with connect(config, clock) as instrument:
             yield instrument.devices.stage

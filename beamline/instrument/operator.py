@@ -17,11 +17,7 @@ _STATE = "What was acquired so far is in the file"
 
 
 def ask_operator(request: str) -> None:
-    """Ask the operator at the terminal, and wait for Enter.
-
-    Raises:
-        DeviceError: there is no terminal, or no confirmation.
-    """
+    """Ask the operator at the terminal, and wait for Enter. DeviceError: there is no terminal, or no confirmation."""
     if not sys.stdin.isatty():
         advice = "Run it in a terminal, or configure a shutter and a sample mover that need no hand"
         raise DeviceError("operator", "there is no terminal to ask at", request=request, advice=advice, state=_STATE)

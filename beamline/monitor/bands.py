@@ -145,8 +145,7 @@ class BandsCheck:
         """Compare the lines of a frame with those before: the profile after it, and (first, after, loss, limit)."""
         lines = np.log(np.maximum(means.astype(np.float64), LEAST_LIGHT))
         if not profile.last or profile.last[-1].shape != lines.shape:
-            known = profile.change is not None and profile.change.shape == lines.shape
-            if known:
+            if profile.change is not None and profile.change.shape == lines.shape:
                 return Profile((lines,), profile.change, profile.seen + 1, blocks), None
             return Profile((lines,), np.zeros_like(lines), 1, blocks), None
         if profile.flagged:

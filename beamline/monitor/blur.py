@@ -116,11 +116,8 @@ class BlurCheck:
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
-    """Fine contrast over coarse, along the rows and along the columns; NaN where there is none.
-
-    Args:
-        lines: counts [line, col], STRIP neighbouring rows of the frame each, as `dark` and `flat`.
-    """
+    """Fine contrast over coarse, along the rows and along the columns; NaN where there is none. `lines`: counts [line,
+    col], STRIP neighbouring rows of the frame each, as `dark` and `flat`."""
     low = np.zeros_like(lines, np.float32) if dark is None else dark
     if flat is None:
         scale = np.full_like(low, 1 / max(float(lines.mean(dtype=np.float64)), 1e-9))

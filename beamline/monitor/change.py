@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,11 +89,12 @@ def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> Sam
     # A gain that has changed is no velocity.
     gained = np.float32(sum(one.brighter for one in last[1:]))
     weight = np.minimum(view.weight, last[-1].weight)
-    fit = _fit(view.depth, last[-1].depth, last[-2].depth, last[0].depth - gained, weight, steps)
-    gain, across, down, turn = fit.solution.tolist()
+    (gain, across, down, turn), residual, noise, image, turning = _fit(
+        view.depth, last[-1].depth, last[-2].depth, last[0].depth - gained, weight, steps
+    )
     across, down, turn = across * grid.cell, down * grid.cell, turn / float(steps)
-    causes = Causes(fit.image, fit.turning, weight, float(steps), grid.cell)
-    return SampleChange(math.expm1(-gain), across, down, turn, fit.residual, fit.noise, causes)
+    causes = Causes(image, turning, weight, float(steps), grid.cell)
+    return SampleChange(math.expm1(-gain), across, down, turn, residual, noise, causes)
 
 
 def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
@@ -199,18 +199,13 @@ def _take_off(change, smooth, image, turning, weight, solution, residual, left_o
             left_over[row, col] = smooth[row, col] - explained
 
 
-class _Fit(NamedTuple):
-    """The best fit of the change: minus gain, across, down in cells, turn in steps; and its residual."""
-
-    solution: NDArray[np.float64]
-    residual: CellValues
-    noise: float
-    image: CellValues
-    turning: CellValues
-
-
-def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, weight: CellValues, steps: float) -> _Fit:
+def _fit(
+    now: CellValues, one: CellValues, two: CellValues, four: CellValues, weight: CellValues, steps: float
+) -> tuple[list[float], CellValues, float, CellValues, CellValues]:
     """The causes of the change from `one`, the view before; `two` and `four` are those before that.
+
+    Returns the solution (minus gain; across and down in cells; turn in steps), the residual and its noise, and the
+    `image` and `turning` of `Causes`.
 
     The median and the solution are numpy's: numba's take ten seconds to compile, in a machine's first scan.
     """
@@ -235,4 +230,4 @@ def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, we
         if robust == 0:
             share = _shares(left_over, 0.0, weight)
     _, noise = _deviation(residual, 0.0, weight)
-    return _Fit(solution, residual, noise or 0.0, image, turning)
+    return solution.tolist(), residual, noise or 0.0, image, turning

@@ -28,12 +28,7 @@ LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
 LATER = LAGS[-1]  # views after the one that is judged
 SPAN = LATER - LAGS[0] + 1
 SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
-SPEEDS = (
-    1.4,
-    2.0,
-    3.0,
-    4.5,
-)  # of the sample's fastest point; faster ones are in only one view of the window
+SPEEDS = (1.4, 2.0, 3.0, 4.5)  # of the sample's fastest point; faster ones are in only one view of the window
 STRUCTURE, COMMON = 1.0, 0.02**2  # line integrals of about 1; a beam that changes by 2 %
 WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
 MARGIN = 1.15  # the axis may be off the middle, and the sample a little wider than the field

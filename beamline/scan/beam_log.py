@@ -31,11 +31,7 @@ class BeamLog:
     """
 
     def __init__(
-        self,
-        monitor: BeamMonitor | None,
-        period: float,
-        sink: Sink,
-        react: Callable[[BeamReading], None] | None = None,
+        self, monitor: BeamMonitor | None, period: float, sink: Sink, react: Callable[[BeamReading], None] | None = None
     ) -> None:
         self._monitor, self._period, self._sink, self._react = monitor, period, sink, react
         self._readings: list[BeamReading] = []

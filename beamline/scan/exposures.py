@@ -86,13 +86,13 @@ class _Pass:
     seconds: float
     told: float = math.inf
     paused: bool = False
-    braking: Braking | None = None
+    braking: Braking = NOT_BRAKING
     waiting: list[CameraFrame] = field(default_factory=list)
 
     @property
     def so_far(self) -> Ledger:
         """The settled ledger, as if no further frame came."""
-        return booked(self.ledger, self._braking, self._exposed, by_nothing)
+        return booked(self.ledger, self.braking, self._exposed, by_nothing)
 
     @property
     def last_due(self) -> float:
@@ -109,11 +109,12 @@ class _Pass:
             last: no further frame will come, so none waits.
         """
         self.waiting += frames
-        if self.braking is not None and not last:
+        brakes = self.braking is not NOT_BRAKING
+        if brakes and not last:
             return
-        way = by_nothing if self.braking is None else placing(self.ledger, self.braking, self._exposed)
+        way = placing(self.ledger, self.braking, self._exposed) if brakes else by_nothing
         while self.waiting:
-            exposed = [way(self.ledger, self._braking, frame) for frame in self._exposed]
+            exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
             if (entered := enter(self.ledger, exposed, last)) is None:
                 return
             self.ledger, entry = entered
@@ -123,10 +124,6 @@ class _Pass:
     @property
     def _exposed(self) -> list[DeliveredFrame]:
         return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]
-
-    @property
-    def _braking(self) -> Braking:
-        return self.braking or NOT_BRAKING
 
 
 class Exposures:
@@ -389,11 +386,7 @@ class Exposures:
         return True
 
     def stand(self) -> None:
-        """Slow down and wait until the stage stands.
-
-        Raises:
-            InstrumentError: it does not stand.
-        """
+        """Slow down and wait until the stage stands. InstrumentError: it does not stand."""
         limits = self._stage.limits
         deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
         self._stage.stop()

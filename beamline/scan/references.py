@@ -60,10 +60,7 @@ class ReferenceLog:
 
     def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the views, because a pixel of the open beam has few photons; or None.
-
-        Args:
-            exposure: s, of the views.
-        """
+        `exposure`: s, of the views."""
         judged = judge(self._groups, limits, self._views)
         good = [group for group, found in zip(self._groups, judged, strict=True) if not found.faults]
         flats, darks = (

@@ -207,7 +207,9 @@ class _Run:
     def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         path = self.folder / SCAN
         command = None if live is None else live(path, self.folder / RECON)
-        self.sink(self._begun(path))
+        timeline = self.ready.timeline
+        planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
+        self.sink(RunStarted(self.folder, path, self.config.sample.name, *planned))
         self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
@@ -395,11 +397,6 @@ class _Run:
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
-
-    def _begun(self, path: Path) -> RunStarted:
-        timeline = self.ready.timeline
-        planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
-        return RunStarted(self.folder, path, self.config.sample.name, *planned)
 
 
 def _wait_in_pause(recorder: Recorder) -> bool:

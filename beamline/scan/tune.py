@@ -221,11 +221,7 @@ def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
 
 
 def _accepted(instrument: ConnectedDevices, config: Config, exposure: float) -> list[float]:
-    """The exposures that the camera takes, the longest first.
-
-    Raises:
-        DeviceRefused: it takes none.
-    """
+    """The exposures that the camera takes, the longest first. DeviceRefused: it takes none."""
     camera = instrument.devices.camera
     taken: list[float] = []
     for share in SHORTER:

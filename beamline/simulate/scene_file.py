@@ -29,11 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """A scene and its file.
-
-    Attributes:
-        text: of the file, with overridden values, for the record.
-    """
+    """A scene and its file. `text`: of the file, with overridden values, for the record."""
 
     scene: Scene
     path: Path
