@@ -12,11 +12,7 @@ from drivers.base.protocols import CameraSettings, TriggerSource
 
 
 def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Key path and sentence of each fault.
-
-    Args:
-        shipped: the folder of the configurations that come with the package.
-    """
+    """Key path and sentence of each fault; `shipped`: folder of the configurations that come with the package."""
     yield from _files(config, shipped)
     yield from _camera(config)
     yield from _triggers(config)
@@ -43,7 +39,7 @@ _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigg
 
 
 def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Faults by which a fly scan would not have one frame a pulse, with the planned exposure."""
+    """Camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
     camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
     if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
         return

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-    create_model,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, create_model, model_validator
 
 from beamline.config.declared import declared, read_from
 from beamline.config.section import Section
@@ -146,27 +139,25 @@ class StageOutputShutter(Section):
     """How long the blade travels."""
 
 
-def _finds_a_number(pattern: str) -> str:
-    if problem := pattern_problem(pattern):
-        raise ValueError(problem)
-    return pattern
+def _without(problem_of: Callable[[str], str]) -> AfterValidator:
+    """Refuses a text that has a problem."""
+
+    def checked(text: str) -> str:
+        if problem := problem_of(text):
+            raise ValueError(problem)
+        return text
+
+    return AfterValidator(checked)
 
 
-def _is_a_page(url: str) -> str:
-    if problem := url_problem(url):
-        raise ValueError(problem)
-    return url
-
-
-Pattern = Annotated[str, AfterValidator(_finds_a_number)]
-PositiveScale = Annotated[float, Field(gt=0)]
+Pattern = Annotated[str, _without(pattern_problem)]
 
 
 class _BeamMonitor(Section):
     """What every beam monitor has."""
 
     unit: str
-    scale: PositiveScale = 1.0
+    scale: PositiveFloat = 1.0
     """What the number is multiplied by to be in `unit`."""
     timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 2.0
     period_s: Annotated[float, Field(gt=0, le=1e6)] = 1.0
@@ -222,7 +213,7 @@ class RingCurrentConfig(_BeamMonitor):
     """The ring current from a page or a text file."""
 
     kind: Literal["ring_current"]
-    url: Annotated[str, AfterValidator(_is_a_page)]
+    url: Annotated[str, _without(url_problem)]
     """http://..., https://... or file:///..."""
     pattern: Pattern
     """Regular expression whose first group is the number."""

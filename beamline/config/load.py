@@ -15,34 +15,15 @@ from pydantic import ValidationError
 
 from beamline.config.checks import faults
 from beamline.config.errors import explain
-from beamline.config.models import (
-    Config,
-    Fields,
-    FileAngles,
-    GoldenAngles,
-    InterlacedAngles,
-    RandomAngles,
-    SectorAngles,
-)
+from beamline.config.models import Config as Config
+from beamline.config.models import Fields, FileAngles, GoldenAngles, InterlacedAngles, RandomAngles, SectorAngles
 from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
-from beamline.core.shipped import config_folder
+from beamline.core.shipped import config_folder as config_folder
 from beamline.core.version import version
 from beamline.plan import angles
 from beamline.plan.plan import FieldPlan, ScanPlan
-
-__all__ = [
-    "Config",
-    "changed",
-    "config_folder",
-    "load",
-    "override_of",
-    "plan_of",
-    "resolved_yaml",
-    "scene_mapping",
-    "schema",
-]
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:
@@ -73,21 +54,13 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
 
 
 def changed(config: Config, overrides: Iterable[str]) -> Config:
-    """The configuration with other values; neither its file nor the environment is looked at again.
-
-    Raises:
-        ConfigError: as `load`.
-    """
+    """The configuration with other values, without its file and the environment. ConfigError as `load`."""
     name = "the configuration"
     return _validated(override(read(resolved_yaml(config), name), overrides, {}), name)
 
 
 def override_of(key: str, value: object) -> str:
-    """The override that sets a key to a plain value, a NumPy scalar or a path.
-
-    Raises:
-        ConfigError: another kind of value.
-    """
+    """The override that sets a key to a plain value, a NumPy scalar or a path. ConfigError: another kind of value."""
     plain = value.item() if isinstance(value, np.generic) else str(value) if isinstance(value, Path) else value
     plain = list(plain) if isinstance(plain, tuple) else plain
     try:

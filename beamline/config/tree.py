@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,9 +82,8 @@ def _walk(node: yaml.Node, path: KeyPath, name: str, origins: dict[KeyPath, str]
     if isinstance(node, yaml.ScalarNode):
         if "\0" in node.value:
             raise ConfigError(f"{name}:{_line(node)}: a text holds a NUL character. Nothing was started.")
-        if (
-            node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS
-        ):  # Python neither reads nor writes very long numbers
+        # Python neither reads nor writes very long numbers.
+        if node.tag.endswith(":int") and len(node.value) > _MOST_DIGITS:
             raise ConfigError(f"{name}:{_line(node)}: a number has {len(node.value)} digits. Nothing was started.")
     if isinstance(node, yaml.SequenceNode):
         for index, child in enumerate(node.value):
@@ -121,16 +121,12 @@ def override(tree: Tree, overrides: Iterable[str], environment: Mapping[str, str
         if not equals or not key.strip():
             raise ConfigError(f"--set {word}: expected section.key=value, such as --set scan.period_s=0.2")
         changes.append((key.strip().split("."), value, f"--set {word}"))
-    data, origins = _copy(tree.data), dict(tree.origins)
+    data, origins = deepcopy(tree.data), dict(tree.origins)
     for keys, text, origin in changes:
-        _put(data, keys, _value(text, origin))
+        _put(data, keys, _parsed(text, origin)[0])
         path = tuple(keys)
         origins = {known: said for known, said in origins.items() if known[: len(path)] != path} | {path: origin}
     return Tree(data, origins)
-
-
-def _value(text: str, origin: str) -> Any:
-    return _parsed(text, origin)[0]
 
 
 def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:
@@ -139,9 +135,3 @@ def _put(data: dict[str, Any], keys: list[str], value: Any) -> None:
             data[key] = {}
         data = data[key]
     data[keys[-1]] = value
-
-
-def _copy(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _copy(child) for key, child in value.items()}
-    return value

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, dataclass_transform
 import numpy as np
 
 KINDS: dict[str, list[type[Event]]] = {}
-"""The classes of each kind; each class below enters itself. Forms of one kind are told apart by their fields."""
+"""The classes of each kind, filled as they are defined. Classes of one kind differ in their fields."""
 _SPREAD = {"spread": True}  # of a field whose own values stand in the line, a mapping or a dataclass
 
 
@@ -62,11 +62,7 @@ Sink = Callable[[Event], None]
 
 
 def event_of(values: Mapping[str, Any]) -> Event:
-    """The event of a JSON line of another process.
-
-    Raises:
-        ValueError: no kind of event has these values.
-    """
+    """The event of a JSON line of another process. ValueError: no kind of event has these values."""
     given = {name: value for name, value in values.items() if name != "event"}
     for each in KINDS.get(str(values.get("event")), ()):
         spread = [item.name for item in fields(each) if item.metadata == _SPREAD]

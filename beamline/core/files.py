@@ -8,7 +8,6 @@ import os
 import platform
 import shutil
 import stat
-import sys
 import uuid
 import zlib
 from collections.abc import Iterator
@@ -72,11 +71,7 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
 
 
 def text_in(path: Path, largest: int = TEXT, encoding: str = "utf-8") -> str:
-    """The content of a text file of so many bytes at most.
-
-    Raises:
-        OSError: as `require_regular`, or it cannot be read. UnicodeDecodeError: it is not text of this encoding.
-    """
+    """The content of a text file of so many bytes at most. OSError as `require_regular`; UnicodeDecodeError."""
     require_regular(path, largest)
     return path.read_text(encoding=encoding)
 
@@ -93,34 +88,17 @@ def refuse_existing(path: Path) -> None:
 
 @contextmanager
 def named_on_failure(path: Path) -> Iterator[None]:
-    """An OSError while the block writes `path` becomes a DataError with the path, which the system leaves out.
-
-    Raises:
-        DataError: instead of OSError.
-    """
+    """An OSError while the block writes `path` becomes a DataError with the path, which the system leaves out."""
     try:
         yield
     except OSError as error:
         raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
 
 
-if sys.platform == "darwin":
-    import fcntl
-
-    def _fsync(handle: int) -> None:
-        os.fsync(handle)  # fsync on macOS does not wait for the disk's own cache
-        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
-
-else:
-
-    def _fsync(handle: int) -> None:
-        os.fsync(handle)
-
-
 def to_disk(handle: int) -> None:
     """Wait until all data written to an open file are on the disk. OSError if the disk did not take them."""
     try:
-        _fsync(handle)
+        os.fsync(handle)
     except OSError as error:
         if error.errno not in _NO_SUCH_CALL:
             raise
@@ -189,11 +167,7 @@ def _remove_left(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
-    """Write a file from memory as `whole_file` does, read it back and compare.
-
-    Raises:
-        DataError: as `whole_file`, or the disk holds something else.
-    """
+    """Write a file from memory as `whole_file` does, and compare what is read back. DataError if it is not the same."""
     data = content.encode() if isinstance(content, str) else content
     with whole_file(path, replace=replace) as partial:
         partial.write_bytes(data)

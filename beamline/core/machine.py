@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 import sys
@@ -11,6 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import psutil
+
+from beamline.core.text import count
 
 _CPUINFO, _STATUS, _CLEAR = Path("/proc/cpuinfo"), Path("/proc/self/status"), Path("/proc/self/clear_refs")
 _CGROUPS, _OWN_CGROUP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -40,15 +41,13 @@ def machine_line(found: dict[str, str | int] | None = None) -> str:
     """`machine()` as one line of text: a time means nothing without it."""
     m = found or machine()
     return (
-        f"{m['processor']}, {_counted(m['cores'], 'core')}, {_counted(m['threads'], 'thread')}, {m['system']}, "
+        f"{m['processor']}, {count(int(m['cores']), 'core')}, {count(int(m['threads']), 'thread')}, {m['system']}, "
         f"Python {m['python']}, torch {m['torch']}, numba {m['numba']}"
     )
 
 
 def usable_cores() -> int:
-    """Cores that this process may use, if the system tells; otherwise all cores."""
-    if sys.platform == "darwin":  # has no affinity
-        return os.cpu_count() or 1
+    """Cores that this process may use."""
     return len(psutil.Process().cpu_affinity())
 
 
@@ -63,20 +62,14 @@ def peak_memory() -> int | None:
         return int(psutil.Process().memory_info().peak_wset)
     if _STATUS.is_file():
         # Linux lets a new process inherit ru_maxrss of the one that started it; VmHWM is its own.
-        return _high_water(_STATUS.read_text(encoding="ascii", errors="replace"))
-    import resource
-
-    return int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)  # macOS: bytes
+        return _entry(_STATUS, "VmHWM:") * 1024 or None
+    return None
 
 
 def reset_peak_memory() -> None:
     """Let `peak_memory` start again, if the system can (Linux); otherwise do nothing."""
     with suppress(OSError):
         _CLEAR.write_text("5", encoding="ascii")  # proc_pid_clear_refs(5): reset the peak resident set size
-
-
-def _counted(n: str | int, word: str) -> str:
-    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 def _processor() -> str:
@@ -86,14 +79,6 @@ def _processor() -> str:
             if name.strip() == "model name":
                 return value.strip()
     return platform.processor() or platform.machine() or "unknown processor"
-
-
-def _high_water(status: str) -> int | None:
-    for line in status.splitlines():
-        name, _, value = line.partition(":")
-        if name == "VmHWM" and value.split()[1:] == ["kB"]:
-            return int(value.split()[0]) * 1024
-    return None
 
 
 def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
@@ -116,9 +101,9 @@ def _left_in_cgroups(root: Path, own: Path) -> Iterator[int]:
 
 
 def _entry(stat: Path, wanted: str) -> int:
-    """The value of a line "name value" of a file; 0 without such a line."""
-    for line in stat.read_text("ascii").splitlines():
-        name, _, value = line.partition(" ")
-        if name == wanted:
-            return int(value)
+    """The number after this name in a file; 0 without such a line."""
+    for line in stat.read_text("ascii", "replace").splitlines():
+        words = line.split()
+        if words[:1] == [wanted]:
+            return int(words[1])
     return 0

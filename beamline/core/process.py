@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum, auto
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TextIO
 
 import psutil
@@ -89,9 +88,7 @@ class ChildProcess:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.end()
 
     @property
@@ -138,7 +135,7 @@ class ChildProcess:
                 continue
             self._end(grace, hurry)
         self._reader.join()
-        self._close_stdin()
+        self.let_go()
         return ending
 
     def tell(self, line: str) -> None:
@@ -153,16 +150,12 @@ class ChildProcess:
         with suppress(OSError, ValueError):  # it has ended
             os.write(self._process.stdin.fileno(), b".")
 
-    def let_go(self) -> None:
-        """Close the stdin of a tethered process, as our end would."""
-        self._close_stdin()
-
     def end(self, grace: float = 0.0) -> None:
         """End the process if it still runs: it has `grace` real s before it is killed."""
         if self.running:
             self._end(grace, lambda: False)
             self._reader.join(_LAST_LINES)
-        self._close_stdin()
+        self.let_go()
 
     def _end(self, grace: float, hurry: Callable[[], bool]) -> None:
         if grace > 0:
@@ -175,7 +168,8 @@ class ChildProcess:
         self._process.kill()
         self._process.wait()
 
-    def _close_stdin(self) -> None:
+    def let_go(self) -> None:
+        """Close the stdin of a tethered process, as our end would."""
         if self._process.stdin is not None:
             with suppress(OSError):  # a line that the process did not take
                 self._process.stdin.close()

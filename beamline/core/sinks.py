@@ -6,7 +6,6 @@ import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from queue import SimpleQueue
-from types import TracebackType
 from typing import Self, TextIO
 
 from beamline.core.events import Event, Sink, Warned
@@ -84,9 +83,7 @@ class Announcer:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._queue.put(None)
         self._thread.join(_PATIENCE)
 

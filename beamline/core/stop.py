@@ -89,9 +89,6 @@ class PauseRequest:
             self._unlit_since = min(self._unlit_since, since)
         self.hold(Cause.BEAM, reason)
 
-    def beam_back(self) -> None:
-        self.release(Cause.BEAM)
-
     def hold(self, by: Cause, reason: str) -> None:
         """Pause until the same cause is released."""
         self._held_by[by] = reason
@@ -114,49 +111,41 @@ class StopRequest:
 
     Args:
         now: a clock in real s.
+
+    Attributes, only for reading:
+        stopping: a stop or an abort was requested.
+        aborting: an abort was.
+        reason: of the first stop, or of the last abort.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self._stop = self._abort = self._enough = False
-        self._reason, self._now, self._requested_at = "", now, 0.0
+        self.stopping = self.aborting = self._enough = False
+        self.reason, self._now, self._requested_at = "", now, 0.0
 
     def stop(self, reason: str = "the operator asked for it") -> None:
         """End cleanly: pending frames and missing references are still acquired, the stage returns."""
-        self._reason = self._reason or reason
+        self.reason = self.reason or reason
         self._requested_at = self._requested_at or self._now()
-        self._stop = True
+        self.stopping = True
 
     def stop_as_enough(self, reason: str) -> None:
         """As `stop`, but without hurry: the frames so far serve their purpose."""
-        self._enough = not self._stop
+        self._enough = not self.stopping
         self.stop(reason)
 
     def abort(self, reason: str = "the operator aborted it") -> None:
         """End at once: the stage stops, the shutter closes, no further frame is acquired."""
-        self._reason = reason
+        self.reason = reason
         self._requested_at = self._requested_at or self._now()
-        self._abort = True
-        self._stop = True
-
-    @property
-    def stopping(self) -> bool:
-        """A stop or an abort was requested."""
-        return self._stop
+        self.aborting = True
+        self.stopping = True
 
     @property
     def enough(self) -> bool:
         """Whether it is stopped only by `stop_as_enough`."""
-        return self._enough and not self._abort
+        return self._enough and not self.aborting
 
     @property
     def seconds(self) -> float:
         """Real s since the first request; 0 without one."""
-        return self._now() - self._requested_at if self._stop else 0.0
-
-    @property
-    def aborting(self) -> bool:
-        return self._abort
-
-    @property
-    def reason(self) -> str:
-        return self._reason
+        return self._now() - self._requested_at if self.stopping else 0.0

@@ -19,6 +19,14 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes:.3g} TB"
 
 
+def rounded(value: float, *, up: bool = False) -> float:
+    """A positive value to three digits, down (or up), so that an advised limit holds; other values as they are."""
+    if not 0 < value < math.inf:
+        return value
+    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return (math.ceil(value / unit - 1e-9) if up else math.floor(value / unit + 1e-9)) * unit
+
+
 def printable(text: str) -> str:
     """The text for a terminal: control characters become `\\x1b`, except line ends and tabs, so that none acts."""
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)

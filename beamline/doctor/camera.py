@@ -10,6 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from beamline.config.devices import DcamOrca
 from beamline.doctor.check import Diagnosis, Grade, of_error
 from drivers import usb
@@ -26,6 +28,11 @@ _LINK_ADVICE = {
     "`lsusb -d 0661:` lists it, on Windows the Device Manager",
     usb.Verdict.AMBIGUOUS: "Set devices.camera.usb_product or usb_serial to the ids listed here",
 }
+_NO_LIBUSB = (
+    "Put libusb-1.0.dll (libusb.info) in a folder of the PATH"
+    if sys.platform == "win32"
+    else "Install libusb 1.0 (Debian and Ubuntu: apt install libusb-1.0-0)"
+)
 _VERDICTS = {
     usb.Verdict.READY: Grade.OK,
     usb.Verdict.SLOW: Grade.FAILED,  # the plan assumes the fast link: frames would be lost
@@ -51,14 +58,9 @@ def link(camera: DcamOrca | None, backend: Any = None) -> Diagnosis:
     verdict = _VERDICTS[found.verdict]
     if verdict is Grade.FAILED and camera is None:
         verdict = Grade.WARNING
-    return Diagnosis(
-        LINK,
-        verdict,
-        found.message,
-        _SUPERSPEED,
-        _LINK_ADVICE.get(found.verdict, "" if verdict is Grade.OK else _no_libusb()),
-        {"devices": [vars(device) for device in found.devices]},
-    )
+    otherwise = "" if verdict is Grade.OK else f"{_NO_LIBUSB}; the camera itself does not need it"
+    values = {"devices": [vars(device) for device in found.devices]}
+    return Diagnosis(LINK, verdict, found.message, _SUPERSPEED, _LINK_ADVICE.get(found.verdict, otherwise), values)
 
 
 def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
@@ -88,14 +90,9 @@ def library(camera: DcamOrca | None, session: bool = False) -> Diagnosis:
     values["cameras"] = cameras
     listed = "; ".join(", ".join(f"{name} {text}" for name, text in one.items()) for one in cameras)
     if index >= len(cameras):
-        return Diagnosis(
-            LIBRARY,
-            Grade.FAILED,
-            f"{found} {len(cameras)} cameras: {listed}.",
-            f"a camera of index {index}",
-            "Set devices.camera.index to one of these cameras",
-            values,
-        )
+        found, expected = f"{found} {len(cameras)} cameras: {listed}.", f"a camera of index {index}"
+        advice = "Set devices.camera.index to one of these cameras"
+        return Diagnosis(LIBRARY, Grade.FAILED, found, expected, advice, values)
     return Diagnosis(LIBRARY, Grade.OK, f"{found} {listed}.", expected, values=values)
 
 
@@ -124,29 +121,13 @@ def _cameras(dcam: Dcam) -> list[dict[str, str]]:
             dcam.api_uninit()
 
 
-def _no_libusb() -> str:
-    where = {
-        "win32": "Put libusb-1.0.dll (libusb.info) in a folder of the PATH",
-        "darwin": "Install libusb (brew install libusb)",
-    }.get(sys.platform, "Install libusb 1.0 (Debian and Ubuntu: apt install libusb-1.0-0)")
-    return f"{where}; the camera itself does not need it"
-
-
 def _loaded_file(path: Path | None) -> Path | None:
     """The file of the library that this process has loaded; None if the system does not report it."""
     if path is not None:
         return path.resolve()
-    if sys.platform == "win32":
-        buffer = ctypes.create_unicode_buffer(1024)
-        kernel = ctypes.WinDLL("kernel32")
-        kernel.GetModuleHandleW.restype = ctypes.c_void_p
-        kernel.GetModuleFileNameW.argtypes = (ctypes.c_void_p, ctypes.c_wchar_p, ctypes.c_uint32)
-        size = kernel.GetModuleFileNameW(kernel.GetModuleHandleW("dcamapi.dll"), buffer, len(buffer))
-        return Path(buffer.value) if size else None
-    with suppress(OSError):
-        for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
-            if "/libdcamapi." in line:
-                return Path(line[line.index("/") :])
+    with suppress(OSError, psutil.Error):
+        loaded = (Path(file.path) for file in psutil.Process().memory_maps())
+        return next((file for file in loaded if file.name.lower().startswith(("libdcamapi.", "dcamapi.dll"))), None)
     return None
 
 

@@ -1,21 +1,25 @@
-"""Doctor on the disk: measured write speed and free space against the needs of a scan."""
+"""Doctor on the disk: what a planned scan needs, and the measured write speed and free space against it."""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import shutil
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 import numpy as np
 
 from beamline.core.text import size
 from beamline.doctor.check import Diagnosis, Grade
-from beamline.doctor.needs import ScanNeeds
-from beamline.scan.preflight import free_bytes
+from beamline.plan.limits import ROOM as MARGIN
+from beamline.scan.preflight import DryRun, disk_of
+from beamline.scan.recorder import room as waiting_room
 from drivers.base.clock import Clock
 
 SECONDS, MOST = 3.0, 4 << 30
@@ -30,6 +34,49 @@ SPEED, ROOM = "disk speed", "disk space"
 
 
 @dataclass(frozen=True)
+class ScanNeeds:
+    """The disk and memory that a scan needs."""
+
+    stretches: tuple[tuple[int, float], ...]  # (bytes to write, duration in s) of each block
+    waiting_bytes: int  # memory for frames that wait for the disk
+    ring_bytes: int  # memory of the camera's ring; 0 for a simulated one
+    file_bytes: int  # size of the file and the margin that a scan needs beside it
+
+    @property
+    def rate(self) -> float:
+        """Bytes/s at the highest frame rate."""
+        return max(n_bytes / seconds for n_bytes, seconds in self.stretches)
+
+    @property
+    def memory(self) -> int:
+        return self.waiting_bytes + self.ring_bytes
+
+    def backlog(self, rate: float) -> float:
+        """The largest number of bytes that wait for a disk of `rate` bytes/s."""
+        most = waiting = 0.0
+        for n_bytes, seconds in self.stretches:
+            waiting = max(waiting + n_bytes - rate * seconds, 0.0)
+            most = max(most, waiting)
+        return most
+
+
+def needs(worked: DryRun, most_ring: int) -> ScanNeeds:
+    """The needs of a planned scan; `most_ring`: bytes that the camera's ring may take, 0 without one.
+
+    The ring holds the longest block, with one slot more than frames and at least 16, like the driver.
+    """
+    timeline = worked.timeline
+    slots = max(max(block.n for block in timeline.blocks) + 1, 16)
+    per_row = timeline.total_bytes // timeline.n_frames
+    return ScanNeeds(
+        stretches=tuple((block.n * per_row, block.n * block.period) for block in timeline.blocks),
+        waiting_bytes=waiting_room(timeline) * timeline.frame_bytes,
+        ring_bytes=max(2, min(slots, most_ring // timeline.frame_bytes)) * timeline.frame_bytes if most_ring else 0,
+        file_bytes=math.ceil(timeline.total_bytes * MARGIN),
+    )
+
+
+@dataclass(frozen=True)
 class Measured:
     """Bytes written, and the s until they were on the disk."""
 
@@ -41,10 +88,8 @@ class Measured:
         return self.n_bytes / max(self.seconds, 1e-9)  # a clock may be coarse
 
 
-class Opens(Protocol):
-    """Opens a new file in a folder; the file is removed when it is closed or the process ends."""
-
-    def __call__(self, folder: Path) -> IO[bytes]: ...
+Opens = Callable[[Path], IO[bytes]]
+"""Opens a new file in a folder; the file is removed when it is closed or the process ends."""
 
 
 def temporary(folder: Path) -> IO[bytes]:
@@ -76,46 +121,41 @@ def measure(
 def speed(folder: Path, needs: ScanNeeds | None, clock: Clock, opens: Opens = temporary) -> Diagnosis:
     """Write speed of the disk that holds `folder`, or will hold it, against the rate of the frames."""
     expected = "" if needs is None else f"{size(needs.rate)}/s, with previews, at the highest frame rate"
-    there = existing(folder)
+    there, said = disk_of(folder), partial(Diagnosis, SPEED, expected=expected)
     # The file is temporary, but must not fill the disk even for a moment.
     most = min(MOST, shutil.disk_usage(there).free // 4)
     if most < LEAST:
-        return Diagnosis(SPEED, Grade.CANNOT_CHECK, f"{there} has too little free space for a measurement.", expected)
+        return said(Grade.CANNOT_CHECK, f"{there} has too little free space for a measurement.")
     try:
         measured = measure(there, clock, opens, most)
     except OSError as error:
         if error.errno == errno.EINVAL:  # a file system without fsync
-            return Diagnosis(
-                SPEED, Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.", expected
-            )
-        return Diagnosis(
-            SPEED,
-            Grade.FAILED,
-            f"{there} cannot be written to ({error.strerror or error}).",
-            expected or "a folder in which files can be created",
-            "Choose another storage.folder, or correct its permissions or its disk",
-        )
+            return said(Grade.CANNOT_CHECK, f"{there} does not report when bytes are on the disk.")
+        expected = expected or "a folder in which files can be created"
+        advice = "Choose another storage.folder, or correct its permissions or its disk"
+        found = f"{there} cannot be written to ({error.strerror or error})."
+        return Diagnosis(SPEED, Grade.FAILED, found, expected, advice)
     rate = measured.rate
     found = f"{size(rate)}/s at {there} ({size(measured.n_bytes)} in {measured.seconds:.1f} s, synchronised)."
     values = {"bytes_per_s": rate, "written": measured.n_bytes, "seconds": measured.seconds}
     if needs is None:
-        return Diagnosis(SPEED, Grade.OK, found, values=values)
-    backlog = needs.backlog(rate)
+        return said(Grade.OK, found, values=values)
+    backlog, there_is_room = needs.backlog(rate), f"in memory, which has room for {size(needs.waiting_bytes)}."
     values |= {"needed_bytes_per_s": needs.rate, "backlog": backlog, "waiting_bytes": needs.waiting_bytes}
     if rate >= COMFORT * needs.rate:
-        return Diagnosis(SPEED, Grade.OK, found, expected, values=values)
+        return said(Grade.OK, found, values=values)
     if backlog <= needs.waiting_bytes / 2:
-        found += f" At most {size(backlog)} will wait in memory, which has room for {size(needs.waiting_bytes)}."
+        found += f" At most {size(backlog)} will wait {there_is_room}"
         advice = "Let no other program write to this disk during the scan, or choose a faster disk"
-        return Diagnosis(SPEED, Grade.WARNING, found, expected, advice, values)
-    found += f" {size(backlog)} would have to wait in memory, which has room for {size(needs.waiting_bytes)}."
+        return said(Grade.WARNING, found, advice=advice, values=values)
+    found += f" {size(backlog)} would have to wait {there_is_room}"
     advice = "Choose a storage.folder on a faster disk, or a longer period, a smaller roi or binning"
-    return Diagnosis(SPEED, Grade.FAILED, found, expected, advice, values)
+    return said(Grade.FAILED, found, advice=advice, values=values)
 
 
 def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:
     """Free space against the size of the file."""
-    free = free_bytes(folder)
+    free = shutil.disk_usage(disk_of(folder)).free
     found, values = f"{size(free)} free for {folder.absolute()}.", {"free_bytes": free}
     if needs is None:
         return Diagnosis(ROOM, Grade.OK, found, values=values)
@@ -127,9 +167,3 @@ def room(folder: Path, needs: ScanNeeds | None) -> Diagnosis:
     if free < 2 * needs.file_bytes:
         return Diagnosis(ROOM, Grade.WARNING, found, expected, "Free some space before the next scan", values)
     return Diagnosis(ROOM, Grade.OK, found, expected, values=values)
-
-
-def existing(folder: Path) -> Path:
-    """The folder, or its nearest parent that exists: a scan creates the folder, the doctor does not."""
-    folder = folder.absolute()
-    return next((place for place in (folder, *folder.parents) if place.is_dir()), folder)

@@ -14,7 +14,7 @@ from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.doctor import camera, disk
 from beamline.doctor.check import Diagnosis, Grade, of_error
-from beamline.doctor.needs import ScanNeeds, needs, ring_bytes
+from beamline.doctor.disk import ScanNeeds, needs
 from beamline.doctor.ports import port, ports
 from beamline.instrument.beam_monitors import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run
@@ -37,11 +37,11 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     Raises:
         ConfigError: an impossible plan, scene or device setting. Violated limits are reported by `beamline check`.
     """
-    worked = None if config is None else dry_run(config)
-    need = None if config is None or worked is None else _needs(config, worked)
-    if worked is not None:
+    cam, need = None, None
+    if config is not None:
+        worked, cam = dry_run(config), config.devices.camera
+        need = needs(worked, cam.ring_mb * 1_000_000 if isinstance(cam, DcamOrca) else 0)
         yield frame_rate(worked)
-    cam = None if config is None else config.devices.camera
     if cam is None or isinstance(cam, DcamOrca):
         yield camera.link(cam, usb)
         yield camera.library(cam, session)
@@ -80,12 +80,6 @@ def frame_rate(worked: DryRun) -> Diagnosis:
     return Diagnosis(_RATE, Grade.FAILED, found, expected, "`beamline check` says which limits it breaks", values)
 
 
-def _needs(config: Config, worked: DryRun) -> ScanNeeds:
-    cam = config.devices.camera
-    ring = ring_bytes(worked.timeline, cam.ring_mb * 1_000_000) if isinstance(cam, DcamOrca) else 0
-    return needs(worked, ring)
-
-
 def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
     """The beam monitor, if one is configured: its port, and one reading."""
     name = "beam monitor"
@@ -107,11 +101,7 @@ def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Cloc
 
 
 def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:
-    """Free memory against a scan's need.
-
-    Args:
-        free: bytes; None if the system does not report them.
-    """
+    """Free memory against a scan's need. `free`: bytes; None if the system does not report them."""
     expected, values = "", {"free_bytes": free}
     if needs is not None:
         parts = [f"{size(needs.waiting_bytes)} for frames that wait for the disk"]

@@ -6,6 +6,7 @@ import os
 import socket
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -45,27 +46,21 @@ def port(name: str, url: str, found: Sequence[SerialPort]) -> Diagnosis:
         return Diagnosis(name, Grade.CANNOT_CHECK, f"{url} can only be tried by opening it.")
     listed = "; ".join(map(str, found)) or "no serial ports"
     known = next((one for one in found if _same(one.device, url)), None)
-    values = {"port": url, "ports": [vars(one) for one in found]}
+    said = partial(Diagnosis, name, values={"port": url, "ports": [vars(one) for one in found]})
+    expected = f"the port {url} of the configuration"
     if known is None and (sys.platform == "win32" or not Path(url).exists()):
-        return Diagnosis(
-            name,
-            Grade.FAILED,
-            f"There is no port {url}; there are {listed}.",
-            f"the port {url} of the configuration",
+        advice = (
             "Plug the adapter in, switch the controller on, and set the port to one of those found. A name under "
-            "/dev/serial/by-id stays the same when adapters are plugged in another order",
-            values,
+            "/dev/serial/by-id stays the same when adapters are plugged in another order"
         )
+        return said(Grade.FAILED, f"There is no port {url}; there are {listed}.", expected, advice)
     if sys.platform != "win32" and not os.access(url, os.R_OK | os.W_OK):
-        return Diagnosis(
-            name,
-            Grade.FAILED,
-            f"{known or url} may not be opened by this user.",
-            f"permission to read and write {url}",
-            "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again",
-            values,
+        expected = f"permission to read and write {url}"
+        advice = (
+            "Add the user to the port's group (Debian and Ubuntu: sudo usermod -a -G dialout $USER) and log in again"
         )
-    return Diagnosis(name, Grade.OK, f"{known or url}.", f"the port {url} of the configuration", values=values)
+        return said(Grade.FAILED, f"{known or url} may not be opened by this user.", expected, advice)
+    return said(Grade.OK, f"{known or url}.", expected)
 
 
 def _same(device: str, url: str) -> bool:
@@ -83,18 +78,14 @@ def _network(name: str, url: str) -> Diagnosis:
     except ValueError:
         host, number = "", None
     if not host or not number:
-        return Diagnosis(
-            name, Grade.FAILED, f"{url} is not an address.", "socket://host:port", "Correct the configuration"
-        )
+        found, advice = f"{url} is not an address.", "Correct the configuration"
+        return Diagnosis(name, Grade.FAILED, found, "socket://host:port", advice)
     try:
         socket.create_connection((host, number), CONNECT_TIMEOUT).close()
     except OSError as error:
-        return Diagnosis(
-            name,
-            Grade.FAILED,
-            f"{host}:{number} accepts no connection ({error}).",
-            expected,
+        advice = (
             "Check the controller's power, its address and port on its panel, and the network. Close other programs: "
-            "many controllers accept only one connection",
+            "many controllers accept only one connection"
         )
+        return Diagnosis(name, Grade.FAILED, f"{host}:{number} accepts no connection ({error}).", expected, advice)
     return Diagnosis(name, Grade.OK, f"{host}:{number} accepts connections.", expected)

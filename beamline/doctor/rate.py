@@ -78,7 +78,10 @@ class Load:
 
     @cached_property
     def digests(self) -> Sequence[FrameDigest]:
-        return [digest(image, SATURATION, self.preview_bin) for image in self.images]
+        return [self.digest(image) for image in self.images]
+
+    def digest(self, image: NDArray[np.uint16]) -> FrameDigest:
+        return digest(image, SATURATION, self.preview_bin)
 
     def slot(self, row: int) -> int:
         """Which of the images a row of the file shows."""
@@ -125,20 +128,15 @@ class Load:
 
 @dataclass(frozen=True)
 class StageRun:
-    """One stage of one round.
-
-    Attributes:
-        seconds: from the first frame until all are on the disk and the file is closed; cpu_seconds: of all threads.
-        lost: frames that are not in the file, in their row.
-        peak: bytes, the largest memory of this process.
-    """
+    """One stage of one round."""
 
     stage: str
     frames: int
+    # from the first frame until all are on the disk and the file is closed; cpu_seconds: of all threads
     seconds: float
     cpu_seconds: float
-    lost: int
-    peak: int | None
+    lost: int  # frames that are not in the file, in their row
+    peak: int | None  # bytes, the largest memory of this process
 
 
 @dataclass(frozen=True)
@@ -182,20 +180,12 @@ def _written(
     return _lost(load, writer.path, n)
 
 
-def _writer_alone(load: Load, folder: Path, n: int, clock: Clock) -> int:
-    return _written(load, folder, n, clock, lambda frame: (load.digests[load.slot(frame.index)], ()))
-
-
-def _with_digest(load: Load, folder: Path, n: int, clock: Clock) -> int:
-    return _written(load, folder, n, clock, lambda frame: (digest(frame.counts, SATURATION, load.preview_bin), ()))
-
-
 def _with_monitor(load: Load, folder: Path, n: int, clock: Clock) -> int:
     monitor = start(load.context, load.checks)
 
     def step(frame: Frame) -> tuple[FrameDigest, tuple[Flag, ...]]:
         nonlocal monitor
-        found = digest(frame.counts, SATURATION, load.preview_bin)
+        found = load.digest(frame.counts)
         monitor, flags = look(monitor, frame, found)
         return found, flags
 
@@ -225,8 +215,12 @@ def _pipeline(load: Load, folder: Path, n: int, clock: Clock) -> int:
 
 STAGES: dict[str, Callable[[Load, Path, int, Clock], int]] = {
     "raw write": _raw,
-    "writer": _writer_alone,
-    "writer + digest": _with_digest,
+    "writer": lambda load, folder, n, clock: _written(
+        load, folder, n, clock, lambda frame: (load.digests[load.slot(frame.index)], ())
+    ),
+    "writer + digest": lambda load, folder, n, clock: _written(
+        load, folder, n, clock, lambda frame: (load.digest(frame.counts), ())
+    ),
     "writer + digest + monitor": _with_monitor,
     "whole pipeline": _pipeline,
 }

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from beamline.config.devices import DcamOrca, NoBeamMonitor, SimulatedOrca, StageOutputShutter
@@ -67,7 +66,7 @@ class ConnectedDevices:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -101,11 +100,7 @@ def connect(
 
 @contextmanager
 def stage_alone(config: Config, clock: Clock | None = None) -> Iterator[RotationStage]:
-    """The configured stage without the rest of the instrument. Nothing moves.
-
-    Raises:
-        DeviceError: it does not answer.
-    """
+    """The configured stage without the rest of the instrument. Nothing moves. DeviceError: it does not answer."""
     if config.simulation is not None:
         with connect(config, clock) as instrument:
             yield instrument.devices.stage

@@ -13,32 +13,20 @@ import click
 
 from drivers.base.errors import DeviceError
 
+_STATE = "What was acquired so far is in the file"
+
 
 def ask_operator(request: str) -> None:
-    """Ask the operator at the terminal, and wait for Enter.
-
-    Raises:
-        DeviceError: there is no terminal, or no confirmation.
-    """
+    """Ask the operator at the terminal, and wait for Enter. DeviceError: there is no terminal, or no confirmation."""
     if not sys.stdin.isatty():
-        raise DeviceError(
-            "operator",
-            "there is no terminal to ask at",
-            request=request,
-            advice="Run it in a terminal, or configure a shutter and a sample mover that need no hand",
-            state="What was acquired so far is in the file",
-        )
+        advice = "Run it in a terminal, or configure a shutter and a sample mover that need no hand"
+        raise DeviceError("operator", "there is no terminal to ask at", request=request, advice=advice, state=_STATE)
     try:
         # A read from a terminal goes on after a signal, so that a stop takes effect only when it returns.
         how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
         click.prompt(f"{request} {how}", default="", show_default=False, prompt_suffix=" ", err=True)
     except click.Abort as error:  # the end of input
-        raise DeviceError(
-            "operator",
-            "the request was not confirmed",
-            request=request,
-            state="What was acquired so far is in the file",
-        ) from error
+        raise DeviceError("operator", "the request was not confirmed", request=request, state=_STATE) from error
 
 
 def enter_pressed() -> bool:

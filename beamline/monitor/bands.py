@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import light
 from beamline.monitor.view import PixelBox
 from drivers.base.frame import Frame, FrameKind
 
@@ -90,8 +89,7 @@ class BandsCheck:
         Field(ge=0, lt=1, description="fraction of light that a preview row or column may lose against the others"),
     ] = 0.1
 
-    def start(self) -> BandsState:
-        return BandsState()
+    start = BandsState
 
     def look(self, state: BandsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BandsState]:
         if frame.kind is FrameKind.PROJECTION and context.view is not None:
@@ -147,8 +145,7 @@ class BandsCheck:
         """Compare the lines of a frame with those before: the profile after it, and (first, after, loss, limit)."""
         lines = np.log(np.maximum(means.astype(np.float64), LEAST_LIGHT))
         if not profile.last or profile.last[-1].shape != lines.shape:
-            known = profile.change is not None and profile.change.shape == lines.shape
-            if known:
+            if profile.change is not None and profile.change.shape == lines.shape:
                 return Profile((lines,), profile.change, profile.seen + 1, blocks), None
             return Profile((lines,), np.zeros_like(lines), 1, blocks), None
         if profile.flagged:

@@ -16,9 +16,8 @@ import numpy as np
 from pydantic import Field
 
 from beamline.monitor.change import SampleChange
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light, more_light
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import light, more_light
 from beamline.monitor.scatter import FrameScatter
 from beamline.monitor.view import CellGrid, CellValues, CellView
 from drivers.base.frame import Frame, FrameKind
@@ -35,27 +34,17 @@ SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 
 @dataclass(frozen=True)
 class BeamState:
-    """State of the check.
+    """State of the check."""
 
-    Attributes:
-        drifting: views in a row beyond the limit; after `said`, views in a row within it.
-        said: the drift was flagged.
-        covered: the missing air was reported.
-        level: logarithm of the light over that of the first view, from its confirmed changes.
-        usual: the normal level.
-        dipping: views in a row with a dip.
-        whole: logarithm of the light of the whole view before; NaN before any.
-        changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the
-            limit is at most 3.8 times `alarm`.
-    """
-
-    drifting: int = 0
-    said: bool = False
-    covered: bool = False
-    level: float = 0.0
-    usual: float = 0.0
-    dipping: int = 0
-    whole: float = math.nan
+    drifting: int = 0  # views in a row beyond the limit; after `said`, views in a row within it
+    said: bool = False  # the drift was flagged
+    covered: bool = False  # the missing air was reported
+    level: float = 0.0  # logarithm of the light over that of the first view, from its confirmed changes
+    usual: float = 0.0  # the normal level
+    dipping: int = 0  # views in a row with a dip
+    whole: float = math.nan  # logarithm of the light of the whole view before; NaN before any
+    # of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the limit is at
+    # most 3.8 times `alarm`
     changes: FrameScatter = field(default_factory=FrameScatter)
 
 
@@ -76,8 +65,7 @@ class BeamCheck:
     drift: Annotated[float, Field(ge=0, description="fraction by which the light may drift, either way")] = 0.02
     dip: Annotated[float, Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")] = 0.10
 
-    def start(self) -> BeamState:
-        return BeamState()
+    start = BeamState
 
     def look(self, state: BeamState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BeamState]:
         if frame.kind is FrameKind.FLAT and context.flat is not None:

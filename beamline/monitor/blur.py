@@ -19,7 +19,7 @@ from pydantic import Field
 from beamline.core.jit import njit
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.scatter import FrameScatter
+from beamline.monitor.scatter import FrameScatter, running_mean
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
 
@@ -36,26 +36,20 @@ DARKEST = 0.05  # share of the flat's mean: pixels with less light are not used
 
 @dataclass(frozen=True, eq=False)
 class BlurState:
-    """State of the check.
+    """State of the check."""
 
-    Attributes:
-        kind, counted: of the latest group of frames.
-        dark, flat: float32 [line, col], means of the latest groups on the lines that are looked at; None before any.
-        across, down: the usual figures along the rows and along the columns.
-        first: the same of the first views, which stay.
-        blurred: views in a row that are flagged.
-        said: the slow loss was reported.
-    """
-
+    # kind, counted: of the latest group of frames
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0
+    # dark, flat: float32 [line, col], means of the latest groups on the lines that are looked at; None before any
     dark: CellValues | None = None
     flat: CellValues | None = None
+    # across, down: the usual figures along the rows and along the columns
     across: FrameScatter = field(default_factory=FrameScatter)
     down: FrameScatter = field(default_factory=FrameScatter)
-    first: tuple[FrameScatter, FrameScatter] | None = None
-    blurred: int = 0
-    said: bool = False
+    first: tuple[FrameScatter, FrameScatter] | None = None  # the same of the first views, which stay
+    blurred: int = 0  # views in a row that are flagged
+    said: bool = False  # the slow loss was reported
 
 
 @dataclass(frozen=True)
@@ -74,8 +68,7 @@ class BlurCheck:
 
     warn: Annotated[float, Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")] = 0.3
 
-    def start(self) -> BlurState:
-        return BlurState()
+    start = BlurState
 
     def look(self, state: BlurState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BlurState]:
         if frame.kind is not FrameKind.PROJECTION:
@@ -123,11 +116,8 @@ class BlurCheck:
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
-    """Fine contrast over coarse, along the rows and along the columns; NaN where there is none.
-
-    Args:
-        lines: counts [line, col], STRIP neighbouring rows of the frame each, as `dark` and `flat`.
-    """
+    """Fine contrast over coarse, along the rows and along the columns; NaN where there is none. `lines`: counts [line,
+    col], STRIP neighbouring rows of the frame each, as `dark` and `flat`."""
     low = np.zeros_like(lines, np.float32) if dark is None else dark
     if flat is None:
         scale = np.full_like(low, 1 / max(float(lines.mean(dtype=np.float64)), 1e-9))
@@ -158,14 +148,10 @@ def _with_reference(state: BlurState, frame: Frame) -> BlurState:
     state = replace(state, kind=frame.kind, counted=counted)
     lines = _lines(frame).astype(np.float32)
     if frame.kind is FrameKind.DARK:
-        return replace(state, dark=_mean(state.dark, lines, counted))
+        return replace(state, dark=running_mean(state.dark, lines, counted))
     if frame.kind is FrameKind.FLAT:
-        return replace(state, flat=_mean(state.flat, lines, counted))
+        return replace(state, flat=running_mean(state.flat, lines, counted))
     return state
-
-
-def _mean(so_far: CellValues | None, lines: CellValues, n: int) -> CellValues:
-    return lines if so_far is None or n == 1 else so_far + (lines - so_far) / np.float32(n)
 
 
 def _updated(usual: FrameScatter, figure: float) -> FrameScatter:

@@ -14,7 +14,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,24 +29,16 @@ MOST_STEPS = 4  # largest gap in steps: after a longer one, velocities are not k
 
 @dataclass(frozen=True, eq=False)
 class SampleChange:
-    """The change from the view before.
+    """The change from the view before."""
 
-    Attributes:
-        gain: relative change of the light, of all cells alike.
-        across, down: pixels of the frame by which the sample is displaced to the right, and downwards.
-        turn: excess rotation of the stage, in steps; NaN if nothing turns visibly.
-        residual: float32 [row, col], change of the depth that these do not explain.
-        noise: robust standard deviation of the residual times the square root of the weight, over the lit cells.
-        causes: inputs of the fit, for `beside_columns`.
-    """
-
-    gain: float
+    gain: float  # relative change of the light, of all cells alike
+    # across, down: pixels of the frame by which the sample is displaced to the right, and downwards
     across: float
     down: float
-    turn: float
-    residual: CellValues
-    noise: float
-    causes: Causes | None = None
+    turn: float  # excess rotation of the stage, in steps; NaN if nothing turns visibly
+    residual: CellValues  # float32 [row, col], change of the depth that these do not explain
+    noise: float  # robust standard deviation of the residual times the square root of the weight, over the lit cells
+    causes: Causes | None = None  # inputs of the fit, for `beside_columns`
 
     def beside_columns(self) -> tuple[float, float, float] | None:
         """Across, down and turn by differences between rows; None if the rows are too much alike.
@@ -72,20 +63,14 @@ class SampleChange:
 
 @dataclass(frozen=True, eq=False)
 class Causes:
-    """Inputs of the fit of a view to earlier ones.
+    """Inputs of the fit of a view to earlier ones."""
 
-    Attributes:
-        image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed.
-        weight: float32 [row, col].
-        steps: since the view before.
-        cell: pixels a side.
-    """
-
+    # image, turning: float32 [row, col], where the gradients are taken, and the change by turning on; both smoothed
     image: CellValues
     turning: CellValues
-    weight: CellValues
-    steps: float
-    cell: int
+    weight: CellValues  # float32 [row, col]
+    steps: float  # since the view before
+    cell: int  # pixels a side
 
     def basis(self) -> CellValues:
         """[cause, row, col]: changes by a pixel across, a pixel down and a turn of a step."""
@@ -104,11 +89,12 @@ def change_of(view: CellView, before: Sequence[CellView], grid: CellGrid) -> Sam
     # A gain that has changed is no velocity.
     gained = np.float32(sum(one.brighter for one in last[1:]))
     weight = np.minimum(view.weight, last[-1].weight)
-    fit = _fit(view.depth, last[-1].depth, last[-2].depth, last[0].depth - gained, weight, steps)
-    gain, across, down, turn = fit.solution.tolist()
+    (gain, across, down, turn), residual, noise, image, turning = _fit(
+        view.depth, last[-1].depth, last[-2].depth, last[0].depth - gained, weight, steps
+    )
     across, down, turn = across * grid.cell, down * grid.cell, turn / float(steps)
-    causes = Causes(fit.image, fit.turning, weight, float(steps), grid.cell)
-    return SampleChange(math.expm1(-gain), across, down, turn, fit.residual, fit.noise, causes)
+    causes = Causes(image, turning, weight, float(steps), grid.cell)
+    return SampleChange(math.expm1(-gain), across, down, turn, residual, noise, causes)
 
 
 def _steps(view: CellView, last: Sequence[CellView]) -> float | None:
@@ -213,18 +199,13 @@ def _take_off(change, smooth, image, turning, weight, solution, residual, left_o
             left_over[row, col] = smooth[row, col] - explained
 
 
-class _Fit(NamedTuple):
-    """The best fit of the change: minus gain, across, down in cells, turn in steps; and its residual."""
-
-    solution: NDArray[np.float64]
-    residual: CellValues
-    noise: float
-    image: CellValues
-    turning: CellValues
-
-
-def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, weight: CellValues, steps: float) -> _Fit:
+def _fit(
+    now: CellValues, one: CellValues, two: CellValues, four: CellValues, weight: CellValues, steps: float
+) -> tuple[list[float], CellValues, float, CellValues, CellValues]:
     """The causes of the change from `one`, the view before; `two` and `four` are those before that.
+
+    Returns the solution (minus gain; across and down in cells; turn in steps), the residual and its noise, and the
+    `image` and `turning` of `Causes`.
 
     The median and the solution are numpy's: numba's take ten seconds to compile, in a machine's first scan.
     """
@@ -249,4 +230,4 @@ def _fit(now: CellValues, one: CellValues, two: CellValues, four: CellValues, we
         if robust == 0:
             share = _shares(left_over, 0.0, weight)
     _, noise = _deviation(residual, 0.0, weight)
-    return _Fit(solution, residual, noise or 0.0, image, turning)
+    return solution.tolist(), residual, noise or 0.0, image, turning

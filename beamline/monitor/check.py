@@ -120,6 +120,16 @@ class ScanContext:
     change: SampleChange | None = None
 
 
+def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
+    """Counts above the dark [preview row, preview col]; the raw counts where no dark was seen."""
+    return preview if context.dark is None else preview - context.dark
+
+
+def more_light(context: ScanContext, exposure: float) -> float:
+    """Light without a sample in a frame of `exposure` s, over that of the flats, which may have their own exposure."""
+    return exposure / context.flat_exposure
+
+
 @dataclass(frozen=True, eq=False)
 class Look(Generic[State]):
     """Result of a look at one frame: the check's state after it, and its finding (None: nothing to report)."""

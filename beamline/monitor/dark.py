@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
-from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import thinned
+from beamline.monitor.digest import FrameDigest, thinned
 from beamline.monitor.references import FEW, READOUT
 from drivers.base.frame import Frame, FrameKind
 
@@ -47,8 +46,7 @@ class DarkCheck:
     drift: Annotated[float, Field(ge=0, description="counts by which a dark may differ from the first one")] = 5.0
     light: Annotated[float, Field(ge=0, description="fraction of the flats' mean from which a dark has light")] = 0.5
 
-    def start(self) -> DarkState:
-        return DarkState()
+    start = DarkState
 
     def look(self, state: DarkState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[DarkState]:
         if frame.kind is FrameKind.DARK:
@@ -63,7 +61,7 @@ class DarkCheck:
         noise = math.sqrt(digest.variance)
         if state.flat is not None and self._lit(digest.mean, state.flat, noise):
             return Look(state, self._shutter_open(view, digest.mean / state.flat))
-        blocks = digest.preview[thinned(digest.preview)]
+        blocks = thinned(digest.preview)
         if state.blocks is None:
             return Look(replace(state, blocks=blocks, dark=digest.mean, noise=noise))
         drift = _trimmed_mean(blocks - state.blocks)

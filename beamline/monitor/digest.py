@@ -19,6 +19,7 @@ from zlib_ng import zlib_ng
 from beamline.core.jit import njit
 
 ENTROPY_BINS = 256
+ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
 
 
@@ -61,6 +62,12 @@ def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
 def block_side(shape: tuple[int, ...], preview: tuple[int, ...]) -> int:
     """Pixels a side of the blocks of a preview of a frame of `shape`, which may be lower or narrower than a block."""
     return max(round(n / blocks) for n, blocks in zip(shape, preview, strict=True))
+
+
+def thinned(preview: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Every k-th block along both axes, so that a large frame costs no more than a small one."""
+    step_rows, step_cols = (max(1, n // ENOUGH) for n in preview.shape)
+    return preview[::step_rows, ::step_cols]
 
 
 def digest(

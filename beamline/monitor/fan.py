@@ -29,19 +29,12 @@ CONSTANT = 1.0  # variance of constant differences: rings, flats that do not fit
 
 @dataclass(frozen=True)
 class Clutter:
-    """The signals that the filters suppress.
+    """The signals that the filters suppress."""
 
-    Attributes:
-        speed: cells a view that the sample's fastest point moves.
-        structure: variance of the sample's line integrals on the scale of the window.
-        common: variance of changes of a whole row or view, such as the beam's.
-        noise: variance of a cell's noise.
-    """
-
-    speed: float
-    structure: float
-    common: float
-    noise: float
+    speed: float  # cells a view that the sample's fastest point moves
+    structure: float  # variance of the sample's line integrals on the scale of the window
+    common: float  # variance of changes of a whole row or view, such as the beam's
+    noise: float  # variance of a cell's noise
 
 
 def window(lags: tuple[int, ...]) -> tuple[Reals, Reals]:
@@ -67,17 +60,12 @@ def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """Filters for several signals.
+    """Filters for several signals."""
 
-    Attributes:
-        weights: float32 [signal, lag, column]; on clutter and noise as assumed their output has the variance 1.
-        strength: float64 [signal], output for a signal of amplitude 1.
-        speeds: float64 [signal], cells a view.
-    """
-
+    # float32 [signal, lag, column]; on clutter and noise as assumed their output has the variance 1
     weights: CellValues
-    strength: Reals
-    speeds: Reals
+    strength: Reals  # float64 [signal], output for a signal of amplitude 1
+    speeds: Reals  # float64 [signal], cells a view
 
 
 def filters(lags: tuple[int, ...], clutter: Clutter, signals: Reals, speeds: Reals) -> Filters:

@@ -46,8 +46,7 @@ class FieldOfViewCheck:
     unlit: Annotated[float, Field(ge=0, lt=1, description="share of the frame that may be without light")] = 0.02
     edge: Annotated[float, Field(ge=0, description="line integral at the edges up to which the sample is inside")] = 0.1
 
-    def start(self) -> FieldState:
-        return FieldState()
+    start = FieldState
 
     def look(self, state: FieldState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FieldState]:
         if frame.kind is FrameKind.FLAT and context.dark is not None:

@@ -28,12 +28,7 @@ LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
 LATER = LAGS[-1]  # views after the one that is judged
 SPAN = LATER - LAGS[0] + 1
 SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
-SPEEDS = (
-    1.4,
-    2.0,
-    3.0,
-    4.5,
-)  # of the sample's fastest point; faster ones are in only one view of the window
+SPEEDS = (1.4, 2.0, 3.0, 4.5)  # of the sample's fastest point; faster ones are in only one view of the window
 STRUCTURE, COMMON = 1.0, 0.02**2  # line integrals of about 1; a beam that changes by 2 %
 WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
 MARGIN = 1.15  # the axis may be off the middle, and the sample a little wider than the field
@@ -53,27 +48,20 @@ FASTEST = 1e3  # cells a view: what moves faster is in one view only
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    """State of the check.
+    """State of the check."""
 
-    Attributes:
-        raw: the last two views.
-        indices: rows in the file of the SPAN views before the last.
-        depths: their line integrals, without zingers and smoothed along the columns; oldest first.
-        filters: for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight
-            `light`.
-        usual: usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely.
-        peaks: of the last views.
-    """
-
-    raw: tuple[CellView, ...] = ()
-    indices: tuple[int, ...] = ()
+    raw: tuple[CellView, ...] = ()  # the last two views
+    indices: tuple[int, ...] = ()  # rows in the file of the SPAN views before the last
+    # their line integrals, without zingers and smoothed along the columns; oldest first
     depths: tuple[CellValues, ...] = ()
+    # for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight `light`
     filters: Filters | None = None
     step: float = math.nan
     rim: float = math.nan
     light: float = 1.0
+    # usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely
     usual: CellValues | None = None
-    peaks: Peaks = field(default_factory=no_peaks)
+    peaks: Peaks = field(default_factory=no_peaks)  # of the last views
 
 
 @dataclass(frozen=True)
@@ -88,8 +76,7 @@ class FloaterCheck:
 
     peak: Annotated[float, Field(ge=0, description="standard deviations of a peak that may be part of a trail")] = 4.5
 
-    def start(self) -> FloaterState:
-        return FloaterState()
+    start = FloaterState
 
     def look(self, state: FloaterState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FloaterState]:
         view, change, grid = context.view, context.change, context.grid

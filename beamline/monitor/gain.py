@@ -46,8 +46,7 @@ class GainCheck:
     warn: Annotated[float, Field(ge=0, description="relative change of the light from one view to the next")] = 0.01
     alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.1
 
-    def start(self) -> GainState:
-        return GainState()
+    start = GainState
 
     def look(self, state: GainState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[GainState]:
         if context.change is None:

@@ -44,21 +44,14 @@ RULES = Rules(span=10, least=4, share=0.6, total=0.0, rows=0.0, cols=2.5, slack=
 
 @dataclass(frozen=True, eq=False)
 class GhostState:
-    """State of the check.
+    """State of the check."""
 
-    Attributes:
-        profiles: float32 [part of the rows, broad column] of the last views, oldest first.
-        filters: for the angle's `step` in radians.
-        usual: usual output of the filters at each column, None before the first.
-        peaks: the highest of each of the last views.
-    """
-
-    profiles: tuple[CellValues, ...] = ()
+    profiles: tuple[CellValues, ...] = ()  # float32 [part of the rows, broad column] of the last views, oldest first
     angle: float = math.nan
-    filters: Filters | None = None
+    filters: Filters | None = None  # for the angle's `step` in radians
     step: float = math.nan
-    usual: CellValues | None = None
-    peaks: Peaks = field(default_factory=no_peaks)
+    usual: CellValues | None = None  # usual output of the filters at each column, None before the first
+    peaks: Peaks = field(default_factory=no_peaks)  # the highest of each of the last views
 
 
 @dataclass(frozen=True)
@@ -78,8 +71,7 @@ class GhostCheck:
     warn: Annotated[float, Field(ge=0, description="relative change of the light in the middle of the ghost")] = 0.01
     alarm: Annotated[float, Field(ge=0, description="relative change that is an alarm")] = 0.8
 
-    def start(self) -> GhostState:
-        return GhostState()
+    start = GhostState
 
     def look(self, state: GhostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[GhostState]:
         view, grid = context.view, context.grid

@@ -33,8 +33,7 @@ class LostCheck:
 
     alarm: Annotated[float, Field(ge=0.5, le=1, description="fraction of the light without which it is lost")] = 0.5
 
-    def start(self) -> LostState:
-        return LostState()
+    start = LostState
 
     def look(self, state: LostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[LostState]:
         score = 1 - context.light_left

@@ -44,8 +44,7 @@ class MassCheck:
     warn: Annotated[float, Field(ge=0, description="relative change of the total absorption")] = 0.03
     frames: Annotated[int, Field(ge=1, description="projections in a row beyond the limit that make a finding")] = 3
 
-    def start(self) -> MassState:
-        return MassState()
+    start = MassState
 
     def look(self, state: MassState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MassState]:
         view, grid = context.view, context.grid

@@ -51,8 +51,7 @@ class ModelCheck:
 
     warn: Annotated[float, Field(ge=0, description="standard deviations by which a part may differ")] = 6.0
 
-    def start(self) -> ModelState:
-        return ModelState()
+    start = ModelState
 
     def look(self, state: ModelState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[ModelState]:
         view, grid = context.view, context.grid

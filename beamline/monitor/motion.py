@@ -46,8 +46,7 @@ class MotionCheck:
     alarm: Annotated[float, Field(ge=0, description="pixels by which the sample may shift between two views")] = 0.5
     steps: Annotated[float, Field(ge=0, description="steps by which the stage may turn too far at once")] = 3.0
 
-    def start(self) -> MotionState:
-        return MotionState()
+    start = MotionState
 
     def look(self, state: MotionState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MotionState]:
         change = context.change

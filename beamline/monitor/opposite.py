@@ -41,16 +41,11 @@ Reals = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """A view for later.
+    """A view for later."""
 
-    Attributes:
-        view: itself.
-        after: the next one, which gives the velocity.
-        turned, again: it was compared with the view from the other side, and with a repetition.
-    """
-
-    view: CellView
-    after: CellView | None = None
+    view: CellView  # itself
+    after: CellView | None = None  # the next one, which gives the velocity
+    # turned, again: it was compared with the view from the other side, and with a repetition
     turned: bool = False
     again: bool = False
 
@@ -95,8 +90,7 @@ class OppositeCheck:
     changed: Annotated[float, Field(ge=0, description="pixels, as a shift of all, by which parts may differ")] = 1.0
     axis: Annotated[float, Field(ge=0, description="pixels between the axis and its stated place that are said")] = 1.0
 
-    def start(self) -> OppositeState:
-        return OppositeState()
+    start = OppositeState
 
     def look(
         self, state: OppositeState, frame: Frame, digest: FrameDigest, context: ScanContext

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from beamline.core.jit import njit
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import light
 from beamline.monitor.view import BRIGHT, UNLIT
 from drivers.base.frame import Frame, FrameKind
 
@@ -56,8 +55,7 @@ class PixelsCheck:
 
     warn: Annotated[float, Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
 
-    def start(self) -> PixelsState:
-        return PixelsState()
+    start = PixelsState
 
     def look(self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[PixelsState]:
         holes = digest.invalid_fraction

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from beamline.core.text import spans
-from beamline.monitor.digest import FrameDigest
-from beamline.monitor.preview import thinned
+from beamline.monitor.digest import FrameDigest, thinned
 from drivers.base.frame import FrameKind
 
 NORMAL = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -87,7 +86,7 @@ class ReferenceFrame:
     def seen(
         cls, row: int, kind: FrameKind, exposure: float, saturated: float, preview: NDArray[np.float32], block: int
     ) -> ReferenceFrame:
-        return cls(row, kind, exposure, saturated, np.array(preview[thinned(preview)]), block)
+        return cls(row, kind, exposure, saturated, np.array(thinned(preview)), block)
 
 
 class FaultKind(StrEnum):
@@ -104,18 +103,13 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True)
 class ReferenceFault:
-    """A fault of a group.
+    """A fault of a group."""
 
-    Attributes:
-        kind: which fault.
-        score, limit: the figure, and the violated limit.
-        message: both in words, with advice.
-    """
-
-    kind: FaultKind
+    kind: FaultKind  # which fault
+    # score, limit: the figure, and the violated limit
     score: float
     limit: float
-    message: str
+    message: str  # both in words, with advice
 
 
 @dataclass(frozen=True)

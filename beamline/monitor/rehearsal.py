@@ -15,7 +15,7 @@ from drivers.base.frame import Frame, FrameKind
 _SIDE, _BIN = 256, 4  # pixels of a toy frame, and of a pixel of its preview
 _DARK, _FLAT, _SAMPLE = 100, 20_000, 8_000  # counts
 _SATURATION, _STEP = 65_535, 0.02  # counts; rad from view to view
-_REHEARSED: set[str] = set()  # checks, in words, by which this process has looked at the toy
+_REHEARSED: set[str] = set()  # the checks that this process has rehearsed, as `repr` writes them
 
 
 def rehearse(monitor: Monitor) -> None:

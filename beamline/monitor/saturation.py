@@ -34,8 +34,7 @@ class SaturationCheck:
     warn: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
     alarm: Annotated[float, Field(ge=0, description="fraction of saturated pixels above which it is an alarm")] = 1e-3
 
-    def start(self) -> SaturationState:
-        return SaturationState()
+    start = SaturationState
 
     def look(
         self, state: SaturationState, frame: Frame, digest: FrameDigest, context: ScanContext

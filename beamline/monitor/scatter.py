@@ -1,8 +1,11 @@
-"""Scatter: the usual variation of a figure, so that a limit is never below it."""
+"""Scatter: the usual variation of a figure, so that a limit is never below it; and a running mean of frames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 CALIBRATION = 12  # figures before the scatter means anything
 MEMORY = 0.02  # weight of the newest figure
@@ -34,3 +37,8 @@ class FrameScatter:
         return FrameScatter(
             self.n + 1, self.mean + weight * away, self.deviation + weight * (abs(away) - self.deviation)
         )
+
+
+def running_mean(so_far: NDArray[np.float32] | None, newest: NDArray[np.float32], n: int) -> NDArray[np.float32]:
+    """The mean with the n-th array."""
+    return newest if so_far is None or n == 1 else so_far + (newest - so_far) / np.float32(n)

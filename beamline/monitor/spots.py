@@ -32,11 +32,7 @@ NO_SPOTS = Spots()
 
 
 def spots_of(
-    frame: Frame,
-    digest: FrameDigest,
-    before: FrameDigest | None,
-    dark: NDArray[np.float32] | None,
-    saturation: float,
+    frame: Frame, digest: FrameDigest, before: FrameDigest | None, dark: NDArray[np.float32] | None, saturation: float
 ) -> Spots:
     """The spots of a view or a flat, given the frame before it and the preview of the darks."""
     if before is None or frame.kind is FrameKind.DARK or digest.preview.shape != before.preview.shape:

@@ -28,8 +28,7 @@ class StuckCheck:
     meaning: ClassVar[str] = "the image equals the one before, pixel for pixel: the camera delivered a frame twice"
     policy: ClassVar[Policy] = Policy.LOG
 
-    def start(self) -> StuckState:
-        return StuckState()
+    start = StuckState
 
     def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
         """Compare checksums. Darks and flats of a single grey value (simulated, without noise) are not compared."""

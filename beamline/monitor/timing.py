@@ -36,8 +36,7 @@ class TimingCheck:
 
     warn: Annotated[float, Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
 
-    def start(self) -> TimingState:
-        return TimingState()
+    start = TimingState
 
     def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
         again = frame.replaces >= 0 or frame.trigger < state.trigger  # a repeated view has its old trigger

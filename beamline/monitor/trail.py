@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,44 +17,26 @@ def no_peaks() -> Peaks:
     return np.empty((0, 4))
 
 
-@dataclass(frozen=True)
-class Rules:
-    """When peaks are a trail.
+class Rules(NamedTuple):
+    """When peaks are a trail."""
 
-    Attributes:
-        span: views that it may take.
-        least: views with a peak that it needs.
-        share: of the views from its first to its last that have a peak.
-        total: sum of the scores that it needs.
-        rows, cols: cells by which a peak may lie beside the line.
-        slack: cells a view added to the sample's speed.
-    """
-
-    span: int
-    least: int
-    share: float
-    total: float
-    rows: float
-    cols: float
-    slack: float
+    span: int  # views that it may take
+    least: int  # views with a peak that it needs
+    share: float  # of the views from its first to its last that have a peak
+    total: float  # sum of the scores that it needs
+    rows: float  # cells by which a peak may lie beside the line
+    cols: float  # likewise
+    slack: float  # cells a view added to the sample's speed
 
 
-@dataclass(frozen=True)
-class Trail:
-    """A trail.
-
-    Attributes:
-        first, last: views.
-        row, col: its place in the last view.
-        speed: cells a view.
-        score: mean of its peaks.
-    """
+class Trail(NamedTuple):
+    """Views from `first` to `last`, the place in cells in the last one, and the mean score of its peaks."""
 
     first: float
     last: float
     row: float
     col: float
-    speed: float
+    speed: float  # cells a view
     score: float
 
 
@@ -67,20 +49,12 @@ def best_trail(older: Peaks, newer: Peaks, rules: Rules, middle: float, turn: fl
     if not len(newer) or len(older) < rules.least - 1:
         return None
     found = np.zeros(6)
-    if not _search(
-        older,
-        newer,
-        (rules.least, rules.share, rules.total, rules.rows, rules.cols, rules.slack),
-        (middle, turn, radius),
-        found,
-    ):
-        return None
-    return Trail(*(float(x) for x in found))
+    return Trail(*found.tolist()) if _search(older, newer, rules, (middle, turn, radius), found) else None
 
 
 @njit(nogil=True, cache=True)
 def _search(older, newer, rules, sample, found):
-    least, share, enough, rows, cols, slack = rules
+    _, least, share, enough, rows, cols, slack = rules
     middle, turn, radius = sample
     best = enough
     seen = np.zeros(64)

@@ -30,27 +30,18 @@ PixelBox = tuple[int, int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class CellGrid:
-    """The cells of a frame, and the light in them without a sample.
+    """The cells of a frame, and the light in them without a sample."""
 
-    Attributes:
-        cell: pixels a side of a cell.
-        blocks: preview blocks a side of a cell.
-        dark: counts [row, col] of the cells without light; 0 where no dark was seen.
-        full: counts above it with the beam and no sample, at the flats' exposure.
-        lit: float32 [row, col], 1 where a cell has enough light, else 0.
-        flats: there were flats; otherwise `full` is 1 and line integrals are relative.
-        row_dark, col_dark: dark counts of each preview row and column, means.
-        left, right: first and last column of cells with most of them lit.
-    """
-
-    cell: int
-    blocks: int
-    dark: CellValues
-    full: CellValues
-    lit: CellValues
-    flats: bool
+    cell: int  # pixels a side of a cell
+    blocks: int  # preview blocks a side of a cell
+    dark: CellValues  # counts [row, col] of the cells without light; 0 where no dark was seen
+    full: CellValues  # counts above it with the beam and no sample, at the flats' exposure
+    lit: CellValues  # float32 [row, col], 1 where a cell has enough light, else 0
+    flats: bool  # there were flats; otherwise `full` is 1 and line integrals are relative
+    # row_dark, col_dark: dark counts of each preview row and column, means
     row_dark: CellValues
     col_dark: CellValues
+    # left, right: first and last column of cells with most of them lit
     left: int
     right: int
 
@@ -68,27 +59,19 @@ class CellGrid:
 
 @dataclass(frozen=True, eq=False)
 class CellView:
-    """A projection on the grid.
+    """A projection on the grid."""
 
-    Attributes:
-        index: its row in the file.
-        angle: radians.
-        depth: float32 [row, col], line integrals; where a cell is not lit those between its left and right neighbour,
-            or 0 where they are not lit either.
-        weight: float32 [row, col], photons relative to the open beam: 0 where unlit, exp(-depth) elsewhere.
-        rows, cols: float32 [preview row], [preview col]: mean counts above the dark.
-        edges: line integrals at the left and the right edge of the lit cells, medians over rows.
-        brighter: change of the logarithm of the light since the view before, where it is known.
-    """
-
-    index: int
-    angle: float
+    index: int  # its row in the file
+    angle: float  # radians
+    # float32 [row, col], line integrals; where a cell is not lit those between its left and right neighbour, or 0 where
+    # they are not lit either
     depth: CellValues
-    weight: CellValues
+    weight: CellValues  # float32 [row, col], photons relative to the open beam: 0 where unlit, exp(-depth) elsewhere
+    # rows, cols: float32 [preview row], [preview col]: mean counts above the dark
     rows: CellValues
     cols: CellValues
-    edges: tuple[float, float]
-    brighter: float = 0.0
+    edges: tuple[float, float]  # line integrals at the left and the right edge of the lit cells, medians over rows
+    brighter: float = 0.0  # change of the logarithm of the light since the view before, where it is known
 
 
 def grid_of(

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of
-from beamline.monitor.check import Check, Flag, Look, ScanContext
+from beamline.monitor.check import Check, Flag, Look, ScanContext, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
-from beamline.monitor.preview import more_light
+from beamline.monitor.scatter import running_mean
 from beamline.monitor.spots import spots_of
 from beamline.monitor.view import CellView, grid_of, light_left, view_of
 from drivers.base.frame import Frame, FrameKind
@@ -150,13 +150,8 @@ def _with_reference(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Moni
     counted = monitor.counted + 1 if frame.kind is monitor.kind else 1
     context = monitor.context
     if frame.kind is FrameKind.DARK:
-        context = replace(context, dark=_mean(context.dark, digest.preview, counted), grid=None)
+        context = replace(context, dark=running_mean(context.dark, digest.preview, counted), grid=None)
     elif frame.kind is FrameKind.FLAT:
-        context = replace(
-            context, flat=_mean(context.flat, digest.preview, counted), flat_exposure=frame.exposure, grid=None
-        )
+        flat = running_mean(context.flat, digest.preview, counted)
+        context = replace(context, flat=flat, flat_exposure=frame.exposure, grid=None)
     return replace(monitor, context=context, counted=counted, kind=frame.kind)
-
-
-def _mean(so_far: NDArray[np.float32] | None, preview: NDArray[np.float32], n: int) -> NDArray[np.float32]:
-    return preview if so_far is None or n == 1 else so_far + (preview - so_far) / np.float32(n)

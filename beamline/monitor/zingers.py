@@ -38,8 +38,7 @@ class ZingersCheck:
 
     warn: Annotated[float, Field(ge=0, le=1, description="zingers over pixels that a view may have")] = 1e-4
 
-    def start(self) -> ZingersState:
-        return ZingersState()
+    start = ZingersState
 
     def look(self, state: ZingersState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[ZingersState]:
         if frame.kind is not FrameKind.PROJECTION:

@@ -12,8 +12,9 @@ import json
 import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from contextlib import suppress
+from dataclasses import astuple, dataclass, field
+from functools import lru_cache, partial
 from importlib.resources import files
 from typing import Any
 
@@ -27,6 +28,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import BeamlineError, user_message
+from beamline.page.recording import Recording
 from beamline.page.run_files import PICTURE, Reader
 from beamline.page.tiles import TileRegion, pack
 from beamline.scan.control import Verb, tell
@@ -48,17 +50,11 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Access:
-    """Who may do what.
+    """Who may do what."""
 
-    Attributes:
-        hosts: what a browser may call this server, each with the port, as in `localhost:8642`.
-        look: the token for looking.
-        act: the token for verbs to the scan; None: nobody may act from the page.
-    """
-
-    hosts: Sequence[str]
-    look: str = field(default_factory=partial(secrets.token_hex, 16))
-    act: str | None = None
+    hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
+    look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
+    act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
 
 
 class Guard:
@@ -97,11 +93,7 @@ def _same(given: str, expected: str) -> bool:
 
 
 def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
-    """The application.
-
-    Args:
-        log: takes a line for each verb that was sent, with the client's address.
-    """
+    """The application. `log`: takes a line for each verb that was sent, with the client's address."""
     server = _Server(reader, access, log)
     static = files("beamline.page") / "static"
     routes = [
@@ -130,15 +122,17 @@ def refused(request: Request, error: Exception) -> Response:
 
 
 class _Server:
+    """Answers requests; Starlette calls what is not a coroutine in a thread of its own."""
+
     def __init__(self, reader: Reader, access: Access, log: Callable[[str], None]) -> None:
         self._reader, self._access, self._log = reader, access, log
-        self._tiles: dict[object, Response] = {}
+        self._picture = lru_cache(_KEPT)(self._tile_of)  # pixels of a frame never change
         self._state: dict[str, Any] = {}
         self._looked = 0.0
         self._looking = asyncio.Lock()
 
-    async def facts(self, request: Request) -> Response:
-        facts = await run_in_threadpool(self._reader.do, lambda recording: recording.facts())
+    def facts(self, request: Request) -> Response:
+        facts = self._reader.do(Recording.facts)
         return JSONResponse({**facts, "run": self._reader.what.name, "may_act": self._access.act is not None})
 
     async def feed(self, request: Request) -> Response:
@@ -168,60 +162,47 @@ class _Server:
                 self._looked = time.monotonic()
         return self._state
 
-    async def columns(self, request: Request) -> Response:
-        first = _number(request, "first")
-        return JSONResponse(await run_in_threadpool(self._reader.do, lambda recording: recording.columns(first)))
+    def columns(self, request: Request) -> Response:
+        return JSONResponse(self._reader.do(lambda recording: recording.columns(_number(request, "first"))))
 
-    async def flags(self, request: Request) -> Response:
-        return JSONResponse(await run_in_threadpool(self._reader.do, lambda recording: recording.flags()))
+    def flags(self, request: Request) -> Response:
+        return JSONResponse(self._reader.do(Recording.flags))
 
-    async def frame(self, request: Request) -> Response:
+    def frame(self, request: Request) -> Response:
         frame, corrected = int(request.path_params["frame"]), request.query_params.get("corrected") == "1"
-        region = region_of(request)
+        return self._picture(frame, region_of(request), corrected)
 
-        def read() -> Response:
-            values, shown, factor = self._reader.do(lambda file: file.picture(frame, region, corrected=corrected))
-            edges = [shown.first_row, shown.last_row, shown.first_col, shown.last_col]
-            return tile_of(values, {"frame": frame, "region": edges, "bin": factor})
+    def _tile_of(self, frame: int, region: TileRegion, corrected: bool) -> Response:
+        values, shown, factor = self._reader.do(lambda file: file.picture(frame, region, corrected=corrected))
+        return tile_of(values, {"frame": frame, "region": astuple(shown), "bin": factor})
 
-        return await self._kept(("frame", frame, region, corrected), read)
-
-    async def sinogram(self, request: Request) -> Response:
+    def sinogram(self, request: Request) -> Response:
         row, first = _number(request, "row"), _number(request, "first")
+        lines, views, factor = self._reader.do(lambda file: file.sinogram(row, first))
+        return tile_of(lines, {"views": views.tolist(), "bin": factor})
 
-        def read() -> Response:
-            lines, views, factor = self._reader.do(lambda file: file.sinogram(row, first))
-            return tile_of(lines, {"views": views.tolist(), "bin": factor})
-
-        return await run_in_threadpool(read)
-
-    async def trace(self, request: Request) -> Response:
+    def trace(self, request: Request) -> Response:
         region, first = region_of(request), _number(request, "first")
-        values = await run_in_threadpool(self._reader.do, lambda recording: recording.trace(region, first))
+        values = self._reader.do(lambda recording: recording.trace(region, first))
         return JSONResponse({"first": first, "values": values})
 
-    async def volume(self, request: Request) -> Response:
-        return JSONResponse(await run_in_threadpool(self._reader.on_volume, lambda volume: volume.facts))
+    def volume(self, request: Request) -> Response:
+        return JSONResponse(self._reader.on_volume(lambda volume: volume.facts))
 
-    async def cut(self, request: Request) -> Response:
+    def cut(self, request: Request) -> Response:
         axis, index = int(request.path_params["axis"]), int(request.path_params["index"])
+        values, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index))
+        return tile_of(values, {"axis": axis, "index": index, "bin": factor})
 
-        def read() -> Response:
-            values, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index))
-            return tile_of(values, {"axis": axis, "index": index, "bin": factor})
-
-        return await run_in_threadpool(read)
-
-    async def model(self, request: Request) -> Response:
+    def model(self, request: Request) -> Response:
         """The live picture: newest view, the volume seen from there, their difference in noise."""
-        folder = self._reader.what.folder
-        try:
-            picture = b"" if folder is None else await run_in_threadpool((folder / PICTURE).read_bytes)
-        except OSError:
-            picture = b""
+        folder, picture = self._reader.what.folder, b""
+        if folder is not None:
+            with suppress(OSError):
+                picture = (folder / PICTURE).read_bytes()
         return Response(picture, media_type="image/png") if picture else Response(status_code=404)
 
-    async def verb(self, request: Request) -> Response:
+    def verb(self, request: Request) -> Response:
         folder, act = self._reader.what.folder, self._access.act
         name, client = request.path_params["verb"], request.client.host if request.client else "?"
         ours = f"{request.url.scheme}://{request.headers.get('host', '')}"
@@ -231,17 +212,7 @@ class _Server:
         if folder is None or name not in [str(verb) for verb in Verb]:
             return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
         self._log(f"{name}, asked for from {client}")
-        state = await run_in_threadpool(tell, folder, Verb(name))
-        return JSONResponse({"state": str(state)})
-
-    async def _kept(self, key: object, read: Callable[[], Response]) -> Response:
-        """The result of an earlier request: pixels of a frame never change."""
-        if key not in self._tiles:
-            answer = await run_in_threadpool(read)
-            while len(self._tiles) >= _KEPT:
-                del self._tiles[next(iter(self._tiles))]
-            self._tiles[key] = answer
-        return self._tiles[key]
+        return JSONResponse({"state": str(tell(folder, Verb(name)))})
 
 
 def tile_of(values: Any, facts: dict[str, Any]) -> Response:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,7 @@ from drivers.base.frame import FrameKind
 
 @dataclass(frozen=True)
 class ScanProgress:
-    """The progress of a scan file.
-
-    Attributes:
-        frames: that are whole in it.
-        status: `running`, `complete`, `stopped` or `failed`.
-    """
+    """Whole frames in a scan file, and its status: `running`, `complete`, `stopped` or `failed`."""
 
     frames: int
     status: str
@@ -61,12 +56,11 @@ class Recording:
             self._file.close()
 
     def progress(self) -> ScanProgress:
-        committed = self._file[layout.COMMITTED]
-        hdf5.look_again(committed)
-        finished = self._file[layout.FINISHED]
-        hdf5.look_again(finished)
-        status = self._file[layout.STATUS]
-        hdf5.look_again(status)
+        values = committed, finished, status = [
+            self._file[name] for name in (layout.COMMITTED, layout.FINISHED, layout.STATUS)
+        ]
+        for value in values:
+            hdf5.look_again(value)
         return ScanProgress(int(committed[()]), hdf5.text(status[()]) if finished[()] else "running")
 
     def facts(self) -> dict[str, Any]:
@@ -80,7 +74,9 @@ class Recording:
             "preview_bin": self.preview_bin,
             "pixel_mm": pixel,
             "axis_col": None if axis is None else float(axis[()]),
-            "checks": [{"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in self._legend()],
+            "checks": [
+                {"name": check.name, "unit": check.unit, "meaning": check.meaning} for check in read_legend(self._file)
+            ],
         }
 
     def columns(self, first: int) -> dict[str, Any]:
@@ -126,7 +122,7 @@ class Recording:
         if not 0 <= frame < frames:
             raise DataError(f"Frame {frame} is not in the file, which holds {frames}.")
         region = region.inside(self.shape)
-        rows, cols = slice(region.first_row, region.last_row), slice(region.first_col, region.last_col)
+        rows, cols = region.slices
         factor = region.binning()
         hdf5.look_again(self._data)
         pixels = bin_mean(self._data[frame, rows, cols], (factor, factor))
@@ -159,15 +155,10 @@ class Recording:
 
     def trace(self, region: TileRegion, first: int) -> list[float]:
         """Mean counts of a region, to whole blocks of the preview, in the frames from `first` on."""
-        block = TileRegion(*(edge // self.preview_bin for edge in (region.first_row, region.last_row,
-                                                             region.first_col, region.last_col)))  # fmt: skip
-        block = block.inside((self._preview.shape[1], self._preview.shape[2]))
-        rows, cols = slice(block.first_row, block.last_row), slice(block.first_col, block.last_col)
+        blocks = TileRegion(*(edge // self.preview_bin for edge in astuple(region)))
+        rows, cols = blocks.inside((self._preview.shape[1], self._preview.shape[2])).slices
         hdf5.look_again(self._preview)
         return [float(self._preview[frame, rows, cols].mean()) for frame in range(first, self.progress().frames)]
-
-    def _legend(self) -> Any:
-        return read_legend(self._file)
 
     def _column(self, path: str, first: int, frames: int) -> list[Any]:
         column = self._file[path]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import threading
 import time
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 
 from beamline.core.errors import DataError
 from beamline.core.files import EVENTS, parts_of
+from beamline.core.process import json_object
 from beamline.page.recording import Recording
 from beamline.page.volume import ShownVolume, newest
 from beamline.scan.run_folder import RECON, SCAN
@@ -25,15 +25,10 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Watched:
-    """Paths of a watched run.
+    """Paths of a watched run."""
 
-    Attributes:
-        scan: the scan file.
-        folder: of the run (of its newest part); None: a scan file alone.
-    """
-
-    scan: Path
-    folder: Path | None
+    scan: Path  # the scan file
+    folder: Path | None  # of the run (of its newest part); None: a scan file alone
 
     @property
     def name(self) -> str:
@@ -76,15 +71,8 @@ class EventLog:
         whole = added[: added.rfind(b"\n") + 1]
         self._at += len(whole)
         for line in whole.decode("utf-8", "replace").splitlines():
-            if _is_event(line):
+            if json_object(line) is not None:
                 self.lines.append(line)
-
-
-def _is_event(line: str) -> bool:
-    try:
-        return isinstance(json.loads(line), dict)
-    except ValueError:
-        return False
 
 
 class Reader:

@@ -30,12 +30,12 @@ class TileRegion:
         return TileRegion(first_row, last_row, first_col, last_col)
 
     @property
-    def shape(self) -> tuple[int, int]:
-        return self.last_row - self.first_row, self.last_col - self.first_col
+    def slices(self) -> tuple[slice, slice]:
+        return slice(self.first_row, self.last_row), slice(self.first_col, self.last_col)
 
-    def binning(self, most: int = MOST) -> int:
-        """The smallest binning that leaves at most `most` pixels along each axis."""
-        return max(1, -(-max(self.shape) // most))
+    def binning(self) -> int:
+        """The smallest binning that leaves at most MOST pixels along each axis."""
+        return max(1, -(-max(self.last_row - self.first_row, self.last_col - self.first_col) // MOST))
 
 
 def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float32]:

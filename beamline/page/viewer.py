@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import astuple
 from importlib.resources import files
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from starlette.applications import Starlette
-from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -18,6 +19,7 @@ from starlette.staticfiles import StaticFiles
 
 from beamline.core.errors import BeamlineError, DataError
 from beamline.page.app import Access, Guard, refused, region_of, tile_of
+from beamline.page.tiles import TileRegion
 from beamline.page.viewed import ViewedVolume
 
 _Result = TypeVar("_Result")
@@ -46,29 +48,25 @@ class _Viewer:
     def __init__(self, volumes: Sequence[ViewedVolume]) -> None:
         self._volumes, self._thread = volumes, ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
-    async def facts(self, request: Request) -> Response:
-        return JSONResponse(await self._do(lambda: [volume.facts() for volume in self._volumes]))
+    def facts(self, request: Request) -> Response:
+        return JSONResponse(self._do(lambda: [volume.facts() for volume in self._volumes]))
 
-    async def cut(self, request: Request) -> Response:
+    def cut(self, request: Request) -> Response:
         volume, axis, index = self._volume(request), *_place(request)
-        return await self._tile(lambda: volume.cut(axis, index, region_of(request)))
+        return _picture(*self._do(lambda: volume.cut(axis, index, region_of(request))))
 
-    async def difference(self, request: Request) -> Response:
+    def difference(self, request: Request) -> Response:
         """The second volume less the first one; DataError unless both have one shape."""
         if len({volume.shape for volume in self._volumes}) != 1 or len(self._volumes) != 2:
             raise DataError("A difference is of two volumes of the same shape.")
         (axis, index), region = _place(request), region_of(request)
+        first, second = self._do(lambda: [volume.cut(axis, index, region) for volume in self._volumes])
+        return _picture(second[0] - first[0], *first[1:])
 
-        def read() -> Any:
-            first, second = (volume.cut(axis, index, region) for volume in self._volumes)
-            return np.asarray(second[0] - first[0]), *first[1:]
+    def histogram(self, request: Request) -> Response:
+        return JSONResponse(self._do(self._volume(request).histogram))
 
-        return await self._tile(read)
-
-    async def histogram(self, request: Request) -> Response:
-        return JSONResponse(await self._do(self._volume(request).histogram))
-
-    async def profile(self, request: Request) -> Response:
+    def profile(self, request: Request) -> Response:
         volume, axis, index = self._volume(request), *_place(request)
         try:
             line = [float(word) for word in request.query_params.get("line", "").split(",")]
@@ -76,7 +74,7 @@ class _Viewer:
                 raise ValueError
         except ValueError:
             raise DataError("A profile is along a line: first row, first column, last row, last column.") from None
-        return JSONResponse(await self._do(lambda: volume.profile(axis, index, line)))
+        return JSONResponse(self._do(lambda: volume.profile(axis, index, line)))
 
     def _volume(self, request: Request) -> ViewedVolume:
         which = int(request.path_params["which"])
@@ -84,13 +82,12 @@ class _Viewer:
             raise DataError(f"Volume {which} is not shown here.")
         return self._volumes[which]
 
-    async def _tile(self, read: Callable[[], Any]) -> Response:
-        values, shown, factor = await self._do(read)
-        edges = [shown.first_row, shown.last_row, shown.first_col, shown.last_col]
-        return tile_of(values, {"region": edges, "bin": factor})
+    def _do(self, read: Callable[[], _Result]) -> _Result:
+        return self._thread.submit(read).result()
 
-    async def _do(self, read: Callable[[], _Result]) -> _Result:
-        return await run_in_threadpool(lambda: self._thread.submit(read).result())
+
+def _picture(values: NDArray[np.float32], shown: TileRegion, factor: int) -> Response:
+    return tile_of(values, {"region": astuple(shown), "bin": factor})
 
 
 def _place(request: Request) -> tuple[int, int]:

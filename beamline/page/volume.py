@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import MOST, TileRegion, bin_mean
+from beamline.page.tiles import TileRegion, bin_mean
 from beamline.storage import hdf5
 
 _DATA = "/entry/data/data"
@@ -65,7 +65,7 @@ class ShownVolume:
         place[axis] = index
         with hdf5.readable(self.file.path):
             values = np.asarray(self._values[tuple(place)], np.float32)
-        factor = TileRegion(0, values.shape[0], 0, values.shape[1]).binning(MOST)
+        factor = TileRegion(0, values.shape[0], 0, values.shape[1]).binning()
         return bin_mean(values, (factor, factor)), factor
 
     def _facts(self) -> dict[str, Any]:

@@ -11,9 +11,9 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 """The golden section; modulo one, its multiples stay spread at every length (three-gap theorem, Sós 1957)."""
 
 
-def _require(views: int, at_least: int = 1) -> None:
-    if views < at_least:
-        raise ValueError(f"a plan needs at least {at_least} view(s), got {views}")
+def _require(views: int) -> None:
+    if views < 1:
+        raise ValueError(f"a plan needs at least 1 view(s), got {views}")
 
 
 def fixed(views: int, start: float = 0.0, span: float = math.pi) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from beamline.core.text import degrees, size
+from beamline.core.text import degrees, rounded, size
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan
 from beamline.plan.triggers import Flight
 from drivers.base.protocols import CameraTiming, StageLimits
@@ -118,7 +118,7 @@ def _timing(facts: PlanFacts) -> Iterator[str]:
         yield (
             f"period_s {period:.4g} is below the camera's least {camera.min_period:.6g} s between triggers "
             f"({rows} x {cols} px, {plan.exposure:g} s exposure); set scan.period_s >= "
-            f"{_up(camera.min_period * MARGIN):g}, expose shorter or read fewer pixels"
+            f"{rounded(camera.min_period * MARGIN, up=True):g}, expose shorter or read fewer pixels"
         )
 
 
@@ -133,7 +133,7 @@ def _speed(facts: PlanFacts) -> Iterator[str]:
         period = facts.plan.period * facts.views.speed / facts.stage.max_speed
         yield (
             f"the scan needs {degrees(facts.views.speed)}/s, the stage turns at most "
-            f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {_up(period):g} or take more views"
+            f"{degrees(facts.stage.max_speed)}/s; set scan.period_s >= {rounded(period, up=True):g} or take more views"
         )
 
 
@@ -151,7 +151,7 @@ def _spacing(interval: int, stage: StageLimits) -> Iterator[str]:
         yield (
             f"views are {interval} counts of the stage apart, its trigger output needs {least}: "
             f"{stage.pulse_spacing:g} s at its full speed of {degrees(stage.max_speed)}/s. Take fewer views, a shorter "
-            f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {_down(fastest):g}"
+            f"devices.stage.pulse_width_s where it has one, or devices.stage.max_speed_deg_s <= {rounded(fastest):g}"
         )
 
 
@@ -184,15 +184,3 @@ def _reference(name: str, field: FieldPlan, exposure: float, otherwise: str) -> 
         yield f"no {name} will be taken (scan.{name}.at: none)"
     elif field.exposure != exposure:
         yield f"{name} are exposed for {field.exposure:g} s and views for {exposure:g} s; {otherwise}"
-
-
-def _up(seconds: float) -> float:
-    """Rounded up to three digits, so that the advice works."""
-    unit = 10.0 ** (math.floor(math.log10(seconds)) - 2)
-    return math.ceil(seconds / unit - 1e-9) * unit
-
-
-def _down(value: float) -> float:
-    """Rounded down to three digits, as `_up`."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
-    return math.floor(value / unit + 1e-9) * unit

@@ -238,12 +238,7 @@ def _return(views: Block, stage: StageLimits) -> float:
 
 
 def describe(
-    plan: ScanPlan,
-    timeline: Timeline,
-    stage: StageLimits,
-    camera: CameraTiming,
-    *,
-    free_bytes: int | None = None,
+    plan: ScanPlan, timeline: Timeline, stage: StageLimits, camera: CameraTiming, *, free_bytes: int | None = None
 ) -> list[str]:
     """The timeline as text, for `check` and `scan --dry-run`."""
     lines = [

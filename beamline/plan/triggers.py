@@ -32,21 +32,13 @@ class Scale:
 
 @dataclass(frozen=True)
 class Flight:
-    """Pulse trains of a fly scan.
+    """Pulse trains of a fly scan."""
 
-    Attributes:
-        trains: one a pass, in the order of the views.
-        interval: whole counts between neighbouring pulses of a pass (positive).
-        step: whole counts between neighbouring angles of all passes together.
-        exact: the step without rounding.
-        drift: largest shift of a view by the rounding, radians.
-    """
-
-    trains: tuple[TriggerTrain, ...]
-    interval: int
-    step: int
-    exact: float
-    drift: float
+    trains: tuple[TriggerTrain, ...]  # one a pass, in the order of the views
+    interval: int  # whole counts between neighbouring pulses of a pass (positive)
+    step: int  # whole counts between neighbouring angles of all passes together
+    exact: float  # the step without rounding
+    drift: float  # largest shift of a view by the rounding, radians
 
     def counts(self) -> NDArray[np.int64]:
         """Count of every pulse, in the order of the views."""

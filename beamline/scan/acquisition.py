@@ -24,8 +24,6 @@ from drivers.base.protocols import CameraSettings, Devices
 
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
-NOUN = {FrameKind.PROJECTION: "projection", FrameKind.FLAT: "flat", FrameKind.DARK: "dark"}
-
 
 @dataclass(frozen=True)
 class TakenBlock:
@@ -185,7 +183,7 @@ class Acquisition:
         if shutter.is_open() is (kind is FrameKind.DARK):
             wanted, found = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
             raise InstrumentError(
-                f"{shutter.name}: it is {found}, {NOUN[kind]}s need it {wanted}. Check its interlock. "
+                f"{shutter.name}: it is {found}, {kind.name.lower()}s need it {wanted}. Check its interlock. "
                 "What was taken before is in the file."
             )
 
@@ -243,7 +241,7 @@ class Acquisition:
         if home is None or failed or self._stop.aborting:
             return failed
         attempt(self._devices.sample.back)
-        if not attempt(lambda: self._exposures.go_home(home)):
+        if not attempt(lambda: self._exposures.go(home, until_stop=False)):
             self.unsafe = not attempt(*stop)
         return failed
 
@@ -293,7 +291,7 @@ def _in_words(error: Exception) -> str:
 
 def _describe(done: TakenBlock) -> str:
     """Sentences on missing, extra and doubtful frames of a block."""
-    block, taken, noun = done.block, done.taken, NOUN[done.block.kind]
+    block, taken, noun = done.block, done.taken, done.block.kind.name.lower()
     text = ""
     if taken.missing:
         n = len(taken.missing)

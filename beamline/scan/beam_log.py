@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections.abc import Callable
-from types import TracebackType
 from typing import Self
 
+from beamline.config.devices import BeamMonitorConfig, NoBeamMonitor
 from beamline.core.events import BeamRead, Sink, Warned
+from beamline.core.stop import PauseRequest
+from beamline.core.text import count
+from beamline.scan.supervision import PAUSE_POLL, BeamGuard, BeamLimits
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, BeamReading
 
@@ -26,11 +31,7 @@ class BeamLog:
     """
 
     def __init__(
-        self,
-        monitor: BeamMonitor | None,
-        period: float,
-        sink: Sink,
-        react: Callable[[BeamReading], None] | None = None,
+        self, monitor: BeamMonitor | None, period: float, sink: Sink, react: Callable[[BeamReading], None] | None = None
     ) -> None:
         self._monitor, self._period, self._sink, self._react = monitor, period, sink, react
         self._readings: list[BeamReading] = []
@@ -44,10 +45,11 @@ class BeamLog:
         """The readings so far, in order of time."""
         return tuple(self._readings)
 
-    def next_reading_done(self) -> Callable[[], bool]:
-        """Returns a function: whether a reading begun after this call is over (or failed), or no reading will come."""
+    def wait_for_reading(self, stop: Callable[[], bool]) -> None:
+        """Where readings are told: wait until one begun after this call is over (or failed), or `stop` returns True."""
         due = self._begun + 1
-        return lambda: self._ended >= due or not self._thread.is_alive()
+        while self._react is not None and self._ended < due and self._thread.is_alive() and not stop():
+            time.sleep(PAUSE_POLL)
 
     def __enter__(self) -> Self:
         if self._monitor is not None:
@@ -56,9 +58,7 @@ class BeamLog:
             self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(LAST_WAIT)
@@ -83,8 +83,7 @@ class BeamLog:
         if self._over.is_set():  # too late to be written
             return
         if self._failed:
-            failed = "1 failed reading" if self._failed == 1 else f"{self._failed} failed readings"
-            self._sink(Warned(f"{name}: it answers again after {failed}."))
+            self._sink(Warned(f"{name}: it answers again after {count(self._failed, 'failed reading')}."))
             self._failed = 0
         self._readings.append(reading)
         self._sink(BeamRead(reading.value, reading.unit, reading.time))
@@ -97,3 +96,13 @@ class BeamLog:
             return
         problem = str(error) if isinstance(error, DeviceError) else f"{name}: {type(error).__name__}: {error}."
         self._sink(Warned(f"{problem} The scan goes on without readings until it answers again."))
+
+
+def beam_log(config: BeamMonitorConfig, monitor: BeamMonitor | None, sink: Sink, pause: PauseRequest) -> BeamLog:
+    """The log of the configured beam monitor, which pauses the scan where that is configured."""
+    if isinstance(config, NoBeamMonitor):
+        return BeamLog(None, math.inf, sink)
+    guard = None
+    if config.pause_below is not None:
+        guard = BeamGuard(BeamLimits(config.pause_below, config.resumes_at, config.settle_s), pause)
+    return BeamLog(monitor, config.period_s, sink, guard)

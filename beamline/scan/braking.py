@@ -16,7 +16,7 @@ from itertools import pairwise
 
 from beamline.scan.ledger import DeliveredFrame, Ledger, enter, start_known
 
-EARLY, LATE = 0.02, 0.5  # s by which braking may seem to begin before the stop was sent, and may begin after it
+EARLY, LATE = 0.02, 0.5  # s before and after the stop was sent between which the braking must begin, as worked out
 MOST = 0.75  # share of the triggers that must have a frame by their times; by chance 0.4 do
 FEW = 4  # triggers; fewer exposures show nothing
 SHRINKS = 0.2  # periods by which an interval may be shorter than the one before
@@ -25,17 +25,11 @@ BESIDE = 0.02  # intervals: a stage that stands so near a trigger may or may not
 
 @dataclass(frozen=True)
 class Braking:
-    """A stage that was told to stop within a train, and stands.
+    """A stage that was told to stop within a train, and stands."""
 
-    Attributes:
-        told: time at which it was told, in s.
-        stood: where it stands, in intervals beyond trigger 0.
-        deceleration: intervals/s².
-    """
-
-    told: float
-    stood: float
-    deceleration: float
+    told: float  # time at which it was told, in s
+    stood: float  # where it stands, in intervals beyond trigger 0
+    deceleration: float  # intervals/s²
 
 
 Placing = Callable[[Ledger, Braking, DeliveredFrame], DeliveredFrame]

@@ -41,11 +41,7 @@ class Verb(StrEnum):
 
 
 class _Requests:
-    """The folder of requests, made here and held open, so that a replacement is noticed.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """The folder of requests, made here and held open, so that a replacement is noticed. OSError: it cannot be made."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(mode=0o700)

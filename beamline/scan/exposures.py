@@ -15,7 +15,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, booked, by_nothing, placing
-from beamline.scan.ledger import EXTRA, Account, DeliveredFrame, Ledger, Train, enter, settle
+from beamline.scan.ledger import EXTRA, DeliveredFrame, Ledger, Train, enter, settle
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
 from drivers.base.clock import Clock
@@ -43,8 +43,7 @@ class Taken:
         lost, ignored: of the missing ones, exposed but not delivered, and not exposed, where that is known.
         extra: frames that no trigger exposed.
         unconfirmed: of the extra ones, those exposed while the stage braked.
-        shift: triggers by which the angles of a pass may be wrong (see ledger.Account).
-        off: steps by which the angle of a frame may be wrong (likewise).
+        shift, off: the largest of the passes, see `Ledger`.
     """
 
     frames: int = 0
@@ -61,15 +60,15 @@ class Taken:
         """Record triggers without a frame. A trigger with an earlier frame, perhaps without beam, keeps that frame."""
         self.missing += [trigger for trigger in triggers if trigger not in self.rows]
 
-    def enter(self, account: Account, first: int) -> None:
+    def enter(self, settled: Ledger, first: int) -> None:
         """Add a pass whose first trigger is `first`."""
-        self.miss(first + i for i in account.missing)
-        self.lost += account.lost
-        self.ignored += account.ignored
-        self.extra += len(account.extra)
-        self.unconfirmed += account.unconfirmed
-        self.shift = max(self.shift, account.shift)
-        self.off = max(self.off, account.off)
+        self.miss(first + i for i in settled.missing)
+        self.lost += settled.lost
+        self.ignored += settled.ignored
+        self.extra += len(settled.extra)
+        self.unconfirmed += settled.unconfirmed
+        self.shift = max(self.shift, settled.shift)
+        self.off = max(self.off, settled.off)
 
 
 @dataclass
@@ -87,13 +86,13 @@ class _Pass:
     seconds: float
     told: float = math.inf
     paused: bool = False
-    braking: Braking | None = None
+    braking: Braking = NOT_BRAKING
     waiting: list[CameraFrame] = field(default_factory=list)
 
     @property
     def so_far(self) -> Ledger:
         """The settled ledger, as if no further frame came."""
-        return booked(self.ledger, self._braking, self._exposed, by_nothing)
+        return booked(self.ledger, self.braking, self._exposed, by_nothing)
 
     @property
     def last_due(self) -> float:
@@ -110,11 +109,12 @@ class _Pass:
             last: no further frame will come, so none waits.
         """
         self.waiting += frames
-        if self.braking is not None and not last:
+        brakes = self.braking is not NOT_BRAKING
+        if brakes and not last:
             return
-        way = by_nothing if self.braking is None else placing(self.ledger, self.braking, self._exposed)
+        way = placing(self.ledger, self.braking, self._exposed) if brakes else by_nothing
         while self.waiting:
-            exposed = [way(self.ledger, self._braking, frame) for frame in self._exposed]
+            exposed = [way(self.ledger, self.braking, frame) for frame in self._exposed]
             if (entered := enter(self.ledger, exposed, last)) is None:
                 return
             self.ledger, entry = entered
@@ -124,10 +124,6 @@ class _Pass:
     @property
     def _exposed(self) -> list[DeliveredFrame]:
         return [DeliveredFrame(frame.framestamp, frame.time) for frame in self.waiting]
-
-    @property
-    def _braking(self) -> Braking:
-        return self.braking or NOT_BRAKING
 
 
 class Exposures:
@@ -184,19 +180,12 @@ class Exposures:
                 frame.counts, kind, row, trigger, frame.framestamp, angle, frame.time, accepted.exposure, replaces
             )
 
-    def go(self, angle: float) -> bool:
-        """Move to `angle` at full speed and wait; False if a stop cut the move short."""
+    def go(self, angle: float, *, until_stop: bool = True) -> bool:
+        """Move to `angle` at full speed and wait; False if a stop (or only an abort) cut the move short."""
         limits = self._stage.limits
         distance = angle - self._stage.position()
         self._stage.start_move(angle, limits.max_speed)
-        return self._wait(move_seconds(distance, limits.max_speed, limits.acceleration))
-
-    def go_home(self, angle: float) -> None:
-        """Move to `angle` also after a stop request; only an abort ends this move early."""
-        limits = self._stage.limits
-        seconds = move_seconds(angle - self._stage.position(), limits.max_speed, limits.acceleration)
-        self._stage.start_move(angle, limits.max_speed)
-        self._wait(seconds, until_stop=False)
+        return self._wait(move_seconds(distance, limits.max_speed, limits.acceleration), until_stop)
 
     def _fly(self, block: Block, taken: Taken) -> Iterator[tuple[CameraFrame, int, float]]:
         ahead, i = passes(block), 0
@@ -397,11 +386,7 @@ class Exposures:
         return True
 
     def stand(self) -> None:
-        """Slow down and wait until the stage stands.
-
-        Raises:
-            InstrumentError: it does not stand.
-        """
+        """Slow down and wait until the stage stands. InstrumentError: it does not stand."""
         limits = self._stage.limits
         deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
         self._stage.stop()

@@ -43,19 +43,12 @@ class LedgerError(DataError):
 
 @dataclass(frozen=True, eq=False)
 class Train:
-    """The triggers to expect.
+    """The triggers to expect."""
 
-    Attributes:
-        angles: float64 [trigger] radians.
-        period: s between triggers.
-        first: time of trigger 0, s since the Unix epoch; None if unknown.
-        tolerance: s by which `first` may be wrong.
-    """
-
-    angles: NDArray[np.float64]
-    period: float
-    first: float | None = None
-    tolerance: float = 0.0
+    angles: NDArray[np.float64]  # float64 [trigger] radians
+    period: float  # s between triggers
+    first: float | None = None  # time of trigger 0, s since the Unix epoch; None if unknown
+    tolerance: float = 0.0  # s by which `first` may be wrong
 
     def __post_init__(self) -> None:
         if self.angles.ndim != 1 or self.angles.size == 0:
@@ -80,66 +73,36 @@ class LedgerEntry:
 class Ledger:
     """Triggers and frames matched so far: begins as `Ledger(train)`, goes on by `assign`, ends by `settle`.
 
-    Attributes:
-        train: the expected triggers.
-        last: the trigger of the last matched frame, -1 before the first.
-        exposed: framestamp of the last frame, matched or not, -1 before the first.
-        unmatched: exposures since the last matched frame, delivered or not.
-        phase, period: estimated time of the last matched trigger, and estimated period, both in s.
-        first: the first matched frame: framestamp, trigger, and periods since the expected time of trigger 0.
-        missing: triggers up to `last` without a frame.
-        lost: of these, frames that were exposed but never delivered.
-        ignored: of these, triggers that exposed nothing.
-        extra: framestamps of frames that no trigger exposed.
-        beyond: of these, frames that came when a trigger after the last one would have come.
-        unconfirmed: of the extra frames, those exposed while the stage braked.
-        off: of the matched frames the largest distance from the trigger's expected time, in periods.
+    Without faults every trigger has its frame and every frame its trigger.
     """
 
-    train: Train
-    last: int = -1
-    exposed: int = -1
-    unmatched: int = 0
+    train: Train  # the expected triggers
+    last: int = -1  # the trigger of the last matched frame, -1 before the first
+    exposed: int = -1  # framestamp of the last frame, matched or not, -1 before the first
+    unmatched: int = 0  # exposures since the last matched frame, delivered or not
+    # phase, period: estimated time of the last matched trigger, and estimated period, both in s
     phase: float = math.nan
     period: float = math.nan
+    # the first matched frame: framestamp, trigger, and periods since the expected time of trigger 0
     first: tuple[int, int, float] = (-1, -1, math.nan)
-    missing: tuple[int, ...] = ()
-    lost: int = 0
-    ignored: int = 0
-    extra: tuple[int, ...] = ()
-    beyond: int = 0
-    unconfirmed: int = 0
+    missing: tuple[int, ...] = ()  # triggers without a frame, ascending: up to `last`, in a settled ledger all
+    lost: int = 0  # of these, exposed but never delivered (framestamp gap)
+    ignored: int = 0  # of these, not exposed (time gap). Those after the last frame may be either
+    extra: tuple[int, ...] = ()  # framestamps of frames that no trigger exposed
+    beyond: int = 0  # of these, frames that came when a trigger after the last one would have come
+    unconfirmed: int = 0  # of the extra frames, those exposed while the stage braked
+    # of the matched frames the largest distance from the trigger's expected time, in periods: steps by which the angle
+    # of a frame may be wrong
     off: float = 0.0
+    # in a settled ledger, by how many triggers all angles may be wrong: triggers missing at one end could as well be
+    # missing at the other, and an extra frame at the end could be one at the beginning. 0 without such frames, or if
+    # the time of the first trigger is known
+    shift: int = 0
 
     @property
     def complete(self) -> bool:
         """Whether the last trigger has its frame, so that no more frames are expected."""
         return self.last == self.train.n - 1
-
-
-@dataclass(frozen=True)
-class Account:
-    """A settled ledger. Without faults every trigger has its frame and every frame its trigger.
-
-    Attributes:
-        missing: triggers without a frame, ascending.
-        lost: of these, exposed but not delivered (framestamp gap).
-        ignored: of these, not exposed (time gap). Those after the last frame may be either.
-        extra: framestamps of the frames that no trigger exposed.
-        unconfirmed: how many of them were exposed while the stage braked.
-        shift: by how many triggers all angles may be wrong, because triggers missing at one end could as well be
-        missing at the other. Likewise an extra frame at the end could be one at the beginning. 0 without such
-        frames, or if the time of the first trigger is known.
-        off: steps by which the angle of a frame may be wrong, because it came so much off its trigger.
-    """
-
-    missing: tuple[int, ...]
-    lost: int
-    ignored: int
-    extra: tuple[int, ...]
-    shift: int
-    unconfirmed: int = 0
-    off: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -239,22 +202,15 @@ def _extra(ledger: Ledger, frame: DeliveredFrame, position: float, beyond: bool 
     return after, LedgerEntry(EXTRA, float(np.interp(position, np.arange(train.n), train.angles)))
 
 
-def settle(ledger: Ledger, cut_short: bool = False) -> Account:
+def settle(ledger: Ledger, cut_short: bool = False) -> Ledger:
     """Close the ledger: every trigger after the last frame is missing.
 
     Args:
         cut_short: the scan was stopped; triggers after the last frame were not waited for and do not count as missing.
     """
     at_the_end = range(0 if cut_short else ledger.last + 1, 0 if cut_short else ledger.train.n)
-    return Account(
-        missing=(*ledger.missing, *at_the_end),
-        lost=ledger.lost,
-        ignored=ledger.ignored,
-        extra=ledger.extra,
-        shift=_shift(ledger, None if cut_short else len(at_the_end)),
-        unconfirmed=ledger.unconfirmed,
-        off=ledger.off,
-    )
+    shift = _shift(ledger, None if cut_short else len(at_the_end))
+    return replace(ledger, missing=(*ledger.missing, *at_the_end), shift=shift)
 
 
 def start_known(train: Train) -> bool:

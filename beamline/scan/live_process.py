@@ -25,6 +25,7 @@ from beamline.core.events import (
 )
 from beamline.core.machine import free_memory
 from beamline.core.process import ChildProcess, Ending, json_object
+from beamline.core.stop import StopRequest
 from beamline.core.text import count, size
 from beamline.instrument.connect import describe
 from recon.base.choices import AUTO
@@ -40,6 +41,9 @@ _SILENCE = 300.0  # real s without output, after which the process is ended
 _GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts
 _CLOSE = 5.0  # the same if the scan itself has failed
 _POLL = 0.1  # real s between two checks of its readiness
+ASK_LIVE_AFTER = 4.0
+"""Real s from the request to stop a scan to the request for the live reconstruction's volume. The volume then comes
+within 10 s; the time that the scan takes to end counts."""
 
 
 # Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
@@ -51,17 +55,11 @@ _SHARE = 0.5  # share of the free memory
 
 @dataclass(frozen=True)
 class LivePlan:
-    """The part of a scan for the live volume.
+    """The part of a scan for the live volume."""
 
-    Attributes:
-        binning: binning of rows and columns.
-        every: one of so many views, in the order taken.
-        bytes: of memory, about.
-    """
-
-    binning: int = 1
-    every: int = 1
-    bytes: int = 0
+    binning: int = 1  # binning of rows and columns
+    every: int = 1  # one of so many views, in the order taken
+    bytes: int = 0  # of memory, about
 
     @property
     def whole(self) -> bool:
@@ -182,6 +180,14 @@ def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> S
     return [sys.executable, "-m", "beamline.cli.main", "recon", str(scan), *flags, "--json", *words]
 
 
+def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
+    """Whether the live reconstruction of an ended scan should end with its present volume. It should after an abort, a
+    new stop, or ASK_LIVE_AFTER after the scan's stop (unless its views were enough). Also with a `useless` file, which
+    is broken or has no projections."""
+    last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
+    return lambda: useless or stop.aborting or (stop.stopping and stop.seconds >= last)
+
+
 class LiveReconstruction:
     """A running reconstruction whose events are passed on, each marked with source="recon".
 
@@ -293,3 +299,12 @@ class LiveReconstruction:
             case Failed(message=message):
                 event = Warned(f"{self._what.capitalize()}: {message}")
         self._sink(replace(event, source="recon"))
+
+
+def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
+    """The data of the `done` event of a reconstruction of a complete scan, as `LiveReconstruction.finish`."""
+    process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
+    try:
+        return process.finish(lambda: stop.stopping, lambda: stop.aborting)
+    finally:
+        process.close()

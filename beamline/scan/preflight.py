@@ -57,8 +57,7 @@ class DryRun:
 
     def data(self) -> Mapping[str, Any]:
         """For a program: the numbers behind the lines, in s, rad, bytes and pixels."""
-        worked = self.timeline
-        views = worked.views
+        worked, views = self.timeline, self.timeline.views
         return {
             "remarks": worked.remarks,
             "duration": worked.duration,
@@ -92,26 +91,24 @@ def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = a
     """
     plan = remaining(plan_of(settings))
     stage, camera, to_counts = connect.describe(settings)
-    free = free_bytes(runs or Path(settings.storage.folder))
-    worked = work_out(
-        plan,
-        stage,
-        to_counts,
-        camera,
-        axis_col=settings.optics.axis_col,
-        preview_bin=settings.storage.preview_bin,
-        free_bytes=free,
-    )
-    return DryRun(plan, with_remarks(worked, settings, camera.shape), stage, camera, free)
+    free = shutil.disk_usage(disk_of(runs or Path(settings.storage.folder))).free
+    return DryRun(plan, _worked(settings, plan, stage, to_counts, camera, free), stage, camera, free)
 
 
-def with_remarks(worked: Timeline, config: Config, shape: tuple[int, int]) -> Timeline:
-    """The timeline with remarks on the live volume."""
-    remarks = [*worked.remarks]
-    method = config.recon.method
-    if config.recon.live and method != AUTO and streams(method):
-        remarks.append(live_need(shape, worked.views.n, free_memory()))
-    return replace(worked, remarks=tuple(remarks))
+def _worked(
+    config: Config,
+    plan: ScanPlan,
+    stage: StageLimits,
+    to_counts: Callable[[float], int],
+    camera: CameraTiming,
+    free: int,
+) -> Timeline:
+    """The timeline, with a remark on the live volume."""
+    axis_col, preview_bin, method = config.optics.axis_col, config.storage.preview_bin, config.recon.method
+    worked = work_out(plan, stage, to_counts, camera, axis_col=axis_col, preview_bin=preview_bin, free_bytes=free)
+    if not config.recon.live or method == AUTO or not streams(method):
+        return worked
+    return replace(worked, remarks=(*worked.remarks, live_need(camera.shape, worked.views.n, free_memory())))
 
 
 def refuse_violations(worked: Timeline) -> None:
@@ -123,8 +120,8 @@ def refuse_violations(worked: Timeline) -> None:
         raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
 
 
-def free_bytes(folder: Path) -> int:
-    """Free space on the disk that holds `folder`, or will hold it once it exists.
+def disk_of(folder: Path) -> Path:
+    """`folder`, or its nearest parent that exists: on the disk that will hold it.
 
     Raises:
         ConfigError: a file stands in the way, or there is no such disk.
@@ -136,26 +133,19 @@ def free_bytes(folder: Path) -> int:
         raise ConfigError(
             f"runs cannot go to {folder}: there is {problem}. Choose another folder; nothing was started."
         )
-    return shutil.disk_usage(there).free
+    return there
 
 
 @dataclass(frozen=True, eq=False)
 class ReadyScan:
-    """A scan that may start.
-
-    Attributes:
-        settings: of the camera for the views, as it accepted them.
-        timing: of the camera with these settings.
-        monitor: before the first frame.
-        info: written into the file before the first frame.
-    """
+    """A scan that may start."""
 
     plan: ScanPlan
     timeline: Timeline
-    settings: CameraSettings
-    timing: CameraTiming
-    monitor: Monitor
-    info: ScanInfo
+    settings: CameraSettings  # of the camera for the views, as it accepted them
+    timing: CameraTiming  # of the camera with these settings
+    monitor: Monitor  # before the first frame
+    info: ScanInfo  # written into the file before the first frame
 
 
 def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remaining: Remaining = all_of) -> ReadyScan:
@@ -173,24 +163,13 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
     stage, camera = instrument.devices.stage, instrument.devices.camera
     plan = remaining(plan_of(config))
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.EXTERNAL))
-    timing, free = camera.timing, free_bytes(runs)
-    axis_col = config.optics.axis_col
-    preview_bin = config.storage.preview_bin
-    timeline = work_out(
-        plan,
-        stage.limits,
-        stage.to_counts,
-        timing,
-        axis_col=axis_col,
-        preview_bin=preview_bin,
-        free_bytes=free,
-    )
+    timing, free = camera.timing, shutil.disk_usage(disk_of(runs)).free
+    timeline = _worked(config, plan, stage.limits, stage.to_counts, timing, free)
     refuse_violations(timeline)
-    timeline = with_remarks(timeline, config, timing.shape)
     info = _info(config, instrument, plan, timeline)
     monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
-    digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, preview_bin)
+    digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     if instrument.simulated is not None:
         instrument.simulated.rehearse()
     return ReadyScan(plan, timeline, settings, timing, monitor, info)

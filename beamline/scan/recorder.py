@@ -54,7 +54,7 @@ class Writer(Protocol):
     def flush(self) -> None: ...
 
 
-def _room(timeline: Timeline) -> int:
+def room(timeline: Timeline) -> int:
     """Frames that may wait to be written."""
     low, high = WAITING_FRAMES
     return min(max(WAITING_BYTES // timeline.frame_bytes, low), high)
@@ -62,7 +62,7 @@ def _room(timeline: Timeline) -> int:
 
 def frames_in_memory(timeline: Timeline) -> int:
     """Most frames of a scan in memory at one time: waiting, in work, and on their way from the camera."""
-    return min(_room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
+    return min(room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
 
 
 _Checked = tuple[Frame, FrameDigest, tuple[Flag, ...]]
@@ -74,7 +74,8 @@ class Recorder:
     Appended frames are flushed when no frame waits; otherwise the writer decides how often.
 
     No frame is dropped: while the disk is behind, `put` waits. A fly scan cannot wait for room,
-    so it pauses before the queue is full. Any scan pauses before the disk is full.
+    so it pauses before the queue is full. Any scan pauses before the disk is full. `put`, `check`, `wait` and `finish`
+    raise DataError where a frame could not be written, or the disk has taken none for STALL.
 
     Args:
         react: told the flags of each frame.
@@ -82,6 +83,7 @@ class Recorder:
 
     Attributes:
         n_frames: written so far.
+        retaken: views that were taken again.
         references: the darks and flats so far.
     """
 
@@ -105,19 +107,19 @@ class Recorder:
         self._found: list[Flag] = []
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
-        self._retaken, self._retaking = 0, False
+        self.retaken, self._retaking = 0, False
         self.references = ReferenceLog(preview_bin)
         self._failure: Exception | None = None
         self._work = Workload()
-        room = _room(timeline)
-        self._waiting: Queue[Frame | threading.Event | None] = Queue(room)
+        most = room(timeline)
+        self._waiting: Queue[Frame | threading.Event | None] = Queue(most)
         self._checked: Queue[_Checked | Exception | threading.Event | None] = Queue(CHECKED_FRAMES)
         self._row_bytes = timeline.total_bytes // timeline.n_frames
         pause, views = pause or PauseRequest(), timeline.views
         on_the_way = math.ceil(BRAKING / views.period) if views.trains else 1
         in_work = CHECKED_FRAMES + 2
-        self._space = SpaceGuard(self._row_bytes * (room + in_work + on_the_way), pause)
-        self._backlog = BacklogGuard(room, pause, self._work) if views.trains else None
+        self._space = SpaceGuard(self._row_bytes * (most + in_work + on_the_way), pause)
+        self._backlog = BacklogGuard(most, pause, self._work) if views.trains else None
         self._flying = False
         self._looked_at, self._busy_since = -math.inf, math.inf
         self._thread = threading.Thread(target=self._write_frames, name="recorder", daemon=True)
@@ -125,11 +127,7 @@ class Recorder:
         threading.Thread(target=self._check_frames, name="recorder's checks", daemon=True).start()
 
     def put(self, frame: Frame) -> None:
-        """Queue a frame for writing; waits while the queue is full.
-
-        Raises:
-            DataError: the disk takes no frames, or a frame before could not be written.
-        """
+        """Queue a frame for writing; waits while the queue is full."""
         self._enqueue(frame)
         if frame.kind is not FrameKind.INVALID:  # which comes in any block
             self._flying = frame.kind is FrameKind.PROJECTION and not self._retaking
@@ -137,44 +135,26 @@ class Recorder:
         self._raise_failure()
 
     def check(self) -> None:
-        """Check whether the disk answers, while no frames come.
-
-        Raises:
-            DataError: it has not taken a frame for STALL, or failed.
-        """
+        """Check whether the disk answers, while no frames come."""
         if time.monotonic() - self._busy_since > STALL:
             raise self._stalled()
         self._raise_failure()
 
     def wait(self) -> None:
-        """Wait until every frame that was put is written, and go on.
-
-        Raises:
-            DataError: one could not be written.
-        """
+        """Wait until every frame that was put is written, and go on."""
         reached = threading.Event()
         self._enqueue(reached)
-        written = -1
-        while not reached.wait(STALL):
-            if written == self.n_frames:
-                raise self._stalled()
-            written = self.n_frames
-        self._raise_failure()
+        self._wait_until(lambda: reached.wait(STALL))
 
     def finish(self) -> None:
-        """Wait until every frame that was put is written; no other may follow.
+        """Wait until every frame that was put is written; no other may follow."""
 
-        Raises:
-            DataError: one could not be written.
-        """
-        self._enqueue(None)
-        written = -1
-        while self._thread.is_alive() and written != self.n_frames:
-            written = self.n_frames
+        def ended() -> bool:
             self._thread.join(STALL)
-        if self._thread.is_alive():
-            raise self._stalled()
-        self._raise_failure()
+            return not self._thread.is_alive()
+
+        self._enqueue(None)
+        self._wait_until(ended)
 
     @property
     def flags(self) -> dict[str, dict[str, int]]:
@@ -193,11 +173,6 @@ class Recorder:
     def alarmed_views(self) -> list[Retake]:
         """The views among these, with the trigger that each would be taken again by."""
         return [Retake(row, self._triggers[row]) for row in sorted(self._alarmed & self._triggers.keys())]
-
-    @property
-    def retaken(self) -> int:
-        """Views that were taken again."""
-        return self._retaken
 
     @property
     def _alarmed(self) -> set[int]:
@@ -219,6 +194,15 @@ class Recorder:
             self._waiting.put(item, timeout=STALL)
         except Full:
             raise self._stalled() from None
+
+    def _wait_until(self, over: Callable[[], bool]) -> None:
+        """Wait, by calls of `over` that last STALL at most, as long as frames are written."""
+        written = self.n_frames
+        while not over():
+            if written == self.n_frames:
+                raise self._stalled()
+            written = self.n_frames
+        self._raise_failure()
 
     def _stalled(self) -> DataError:
         return DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
@@ -268,7 +252,8 @@ class Recorder:
                     if isinstance(item, tuple):
                         self._write(*item)
                         flushed = False
-                    if not flushed and (self._nothing_waits or not isinstance(item, tuple)):
+                    nothing_waits = self._waiting.empty() and self._checked.empty()
+                    if not flushed and (nothing_waits or not isinstance(item, tuple)):
                         self._writer.flush()
                         flushed = True
             except Exception as error:
@@ -283,10 +268,6 @@ class Recorder:
             if isinstance(item, threading.Event):
                 item.set()
             item = self._checked.get()
-
-    @property
-    def _nothing_waits(self) -> bool:
-        return self._waiting.empty() and self._checked.empty()
 
     def _next(self) -> Frame | threading.Event | None:
         """The next item of the queue; checks the disk about once a second meanwhile."""
@@ -338,7 +319,7 @@ class Recorder:
             self._triggers[frame.index] = frame.trigger
         if frame.replaces >= 0:
             self._replaced.add(frame.replaces)
-            self._retaken += frame.kind is FrameKind.PROJECTION
+            self.retaken += frame.kind is FrameKind.PROJECTION
         active = {(flag.check, flag.level) for flag in flags}
         for flag in flags:
             if (flag.check, flag.level) not in self._active:

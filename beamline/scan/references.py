@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from beamline.config.references import ReferencesSection, reference_limits
+from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.references import ReferenceFrame, ReferenceLimits, judge, photons
@@ -58,10 +60,7 @@ class ReferenceLog:
 
     def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
         """A warning if noise would dominate the views, because a pixel of the open beam has few photons; or None.
-
-        Args:
-            exposure: s, of the views.
-        """
+        `exposure`: s, of the views."""
         judged = judge(self._groups, limits, self._views)
         good = [group for group, found in zip(self._groups, judged, strict=True) if not found.faults]
         flats, darks = (
@@ -79,3 +78,25 @@ class ReferenceLog:
             f"volume. Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s to "
             "match), or bin the camera's pixels (devices.camera.binning). `beamline tune` measures it."
         )
+
+
+class ReferenceReport:
+    """Warns of the faults of darks and flats, once for each group, and once of too little light.
+
+    Args:
+        exposure: s, of the views.
+    """
+
+    def __init__(self, section: ReferencesSection, exposure: float, sink: Sink) -> None:
+        self._limits, self._exposure, self._sink = reference_limits(section), exposure, sink
+        self._told: set[str] = set()
+
+    def faults(self, log: ReferenceLog, planned: Sequence[Block] = ()) -> Mapping[str, str]:
+        """The faults of the darks and flats so far, as `ReferenceLog.faults`."""
+        faults = log.faults(self._limits, planned)
+        little_light = log.too_little_light(self._limits, self._exposure)
+        said = faults if little_light is None else {"little light": little_light, **faults}
+        for group in [group for group in said if group not in self._told]:
+            self._told.add(group)
+            self._sink(Warned(said[group]))
+        return faults

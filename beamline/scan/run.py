@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -11,10 +10,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from beamline.config.devices import NoBeamMonitor
 from beamline.config.load import Config, resolved_yaml
 from beamline.config.monitor import policies
-from beamline.config.references import reference_limits
 from beamline.core.errors import (
     DataError,
     ReferencesError,
@@ -35,19 +32,19 @@ from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
 from beamline.monitor.rehearsal import rehearse
-from beamline.plan.plan import Block
 from beamline.plan.retake import Retake, spread
 from beamline.scan.acquisition import Acquisition
-from beamline.scan.beam_log import BeamLog
+from beamline.scan.beam_log import BeamLog, beam_log
 from beamline.scan.control import verbs_taken
 from beamline.scan.ledger import LedgerError
-from beamline.scan.live_process import LiveCommand, LiveReconstruction
+from beamline.scan.live_process import LiveCommand, LiveReconstruction, live_should_end, reconstruct
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.recorder import Recorder, frames_in_memory
+from beamline.scan.references import ReferenceReport
 from beamline.scan.resume import ResumableRun
 from beamline.scan.run_folder import CONFIG, RECON, RECON_LOG, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.scan.states import NEXT, State, StateMachine
-from beamline.scan.supervision import PAUSE_POLL, AlarmPolicy, AlarmReaction, BeamGuard, BeamLimits, Supervision
+from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, Supervision
 from beamline.scan.watchdog import watched
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -57,14 +54,8 @@ from drivers.manual import Ask
 SAFE = "Stage stopped, shutter closed; the last frames are being written"
 """Message of the state `finishing`."""
 
-ASK_LIVE_AFTER = 4.0
-"""Real s from the request to stop a scan to the request for the live reconstruction's volume. The volume then comes
-within 10 s; the time that the scan takes to end counts."""
-
 READY_WITHIN = 300.0
 """Real s that a scan waits for its live reconstruction, which compiles once on a machine; see `_Run._compiled`."""
-
-_LITTLE_LIGHT = "little light"
 
 UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
@@ -176,18 +167,6 @@ def _refuse_stop(stop: StopRequest) -> None:
         raise ScanAborted(f"Interrupted before anything was acquired: {stop.reason}. Nothing has moved.")
 
 
-def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
-    """Whether the live reconstruction of an ended scan should end with its present volume. It should after an abort, a
-    new stop, or ASK_LIVE_AFTER after the scan's stop (unless its views were enough). Also with a `useless` file, which
-    is broken or has no projections."""
-    last = math.inf if stop.enough else ASK_LIVE_AFTER if stop.stopping else 0.0
-
-    def ends() -> bool:
-        return useless or stop.aborting or (stop.stopping and stop.seconds >= last)
-
-    return ends
-
-
 @dataclass(frozen=True, eq=False)
 class _Run:
     config: Config
@@ -199,12 +178,14 @@ class _Run:
     began: float
     series: ResumableRun | None
     pause: PauseRequest = field(default_factory=PauseRequest)
-    told: set[str] = field(default_factory=set)
-    """Groups of references whose faults were reported, and `_LITTLE_LIGHT` once it was."""
 
     @cached_property
     def states(self) -> StateMachine:
         return StateMachine(self.sink)
+
+    @cached_property
+    def references(self) -> ReferenceReport:
+        return ReferenceReport(self.config.references, self.ready.plan.exposure, self.sink)
 
     def go(self, live: LiveCommand | None, afterwards: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         """The whole run, and its last event: `done` or `failed`."""
@@ -226,7 +207,9 @@ class _Run:
     def _scan(self, live: LiveCommand | None, release: Callable[[], None]) -> RunResult:
         path = self.folder / SCAN
         command = None if live is None else live(path, self.folder / RECON)
-        self.sink(self._begun(path))
+        timeline = self.ready.timeline
+        planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
+        self.sink(RunStarted(self.folder, path, self.config.sample.name, *planned))
         self._prepare_memory()
         writer = self._writer(path)
         with ExitStack() as ending:
@@ -265,20 +248,15 @@ class _Run:
     def _reconstructed(self, command: LiveCommand, result: RunResult) -> RunResult:
         """The complete scan's result with its volume; Ctrl-C ends the reconstruction alone."""
         began = time.monotonic()
-        log = self.folder / RECON_LOG
         words = command(result.path, self.folder / RECON)
-        process = LiveReconstruction(words, log, self.sink, what="reconstruction", silence=math.inf, low_priority=False)
-        try:
-            recon = process.finish(lambda: self.stop.stopping, lambda: self.stop.aborting)
-        finally:
-            process.close()
+        recon = reconstruct(words, self.folder / RECON_LOG, self.sink, self.stop)
         return replace(result, recon=recon, seconds=result.seconds + time.monotonic() - began)
 
     def _acquire_and_follow(
         self, writer: NXtomoWriter, follower: LiveReconstruction | None, release: Callable[[], None]
     ) -> RunResult:
         recorder = self._recorder(writer)
-        beam = self._beam_log()
+        beam = beam_log(self.config.devices.beam_monitor, self.instrument.beam_monitor, self.sink, self.pause)
         acquisition = self._acquisition(recorder, beam, follower)
         labels = LabelLog()
         with beam:
@@ -286,8 +264,7 @@ class _Run:
         self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
         disk = _failure_of(recorder.finish)
         error = self._worse(error, disk)
-        faults = self._reference_faults(recorder)
-        self._tell_little_light(recorder)
+        faults = self.references.faults(recorder.references)
         status = "complete" if error is None else "stopped" if isinstance(error, ScanStopped) else "failed"
         missing = acquisition.missing
         # A write that does not return holds HDF5's lock: closing the file would wait for it.
@@ -362,14 +339,13 @@ class _Run:
 
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         monitor = self.config.monitor
-        policy = AlarmPolicy(monitor.act_after, policies(monitor))
         return Recorder(
             writer,
             self.ready.monitor,
             self.ready.timeline,
             preview_bin=self.config.storage.preview_bin,
             sink=self.sink,
-            react=AlarmReaction(policy, self.stop, self.pause, self.sink),
+            react=AlarmReaction(monitor.act_after, policies(monitor), self.stop, self.pause, self.sink),
             pause=self.pause,
         )
 
@@ -380,27 +356,18 @@ class _Run:
             self.sink,
             Supervision(
                 lambda: self._refusal(recorder, follower), self.pause, lambda: _wait_in_pause(recorder), self.states,
-                lambda missing: self._retakes(recorder, missing), lambda: self._wait_for_reading(beam),
+                lambda missing: self._retakes(recorder, missing),
+                lambda: beam.wait_for_reading(lambda: self.stop.stopping),
             ),
         )  # fmt: skip
-
-    def _wait_for_reading(self, beam: BeamLog) -> None:
-        """Where the scan pauses without beam: wait until the beam was read after the last frame of a block."""
-        chosen = self.config.devices.beam_monitor
-        if isinstance(chosen, NoBeamMonitor) or chosen.pause_below is None:
-            return
-        over = beam.next_reading_done()
-        while not over() and not self.stop.stopping:
-            time.sleep(PAUSE_POLL)
 
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
         recorder.wait()
-        self._tell_little_light(recorder)
         if self.config.simulation is not None:
             self._compiled(follower)
         blocks = self.ready.timeline.blocks
-        faults = self._reference_faults(recorder, blocks[: blocks.index(self.ready.timeline.views)])
+        faults = self.references.faults(recorder.references, blocks[: blocks.index(self.ready.timeline.views)])
         if not faults or self.config.references.on_fault == "log":
             return None
         return (
@@ -430,36 +397,6 @@ class _Run:
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / most)
         self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
         return chosen
-
-    def _reference_faults(self, recorder: Recorder, planned: Sequence[Block] = ()) -> Mapping[str, str]:
-        """The faults of the darks and flats so far, by group; a fault of a new group is a warning."""
-        faults = recorder.references.faults(reference_limits(self.config.references), planned)
-        for group in faults.keys() - self.told:
-            self.told.add(group)
-            self.sink(Warned(faults[group]))
-        return faults
-
-    def _tell_little_light(self, recorder: Recorder) -> None:
-        """Warn once a scan, as soon as there are flats: before the views, if the plan has flats before them."""
-        said = recorder.references.too_little_light(reference_limits(self.config.references), self.ready.plan.exposure)
-        if said is not None and _LITTLE_LIGHT not in self.told:
-            self.told.add(_LITTLE_LIGHT)
-            self.sink(Warned(said))
-
-    def _beam_log(self) -> BeamLog:
-        chosen = self.config.devices.beam_monitor
-        if isinstance(chosen, NoBeamMonitor):
-            return BeamLog(None, math.inf, self.sink)
-        guard = None
-        if chosen.pause_below is not None:
-            limits = BeamLimits(chosen.pause_below, chosen.resumes_at, chosen.settle_s)
-            guard = BeamGuard(limits, self.pause)
-        return BeamLog(self.instrument.beam_monitor, chosen.period_s, self.sink, guard)
-
-    def _begun(self, path: Path) -> RunStarted:
-        timeline = self.ready.timeline
-        planned = timeline.n_frames, timeline.duration, timeline.total_bytes, timeline.remarks
-        return RunStarted(self.folder, path, self.config.sample.name, *planned)
 
 
 def _wait_in_pause(recorder: Recorder) -> bool:

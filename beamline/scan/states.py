@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from types import MappingProxyType
 
 from beamline.core.events import Sink, StateEntered
 
@@ -33,25 +32,19 @@ class State(StrEnum):
 
 _TAKING = frozenset({State.DARKS, State.FLATS, State.TAXI, State.ACQUIRING})
 
-NEXT: Mapping[State, frozenset[State]] = MappingProxyType(
-    {
-        State.IDLE: frozenset({State.PREPARING}),
-        State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
-        **{state: (_TAKING - {state}) | {State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
-        State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
-        State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
-        **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
-    }
-)
+NEXT: Mapping[State, frozenset[State]] = {
+    State.IDLE: frozenset({State.PREPARING}),
+    State.PREPARING: _TAKING | {State.FINISHING, State.ABORTED, State.FAILED},
+    **{state: (_TAKING - {state}) | {State.PAUSED, State.FINISHING, State.FAILED} for state in _TAKING},
+    State.PAUSED: _TAKING | {State.FINISHING, State.FAILED},
+    State.FINISHING: frozenset({State.DONE, State.STOPPED, State.ABORTED, State.FAILED}),
+    **dict.fromkeys((State.DONE, State.STOPPED, State.ABORTED, State.FAILED), frozenset[State]()),
+}
 """The states that may follow each one."""
 
 
 class StateMachine:
-    """The state of one scan. Attribute `state`: the present one.
-
-    Args:
-        sink: takes the event `state`.
-    """
+    """The state of one scan, in `state`. The sink takes the event `state`."""
 
     def __init__(self, sink: Sink = lambda event: None, state: State = State.IDLE) -> None:
         self._sink, self.state = sink, state

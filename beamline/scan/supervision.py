@@ -27,41 +27,31 @@ def _wait_in_pause() -> bool:
 
 @dataclass(frozen=True)
 class Supervision:
-    """Callbacks of the acquisition.
+    """Callbacks of the acquisition."""
 
-    Attributes:
-        refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no
-        projection should be taken; None: projections may be taken.
-        pause: checked before each frame of a standing stage, and all the time while it turns.
-        wait_in_pause: called repeatedly while the scan is paused. It waits a moment, and returns whether the operator
-        at the terminal has let the scan go on.
-        states: told the states of the scan.
-        wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there
-            was beam.
-        retakes: called once, after the last projection, with the triggers without a frame; returns the views to repeat.
-    """
-
+    # called once, before the first projection, when all earlier frames are recorded. Returns why no projection should
+    # be taken; None: projections may be taken
     refusal: Callable[[], str | None] = lambda: None
+    # checked before each frame of a standing stage, and all the time while it turns
     pause: PauseRequest = field(default_factory=PauseRequest)
+    # called repeatedly while the scan is paused. It waits a moment, and returns whether the operator at the terminal
+    # has let the scan go on
     wait_in_pause: Callable[[], bool] = _wait_in_pause
+    # told the states of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
+    # called once, after the last projection, with the triggers without a frame; returns the views to repeat
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
+    # called after the last frame of flats and views: returns when it is known whether there was beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)
 class BeamLimits:
-    """When a scan waits for the beam, in the beam monitor's unit.
+    """When a scan waits for the beam, in the beam monitor's unit."""
 
-    Attributes:
-        pause_below: a reading below it pauses the scan.
-        resume_above: readings of at least so much mean that the beam is back.
-        settle: s for which they must be so, before the scan goes on.
-    """
-
-    pause_below: float
-    resume_above: float
-    settle: float
+    pause_below: float  # a reading below it pauses the scan
+    resume_above: float  # readings of at least so much mean that the beam is back
+    settle: float  # s for which they must be so, before the scan goes on
 
 
 class BeamGuard:
@@ -94,7 +84,7 @@ class BeamGuard:
         self._back = reading.time if self._back is None else self._back
         if reading.time - self._back >= limits.settle:
             self._paused, self._back, self._good = False, None, reading.time
-            self._pause.beam_back()
+            self._pause.release(Cause.BEAM)
 
 
 class SpaceGuard:
@@ -171,24 +161,19 @@ class BacklogGuard:
             self._pause.release(Cause.BACKLOG)
 
 
-@dataclass(frozen=True)
-class AlarmPolicy:
+class AlarmReaction:
     """Effects of the monitor's alarms on a scan.
 
-    Attributes:
+    Args:
         act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
         policies: by the name of the check.
     """
 
-    act_after: int = 10
-    policies: Mapping[str, Policy] = field(default_factory=dict)
-
-
-class AlarmReaction:
-    """Carries out the policy while frames come."""
-
-    def __init__(self, policy: AlarmPolicy, stop: StopRequest, pause: PauseRequest, sink: Sink) -> None:
-        self._policy, self._stop, self._pause, self._sink = policy, stop, pause, sink
+    def __init__(
+        self, act_after: int, policies: Mapping[str, Policy], stop: StopRequest, pause: PauseRequest, sink: Sink
+    ) -> None:
+        self._act_after, self._policies = act_after, policies
+        self._stop, self._pause, self._sink = stop, pause, sink
         self._in_a_row: Counter[str] = Counter()
 
     def __call__(self, flags: tuple[Flag, ...]) -> None:
@@ -196,14 +181,14 @@ class AlarmReaction:
         alarms = [flag for flag in flags if flag.level is Level.ALARM]
         self._in_a_row = Counter({flag.check: self._in_a_row[flag.check] + 1 for flag in alarms})
         for flag in alarms:
-            if self._in_a_row[flag.check] % self._policy.act_after == 0:
+            if self._in_a_row[flag.check] % self._act_after == 0:
                 self._act(flag)
 
     def _act(self, flag: Flag) -> None:
         n = self._in_a_row[flag.check]
         frames = f"{n} frames in a row have" if n > 1 else "1 frame has"
         reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
-        match self._policy.policies.get(flag.check, Policy.LOG):
+        match self._policies.get(flag.check, Policy.LOG):
             case Policy.WARN:
                 self._sink(Warned(f"{reason}."))
             case Policy.PAUSE:

@@ -19,6 +19,7 @@ from beamline.config.references import reference_limits
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Sink
 from beamline.core.stop import StopRequest
+from beamline.core.text import degrees, rounded
 from beamline.instrument.connect import ConnectedDevices, camera_settings
 from beamline.monitor.digest import digest
 from beamline.monitor.references import FaultKind, ReferenceFrame, ReferenceLimits, judge
@@ -42,40 +43,28 @@ ZINGER = 12.0  # times the median change of a pixel from frame to frame, 8 stand
 
 @dataclass(frozen=True)
 class Tuning:
-    """Results of the frames; counts per pixel and frame, exposures in s.
+    """Results of the frames; counts per pixel and frame, exposures in s."""
 
-    Attributes:
-        configured: exposure of the configuration.
-        exposure: of the flats that were used: the longest that does not saturate.
-        saturation: the largest count.
-        dark, dark_noise: median of the darks, standard deviation of a pixel.
-        flat, brightest: median of the flat where there is beam, and 99.9th percentile of its means of 4 x 4 pixels.
-        saturated: fraction of its pixels that are saturated at the configured exposure.
-        gain: counts of a photon; NaN where the frames have no noise.
-        transmission: of the view, at its darkest hundredth and in the median.
-        advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
-            where darks have light or flats none.
-        noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median.
-        longest: exposure that the period and the camera allow.
-        angle: of the view, rad.
-        faults: what is wrong with darks and flats at the configured exposure.
-    """
-
-    configured: float
-    exposure: float
-    saturation: float
+    configured: float  # exposure of the configuration
+    exposure: float  # of the flats that were used: the longest that does not saturate
+    saturation: float  # the largest count
+    # dark, dark_noise: median of the darks, standard deviation of a pixel
     dark: float
     dark_noise: float
+    # flat, brightest: median of the flat where there is beam, and 99.9th percentile of its means of 4 x 4 pixels
     flat: float
     brightest: float
-    saturated: float
-    gain: float
-    transmission: tuple[float, float]
+    saturated: float  # fraction of its pixels that are saturated at the configured exposure
+    gain: float  # counts of a photon; NaN where the frames have no noise
+    transmission: tuple[float, float]  # of the view, at its darkest hundredth and in the median
+    # exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN where darks
+    # have light or flats none
     advised: float
+    # of a line integral in one view at the advised exposure, at the darkest hundredth and in the median
     noise: tuple[float, float]
-    longest: float
-    angle: float
-    faults: tuple[str, ...]
+    longest: float  # exposure that the period and the camera allow
+    angle: float  # of the view, rad
+    faults: tuple[str, ...]  # what is wrong with darks and flats at the configured exposure
 
     @property
     def photons(self) -> float:
@@ -95,7 +84,10 @@ class Tuning:
             ),
             ("saturated", f"{self.saturated:.2%} of the flat's pixels at the configured {self.configured:.4g} s"),
             ("photons", f"{self.photons:.4g} in a pixel of that flat, {self.gain:.3g} counts each"),
-            ("view", f"lets {middle:.3g} of the light through, its darkest hundredth {low:.3g}, at {_deg(self.angle)}"),
+            (
+                "view",
+                f"lets {middle:.3g} of the light through, its darkest hundredth {low:.3g}, at {degrees(self.angle)}",
+            ),
             (
                 "noise",
                 f"{at_middle:.3g} of a line integral in one view at the exposure advised, {at_low:.3g} in its darkest "
@@ -174,7 +166,7 @@ def evaluate(
     judged = judge([references[: len(darks)], references[len(darks) :]], limits)
     faults = [fault for group in judged for fault in group.faults]
     known = not any(fault.kind in (FaultKind.LIGHT_IN_DARKS, FaultKind.NO_BEAM) for fault in faults)
-    advised = _rounded(min(used * room, longest)) if known else math.nan
+    advised = rounded(min(used * room, longest)) if known else math.nan
     n = max(plan.flats.count, 1)
     longer = typical * advised / used
     noise = tuple(_noise(share, longer, gain, of_darks, n) for share in transmission)
@@ -206,9 +198,7 @@ def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: in
     through = share * light
     if not through > 0:
         return math.inf
-    return math.sqrt(
-        (gain * through + of_darks) / through**2 + (gain * light + of_darks) / (n_flats * light**2)
-    )  # fmt: skip
+    return math.sqrt((gain * through + of_darks) / through**2 + (gain * light + of_darks) / (n_flats * light**2))
 
 
 def _unsaturated(flats: Sequence[Frame], saturation: float, limits: ReferenceLimits) -> float:
@@ -231,11 +221,7 @@ def _variance(pair: Sequence[Frame], where: NDArray[np.bool_]) -> float:
 
 
 def _accepted(instrument: ConnectedDevices, config: Config, exposure: float) -> list[float]:
-    """The exposures that the camera takes, the longest first.
-
-    Raises:
-        DeviceRefused: it takes none.
-    """
+    """The exposures that the camera takes, the longest first. DeviceRefused: it takes none."""
     camera = instrument.devices.camera
     taken: list[float] = []
     for share in SHORTER:
@@ -271,15 +257,3 @@ def _longest(plan: ScanPlan, settings: CameraSettings, timing: CameraTiming) -> 
     if plan.mode is not Mode.FLY:
         return math.inf
     return plan.period - max(timing.min_period - settings.exposure, timing.readout)
-
-
-def _rounded(seconds: float) -> float:
-    """Down to three digits."""
-    if not 0 < seconds < math.inf:
-        return seconds
-    unit = 10.0 ** (math.floor(math.log10(seconds)) - 2)
-    return math.floor(seconds / unit + 1e-9) * unit
-
-
-def _deg(angle: float) -> str:
-    return f"{math.degrees(angle):.4g}°"

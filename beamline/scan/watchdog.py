@@ -45,10 +45,7 @@ INHIBIT = ("systemd-inhibit", "--what=shutdown:sleep", "--mode=block", "--who=be
 
 @contextmanager
 def watched(
-    folder: Path,
-    sink: Sink,
-    stop: StopRequest | None = None,
-    pause: PauseRequest | None = None,
+    folder: Path, sink: Sink, stop: StopRequest | None = None, pause: PauseRequest | None = None
 ) -> Iterator[None]:
     """A watchdog for the run in this folder as long as the context lasts; a warning if there is none.
 
@@ -79,11 +76,8 @@ def inhibited() -> Iterator[None]:
 
 
 class _Keeper:
-    """Keeps a watchdog alive and tells it that the scan lives, in a thread of its own.
-
-    Args:
-        start: starts a command; the function is called with each line that it writes.
-    """
+    """Keeps a watchdog alive and tells it that the scan lives, in a thread of its own. `start`: starts a command; the
+    function is called with each line that it writes."""
 
     def __init__(
         self, folder: Path, sink: Sink, start: Callable[[list[str], Callable[[str], None]], ChildProcess]
@@ -141,11 +135,8 @@ class _Keeper:
 
 
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
-    """Stop the stage, then disarm its trigger output and close the shutter; True: all obeyed.
-
-    Args:
-        say: takes a sentence on each step.
-    """
+    """Stop the stage, then disarm its trigger output and close the shutter; True: all obeyed. `say`: takes a sentence
+    on each step."""
     stage, shutter = config.devices.stage, config.devices.shutter
     closed = "its shutter is closed" if isinstance(shutter, StageOutputShutter) else "the shutter is moved by hand"
 

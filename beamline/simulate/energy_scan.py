@@ -14,13 +14,13 @@ from beamline.config.tree import read
 from beamline.core.errors import ConfigError
 from beamline.simulate.scene_file import open_scene, volumes_beside
 from beamline.xafs.contrast import ContrastRegions
-from beamline.xafs.depth import line_integrals
+from beamline.xafs.radiographs import line_integrals
 from beamline.xafs.series import Series
 from simulators.frame.mapping import SceneError
 from simulators.frame.sensor import largest_count
 from simulators.light.beam import Beam
 from simulators.light.spectrum import Attenuation, light
-from simulators.samples.composed.parts import Constituent, Mixture
+from simulators.samples.composed.parts import Mixture
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import load_scene
 from simulators.scenes.shots import Scan
@@ -35,25 +35,16 @@ NEAR = 24  # pixels around the material that count as its surroundings
 
 @dataclass(frozen=True, eq=False)
 class EnergyScan:
-    """A scene that is exposed at several energies. Created by `open_energy_scan`.
+    """A scene that is exposed at several energies. Created by `open_energy_scan`."""
 
-    Attributes:
-        name: of the scene.
-        beam: its light, of any energy.
-        energies: keV, [n].
-        angle: of the stage, radians.
-        material: whose contrast is measured.
-        regions: of the material and its surroundings.
-    """
-
-    name: str
+    name: str  # of the scene
     scan: Scan
     sample: Mixture
-    beam: Beam
-    energies: Reals
-    angle: float
-    material: str
-    regions: ContrastRegions
+    beam: Beam  # its light, of any energy
+    energies: Reals  # keV, [n]
+    angle: float  # of the stage, radians
+    material: str  # whose contrast is measured
+    regions: ContrastRegions  # of the material and its surroundings
 
     def series(self) -> Series:
         """Its radiographs, computed lazily."""
@@ -167,7 +158,7 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
 def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> ContrastRegions:
     """Pixels with much of the material, and those near it without it, in the sample if possible, else in air."""
     thickness = sample.thickness(angle, scan.detector)
-    mine = np.array([_is(c, material) for c in sample.constituents])
+    mine = np.array([c.material is not None and c.material.name == material for c in sample.constituents])
     own = thickness[mine].sum(axis=0)
     if not own.max() > 0:
         raise ValueError("it is not in the field of view")
@@ -175,10 +166,6 @@ def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> Contra
     near = binary_dilation(own > 0, iterations=min(NEAR, max(own.shape))) & (own == 0)
     matter = near & (thickness != 0).any(axis=0)
     return ContrastRegions(inside, matter if matter.any() else near, float(own[inside].mean()))
-
-
-def _is(constituent: Constituent, material: str) -> bool:
-    return constituent.material is not None and constituent.material.name == material
 
 
 def _no_filters(name: str) -> Attenuation:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from beamline.report.figures import grey_window
+from beamline.report.figures import grey_window, png
 from drivers.base.frame import FrameKind
 from simulators.effects.chain import Anomaly
 from simulators.scenes.expose import expose
@@ -37,7 +34,6 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
     rows = -(-len(frames) // COLUMNS)
     tall = min(max(scan.detector.shape[0] / scan.detector.shape[1], FLATTEST), TALLEST)
     figure = Figure(figsize=(10.5, 0.4 + 2.9 * rows * tall + 0.3 * rows), dpi=110)
-    FigureCanvasAgg(figure)
     anomalies = [effect.name for effect in scan.scene.chain.effects if isinstance(effect, Anomaly)]
     for place, ((number, planned), frame) in enumerate(zip(chosen, small, strict=True), start=1):
         axes = figure.add_subplot(rows, COLUMNS, place)
@@ -58,9 +54,7 @@ def sheet(scan: Scan, marked: tuple[int, ...] = ()) -> bytes:
             axes.text(0.02, 0.97 - 0.07 * row, label.kind, color=colour, fontsize=7, va="top", transform=axes.transAxes)
     figure.suptitle(f"counts {low:.0f} (black) to {high:.0f} (white)", fontsize=8)
     figure.tight_layout()
-    out = io.BytesIO()
-    figure.savefig(out, format="png")
-    return out.getvalue()
+    return png(figure)
 
 
 def _chosen(scan: Scan, marked: tuple[int, ...]) -> list[int]:

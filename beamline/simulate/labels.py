@@ -18,16 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LabelledRun:
-    """One anomaly in consecutive frames.
+    """One anomaly in consecutive frames."""
 
-    Attributes:
-        kind: the anomaly's name.
-        first: its first frame, counted in the file from 0.
-        regions: one for each frame: (first row, row after the last, first column, column after the last).
-    """
-
-    kind: str
-    first: int
+    kind: str  # the anomaly's name
+    first: int  # its first frame, counted in the file from 0
+    # one for each frame: (first row, row after the last, first column, column after the last)
     regions: tuple[PixelBox, ...]
 
     @property

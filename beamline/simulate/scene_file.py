@@ -21,30 +21,15 @@ from simulators.frame.shot import CannotExposeError
 from simulators.scenes.explain import FrameCost, explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
-from simulators.scenes.shots import Scan
+from simulators.scenes.shots import Scan as Scan
 
 if TYPE_CHECKING:
     from simulators.samples.voxels.volume import ReadVolume
 
-__all__ = [
-    "Scan",
-    "SceneFile",
-    "cost_table",
-    "exposure_errors",
-    "frame_cost",
-    "open_scene",
-    "scan_of",
-    "volumes_beside",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class SceneFile:
-    """A scene and its file.
-
-    Attributes:
-        text: of the file, with overridden values, for the record.
-    """
+    """A scene and its file. `text`: of the file, with overridden values, for the record."""
 
     scene: Scene
     path: Path

@@ -40,15 +40,8 @@ class Truth:
 def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
     """The simulated rays as a reconstruction's geometry; a cone's detector is placed at the sample."""
     if np.isfinite(detector.sod):
-        return Geometry.cone(
-            angles,
-            detector.shape,
-            detector.pitch,
-            detector.sod,
-            detector.sod,
-            detector.axis_col,
-            axis_row=detector.axis_row,
-        )
+        at, row = detector.sod, detector.axis_row
+        return Geometry.cone(angles, detector.shape, detector.pitch, at, at, detector.axis_col, axis_row=row)
     return Geometry.parallel(angles, detector.shape, detector.pitch, detector.axis_col, axis_row=detector.axis_row)
 
 
@@ -58,20 +51,12 @@ def binning_of(detector: Detector) -> int:
 
 
 def memory_of(detector: Detector, binning: int) -> int:
-    """Peak memory of `truth_of` in bytes.
-
-    Raises:
-        ValueError: the binning does not fit into the frame.
-    """
+    """Peak memory of `truth_of` in bytes. ValueError: the binning does not fit into the frame."""
     return BYTES_A_VOXEL * math.prod(_grid(detector, binning).shape)
 
 
 def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
-    """The truth in voxels of `binning` pixels.
-
-    Raises:
-        ValueError: the binning does not fit into the frame.
-    """
+    """The truth in voxels of `binning` pixels. ValueError: the binning does not fit into the frame."""
     grid = _grid(detector, binning)
     z, y, x = grid.centre
     shifted = replace(grid, centre=(z + _above(detector, binning), y, x))

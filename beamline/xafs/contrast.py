@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
-from beamline.xafs.local import local_parabolas
-
 Reals = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -148,3 +146,14 @@ def _level(frame: Reals, mask: Mask) -> tuple[float, float]:
         left = curved[mask & np.isfinite(curved)]
     noise = float(np.median(np.abs(left)) / 0.6745 / 6) if left.size >= FEWEST else math.nan
     return float(values[known].mean()), noise
+
+
+def local_parabolas(x: Reals, y: Reals, window: int) -> tuple[Reals, Reals]:
+    """Value and slope at each x of the parabola through the nearest `window` points (for even spacing the filter of
+    Savitzky & Golay, Anal. Chem. 36, 1627, 1964); both [n], of at least `window` points."""
+    values, slopes = np.empty_like(y), np.empty_like(y)
+    for i in range(y.size):
+        first = min(max(i - window // 2, 0), y.size - window)
+        part = slice(first, first + window)
+        values[i], slopes[i], _ = np.polynomial.polynomial.polyfit(x[part] - x[i], y[part], 2)
+    return values, slopes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr
 
-from beamline.xafs.local import local_parabolas
+from beamline.xafs.contrast import local_parabolas
 
 Reals = NDArray[np.float64]
 
@@ -23,23 +23,14 @@ SMOOTH = 1e-3  # of the absorption: tolerated difference of a noiseless smooth c
 
 @dataclass(frozen=True)
 class AbsorptionEdge:
-    """Edge and white line of a curve.
+    """Edge and white line of a curve."""
 
-    Attributes:
-        found: there is an edge within the range.
-        reason: why no edge was found, as a sentence.
-        energy: keV of the steepest rise; None where no edge is found.
-        white_line: keV of the maximum above the edge; None without a maximum within the range.
-        misfit: rms difference from the best smooth curve, in units of the absorption.
-        noise: rms noise of the curve, likewise.
-    """
-
-    found: bool
-    reason: str
-    energy: float | None
-    white_line: float | None
-    misfit: float
-    noise: float
+    found: bool  # there is an edge within the range
+    reason: str  # why no edge was found, as a sentence
+    energy: float | None  # keV of the steepest rise; None where no edge is found
+    white_line: float | None  # keV of the maximum above the edge; None without a maximum within the range
+    misfit: float  # rms difference from the best smooth curve, in units of the absorption
+    noise: float  # rms noise of the curve, likewise
 
 
 def find_edge(energies: Reals, absorption: Reals) -> AbsorptionEdge:

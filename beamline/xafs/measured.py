@@ -19,7 +19,7 @@ from beamline.monitor.view import PixelBox
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.xafs.contrast import ContrastRegions, XafsCurve
-from beamline.xafs.radiographs import FramePart, Radiographs, reals
+from beamline.xafs.radiographs import FramePart, Radiographs
 from beamline.xafs.series import Series
 
 Reals = NDArray[np.float64]
@@ -29,15 +29,7 @@ EV_BEYOND, KEV_BELOW = 500.0, 0.05
 _KEV = {"keV": 1.0, "eV": 1e-3}
 
 
-@dataclass(frozen=True, eq=False)
-class AbsorptionTable:
-    """Energies in keV and absorption of a file, each [n]."""
-
-    energies: Reals
-    absorption: Reals
-
-
-def read_table(path: Path, unit: str | None) -> AbsorptionTable:
+def read_table(path: Path, unit: str | None) -> XafsCurve:
     """Two columns of text, energy and absorption, separated by commas, semicolons, tabs or blanks; lines that begin
     with a letter, # or % are skipped. With another separator the comma may be the decimal point.
 
@@ -61,7 +53,7 @@ def read_table(path: Path, unit: str | None) -> AbsorptionTable:
             raise DataError(f"{path}, line {number}: {line.strip()!r} is not an energy and an absorption.") from None
         rows.append((energy, absorption))
     values = np.array(rows, dtype=np.float64).reshape(-1, 2)
-    return AbsorptionTable(_in_kev(path, values[:, 0], unit), _finite(path, "absorption", values[:, 1]))
+    return XafsCurve(_in_kev(path, values[:, 0], unit), _finite(path, "absorption", values[:, 1]))
 
 
 def _fields(line: str) -> list[str]:
@@ -73,7 +65,6 @@ def _fields(line: str) -> list[str]:
 @dataclass(frozen=True)
 class FileOptions:
     """The part of a file that is used, and properties that it does not state.
-
 
     Attributes:
         low, high: keV, the first and the last energy.
@@ -108,7 +99,7 @@ def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve
                 f"{path}: {energies[np.argmin(rises)]:.9g} keV occurs more than once; average the values of "
                 "each energy. Nothing was written."
             )
-        if isinstance(source, AbsorptionTable):
+        if isinstance(source, XafsCurve):
             if options.region or options.around:
                 raise ConfigError(f"{path} has no frames, so that regions do not apply. Nothing was written.")
             yield XafsCurve(energies, source.absorption[kept], unit="as in the file")
@@ -140,7 +131,7 @@ def _mask(shape: tuple[int, int], box: PixelBox) -> NDArray[np.bool_]:
 
 
 @contextmanager
-def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[AbsorptionTable | Radiographs]:
+def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterator[XafsCurve | Radiographs]:
     """A text table, or an HDF5 file with `energy` [n] and either `mu` [n] or `frames` [n, row, col]. Beside frames it
     has `flats` ([n, row, col] or [row, col]), perhaps `darks` ([row, col] or [k, row, col]).
 
@@ -157,7 +148,9 @@ def open_measured(path: Path, unit: str | None, quantity: str | None) -> Iterato
     with hdf5.open_hdf5(path) as file:
         energies = _energies(path, file, unit)
         if (mu := _numbers(path, file, "mu")) is not None:
-            yield AbsorptionTable(energies, _finite(path, "mu", _like(path, "mu", mu, energies)))
+            if mu.shape != energies.shape:
+                raise DataError(f"{path}: mu is {mu.shape}, but there are {energies.size} energies.")
+            yield XafsCurve(energies, _finite(path, "mu", mu[()]))
             return
         frames, flats = _needed(path, file, "frames"), _numbers(path, file, "flats")
         if frames.ndim != 3 or frames.shape[0] != energies.size or 0 in frames.shape[1:]:
@@ -180,7 +173,7 @@ def _energies(path: Path, file: h5py.File, unit: str | None) -> Reals:
         unit = {"kev": "keV", "ev": "eV"}.get(stated)
         if unit is None:
             raise DataError(f"{path}: energies are in {stated!r}, which is neither keV nor eV; give --unit.")
-    return _in_kev(path, reals(item[()]).reshape(-1), unit)
+    return _in_kev(path, np.ravel(item[()]), unit)
 
 
 def _darks(path: Path, file: h5py.File, shape: tuple[int, ...]) -> h5py.Dataset | None:
@@ -208,12 +201,6 @@ def _needed(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
             f"{', '.join(sorted(file)) or 'nothing'}."
         )
     return item
-
-
-def _like(path: Path, name: str, item: h5py.Dataset, energies: Reals) -> Any:
-    if item.shape != energies.shape:
-        raise DataError(f"{path}: {name} is {item.shape}, but there are {energies.size} energies.")
-    return item[()]
 
 
 def _finite(path: Path, name: str, values: Any) -> Reals:

@@ -1,4 +1,4 @@
-"""Radiographs: frames over energies in an HDF5 file, read one by one, only the requested part of each."""
+"""Radiographs: frames over energies in an HDF5 file become line integrals, one by one, only the requested part."""
 
 from __future__ import annotations
 
@@ -12,29 +12,25 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.xafs.depth import line_integrals
 
 Reals = NDArray[np.float64]
 FramePart = tuple[slice, slice]
 
 EVERYTHING = (slice(None), slice(None))
+LEAST, LEAST_SHARE = (
+    0.5,
+    1e-3,
+)  # light: counts above the dark level, or share of the flat where that is less (flats of 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Radiographs:
-    """A file of frames over energies, open for reading.
+    """A file of frames over energies, open for reading."""
 
-    Attributes:
-        energies: keV, [n].
-        frames: dataset [n, row, col].
-        flats: [n, row, col], or [row, col] for all energies; None where frames are line integrals.
-        darks: [row, col] or [k, row, col], of the same unit as frames; None: no dark level.
-    """
-
-    energies: Reals
-    frames: h5py.Dataset
-    flats: h5py.Dataset | None
-    darks: h5py.Dataset | None
+    energies: Reals  # keV, [n]
+    frames: h5py.Dataset  # dataset [n, row, col]
+    flats: h5py.Dataset | None  # [n, row, col], or [row, col] for all energies; None where frames are line integrals
+    darks: h5py.Dataset | None  # [row, col] or [k, row, col], of the same unit as frames; None: no dark level
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,13 +66,20 @@ def _mean(item: h5py.Dataset | None, part: FramePart) -> Reals:
     return np.asarray(total / item.shape[0])
 
 
-def reals(values: Any) -> Reals:
-    return np.asarray(values, dtype=np.float64)
-
-
 def _counts(values: Any) -> Reals:
     """NaN where integers are the largest of their type: the pixel may be saturated."""
-    found = reals(values)
+    found = np.asarray(values, dtype=np.float64)
     if values.dtype.kind in "ui":
         found[values == np.iinfo(values.dtype).max] = np.nan
     return found
+
+
+def line_integrals(signal: Reals, flat: Reals) -> Reals:
+    """-log(signal / flat), [row, col], of counts above the dark level. +inf where no light was transmitted, NaN where
+    the flat is dark too, or where one of them is not finite."""
+    lit = np.minimum(LEAST, LEAST_SHARE * flat)
+    out = np.full(np.broadcast_shapes(signal.shape, flat.shape), np.nan)
+    known = np.isfinite(signal) & (flat > 0) & (flat < np.inf)
+    np.log(np.divide(flat, signal, where=known & (signal > lit), out=out), where=known & (signal > lit), out=out)
+    out[known & (signal <= lit)] = np.inf
+    return out

@@ -21,11 +21,7 @@ from beamline.xafs.edge import AbsorptionEdge
 
 @dataclass(frozen=True, eq=False)
 class XafsResult:
-    """The curve of an energy scan and its edge.
-
-    Attributes:
-        title: what was scanned.
-    """
+    """The curve of an energy scan and its edge. `title`: what was scanned."""
 
     title: str
     curve: XafsCurve

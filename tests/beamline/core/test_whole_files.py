@@ -20,7 +20,7 @@ def test_what_the_disk_refuses_late_leaves_nothing(tmp_path: Path, monkeypatch: 
     def fsync(handle: int) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(files, "_fsync", fsync)
+    monkeypatch.setattr(files.os, "fsync", fsync)
     with pytest.raises(DataError, match=r"page.html could not be written .Input/output error.*nothing is left of it"):
         write_whole(tmp_path / "page.html", "a page")
     with pytest.raises(DataError, match="Input/output error"), whole_file(tmp_path / "folder") as partial:

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from beamline.doctor import disk
 from beamline.doctor.check import Grade
+from beamline.doctor.disk import ScanNeeds
 from beamline.doctor.examine import memory
-from beamline.doctor.needs import ScanNeeds
 from drivers.base.clock import SystemClock
 from simulators.devices.clock import VirtualClock
 

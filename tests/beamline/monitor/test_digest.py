@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.stats import entropy as scipy_entropy
 
-from beamline.monitor.digest import ENTROPY_BINS, _count_greys, block_means, digest, preview_shape
+from beamline.monitor.digest import ENOUGH, ENTROPY_BINS, _count_greys, block_means, digest, preview_shape, thinned
 
 shapes = st.tuples(st.integers(1, 17), st.integers(1, 17))
 counts = hnp.arrays(np.uint16, shapes)
@@ -189,3 +189,11 @@ def test_the_checksum_is_of_the_pixels_as_they_are_written(
 def test_block_means_are_the_preview_of_a_digest(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 2**16, shape, np.uint16)
     np.testing.assert_array_equal(block_means(image, 4), digest(image, 60_000, 4).preview)
+
+
+@given(st.integers(1, 1200), st.integers(1, 1200))
+def test_thinning_bounds_the_work_and_leaves_small_previews_whole(rows: int, cols: int) -> None:
+    preview = np.broadcast_to(np.float32(0), (rows, cols))
+    kept = thinned(preview).shape
+    for n, k in zip((rows, cols), kept, strict=True):
+        assert k == n if n < 2 * ENOUGH else ENOUGH <= k <= 2 * ENOUGH

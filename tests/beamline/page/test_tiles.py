@@ -44,4 +44,4 @@ def test_any_region_has_a_pixel_inside_the_picture(a: int, b: int, c: int, d: in
 
 def test_no_tile_is_larger_than_a_screen() -> None:
     whole = TileRegion(0, 2304, 0, 4096)
-    assert bin_mean(np.zeros(whole.shape), (whole.binning(),) * 2).shape == (576, MOST)
+    assert bin_mean(np.zeros((2304, 4096)), (whole.binning(),) * 2).shape == (576, MOST)

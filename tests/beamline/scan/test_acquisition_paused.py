@@ -56,7 +56,7 @@ class Paused:
         if event.data["state"] is State.PAUSED:
             self.at_rest.append(not self.instrument.is_open and not self.instrument.stage.moving())
             self.pause.resume()
-            self.pause.beam_back()
+            self.pause.release(Cause.BEAM)
             self.pause.release(Cause.BACKLOG)
 
     def at_frame(self, number: int) -> Paused:

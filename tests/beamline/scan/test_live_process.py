@@ -14,6 +14,7 @@ from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.process import ChildProcess
 from beamline.core.stop import ScanAborted, StopRequest
+from beamline.scan import live_process
 from beamline.scan import run as module
 from beamline.scan.live_process import LivePlan, LiveReconstruction, follow_command, live_need, live_plan
 from beamline.scan.run import RunResult, run_scan
@@ -255,7 +256,7 @@ def test_a_live_reconstruction_that_is_ended_may_deliver_what_it_has(tmp_path: P
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
 def test_after_a_stopped_scan_the_volume_comes_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ASK_LIVE_AFTER", 0.5)
+    monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.5)
     stop = StopRequest()
     instrument = FakeInstrument(on_frame=lambda number: stop.stop() if number == 10 else None)
     ran = Ran(tmp_path, instrument, stop=stop, live=script(DELIVERS))
@@ -267,21 +268,21 @@ def test_the_time_to_the_volume_of_a_stopped_scan_counts_from_the_signal() -> No
     seconds = 1e6
     stop = StopRequest(lambda: seconds)
     stop.stop()
-    seconds += module.ASK_LIVE_AFTER - 1  # what the scan took to end
-    ends = module.live_should_end(stop, useless=False)
+    seconds += live_process.ASK_LIVE_AFTER - 1  # what the scan took to end
+    ends = live_process.live_should_end(stop, useless=False)
     stop.stop("again, by another signal")
-    assert not ends() and module.live_should_end(stop, useless=True)()
+    assert not ends() and live_process.live_should_end(stop, useless=True)()
     seconds += 1
     assert ends()
     late = StopRequest(lambda: seconds)
-    ends = module.live_should_end(late, useless=False)  # the scan is complete
+    ends = live_process.live_should_end(late, useless=False)  # the scan is complete
     assert not ends() and late.seconds == 0
     late.stop()
     assert ends()
 
 
 def test_a_scan_with_enough_views_waits_for_its_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ASK_LIVE_AFTER", 0.0)
+    monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.0)
     fits = """
 import json, sys, time
 time.sleep(1)

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import h5py
+import numpy as np
 import pytest
 
 from beamline.config import load as config
+from beamline.config.load import config_folder, load
 from beamline.config.models import Config
 from beamline.core.errors import ConfigError
-from beamline.scan.preflight import dry_run, free_bytes, refuse_violations
+from beamline.core.events import Event
+from beamline.instrument.connect import connect
+from beamline.scan.preflight import disk_of, dry_run, refuse_violations
+from beamline.scan.run import run_scan
+from tests.beamline.fakes import FakeInstrument
+from tests.beamline.ran import SMALL, Ran, small
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -50,7 +61,8 @@ def test_what_a_live_volume_takes_is_told() -> None:
 
 
 def test_the_disk_is_that_of_the_run_that_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("beamline.scan.preflight.free_bytes", lambda folder: 7 if folder == tmp_path else 10**15)
+    free = {tmp_path: SimpleNamespace(free=7)}
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: free.get(folder, SimpleNamespace(free=10**15)))
     assert dry_run(shipped("demo")).free_bytes == 10**15
     assert dry_run(shipped("demo"), tmp_path).free_bytes == 7
 
@@ -75,5 +87,62 @@ def test_instrument_loads_no_simulator_and_a_dry_run_no_vendor_library() -> None
 
 
 def test_room_on_a_disk_for_a_folder_that_is_not_there_yet(tmp_path: Path) -> None:
-    assert free_bytes(tmp_path / "a" / "b") > 0
-    assert not (tmp_path / "a").exists()
+    assert disk_of(tmp_path / "a" / "b") == tmp_path
+
+
+def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    ran = Ran(tmp_path / "runs", FakeInstrument(), "scan.period_s=0.021")
+    assert isinstance(ran.error, ConfigError)
+    assert "nothing was started" in str(ran.error)
+    assert ran.folder is None
+    assert ran.instrument.log == []
+    assert ran.events == []
+
+
+def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Path) -> None:
+    """Half a turn in 6 views is 3000 counts of the stage; a view every 2200 s would be 1.36 counts a second."""
+    ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.result.flags == {}
+    with h5py.File(ran.result.path) as file:
+        times = file["entry/frame_log/time"][5:11]
+        assert file["entry/record/period"][()] == pytest.approx(3000)
+        assert json.loads(file["entry/record/plan"][()])["period_s"] == 2200
+    np.testing.assert_allclose(np.diff(times), 3000, atol=1e-3)
+
+
+@pytest.mark.parametrize("preview_bin", [1, 3])
+def test_the_bytes_predicted_are_what_the_file_takes(tmp_path: Path, preview_bin: int) -> None:
+    overrides = [*SMALL, "simulation.clock=virtual", "devices.stage.low_deg=-60", f"storage.preview_bin={preview_bin}"]
+    config = load(config_folder() / "simulated.yaml", overrides, environment={})
+    events: list[Event] = []
+    result = run_scan(config, tmp_path, [events.append])
+    predicted = next(event.data["total_bytes"] for event in events if event.event == "run_started")
+    assert 0 < result.bytes - predicted < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
+
+
+@pytest.mark.parametrize("mode", ["fly", "step"])
+def test_the_duration_predicted_is_what_it_takes(tmp_path: Path, mode: str) -> None:
+    """From the stage's zero through a quarter turn away from it and back, with darks and flats at both ends."""
+    angles = "scan.angles={scheme: sector, views: 12, first_deg: 200, last_deg: 290}"
+    overrides = [*SMALL, f"scan.mode={mode}", angles, "simulation.clock=virtual", "scan.darks.at=both"]
+    overrides += ["devices.camera.roi=[1148, 2028, 8, 40]", "scan.flats.exposure_s=0.5", "references.on_fault=log"]
+    config = load(config_folder() / "simulated.yaml", overrides, environment={})
+    with connect(config) as instrument:
+        began = instrument.clock.now()
+        events: list[Event] = []
+        run_scan(config, tmp_path, [events.append], instrument=instrument)
+        seconds = instrument.clock.now() - began
+        assert instrument.devices.stage.position() == 0.0
+    predicted = next(event.data["duration"] for event in events if event.event == "run_started")
+    assert predicted == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
+
+
+@pytest.mark.parametrize("below", ["", "deeper/still"])
+def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> None:
+    (tmp_path / "runs").write_text("a file")
+    instrument = FakeInstrument()
+    with pytest.raises(ConfigError, match="there is a file at"):
+        run_scan(small(), tmp_path / "runs" / below, instrument=instrument.connected())
+    assert instrument.log == []

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.monitor.check import ScanContext
+from beamline.monitor.check import Flag, ScanContext
 from beamline.monitor.digest import FrameDigest
+from beamline.monitor.mass import MassCheck
 from beamline.monitor.watch import start
 from beamline.scan import recorder as module
+from beamline.scan import run as run_module
 from beamline.scan.recorder import Recorder
+from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.fakes import FakeInstrument
+from tests.beamline.fakes import FakeInstrument, Faults
+from tests.beamline.ran import Ran
 
 TIMELINE = FakeInstrument().timeline()
 
@@ -166,3 +171,62 @@ def test_the_time_of_writes_that_wait_is_the_disks() -> None:
     recorder.finish()
     assert recorder._work.disk > 0.1
     assert recorder._work.checking_cpu > 0
+
+
+def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import threading
+
+    free = threading.Event()
+
+    class Hanging(NXtomoWriter):
+        def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
+            if frame.index == 6:
+                free.wait(60)
+            super().append(frame, digest, flags)
+
+    monkeypatch.setattr(run_module, "NXtomoWriter", Hanging)
+    monkeypatch.setattr(module, "STALL", 0.05)
+    monkeypatch.setattr(module, "WAITING_FRAMES", (2, 2))
+    try:
+        ran = Ran(tmp_path, FakeInstrument())
+    finally:
+        free.set()
+    assert isinstance(ran.error, DataError)
+    assert "took no frame" in str(ran.error)
+    ran.assert_safe()
+
+
+def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10, 11})))
+    assert ran.error is None
+    assert ran.result is not None
+    assert ran.folder is not None
+    assert ran.result.flags == {"stuck": {"alarm": 3}}
+    assert ran.result.alarmed_frames == ran.of("scan_done")[0].data["alarmed_frames"] == 3
+    assert [(e.data["check"], e.data["frame"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
+    with h5py.File(ran.folder / "scan.h5") as file:
+        flags = file["entry/frame_log/flags"][()]
+    assert np.flatnonzero(flags).tolist() == [9, 10, 11]
+    assert flags[9] == (1 << 2) | (1 << 18)
+
+
+def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(module, "look", broken)
+    ran = Ran(tmp_path, FakeInstrument())
+    assert ran.error is None
+    ran.assert_good_file(19, "complete")
+    assert ["monitor failed at frame 0" in event.data["message"] for event in ran.of("warning")] == [True]
+
+
+def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("defect")
+
+    monkeypatch.setattr(MassCheck, "look", broken)
+    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
+    (warning,) = ran.of("warning")
+    assert "the check mass failed at frame 0 and is off, the other checks go on" in warning.data["message"]
+    assert {event.data["check"] for event in ran.of("flag")} == {"stuck"}

@@ -13,14 +13,19 @@ from beamline.core.errors import ConfigError, ReferencesError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
 from beamline.scan.references import ReferenceLog
-from beamline.scan.run import State, run_scan
+from beamline.scan.run import run_scan
+from beamline.scan.states import State
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.validate import validate
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline import fakes
 from tests.beamline.fakes import FakeInstrument, Faults
-from tests.beamline.ran import Ran
+from tests.beamline.ran import SMALL, Ran
 
 
 @pytest.mark.parametrize(
@@ -194,3 +199,30 @@ def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Pa
     assert len(told) == 1 and told[0] < views[0]
     found = float(events[told[0]].data["message"].split("has ")[1].split(" photons")[0])
     assert found == pytest.approx(14.5, rel=0.1)
+
+
+def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:
+    """A cylinder about the axis, Beer-Lambert without effects: 2 mu sqrt(r^2 - u^2) in each column, from every side."""
+    radius, attenuation, pitch = 0.05, 5.0, 4e-3
+    overrides = [
+        *SMALL,
+        "scan.mode=step",
+        "scan.flats.exposure_s=0.005",
+        "devices.camera.roi=[1148, 2028, 8, 40]",
+        f"optics.pixel_size_um={pitch * 1e3}",
+        "simulation.clock=virtual",
+        "simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.05, height: 9.0,"
+        " attenuation: 5.0}]}, beam: {photons_per_s: 3.0e+5}}",
+    ]
+    result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
+    assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
+    with open_scan(result.path) as source:
+        selection = Selection(axis_col=19.5, steps=(Air("none"), Flags("ignore")))
+        said: list[str] = []
+        prepared = prepare_projections(source, selection, said.append)
+        assert len(said) == 1 and said[0].startswith("--flags ignore")
+        assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
+    u = (np.arange(40) - 19.5) * pitch
+    expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))
+    # 14 000 counts in a flat of 5 ms, rounded to a half: 4e-5 of its light.
+    np.testing.assert_allclose(prepared.projections.data, np.broadcast_to(expected, (12, 8, 40)), atol=1e-4)

@@ -16,19 +16,13 @@ import numpy as np
 import pytest
 
 from beamline.config.load import config_folder, load
-from beamline.core.errors import ConfigError, DataError, InstrumentError, ScanStopped
+from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest
-from beamline.instrument.connect import connect
 from beamline.monitor.check import Flag
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.mass import MassCheck
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection
-from beamline.projections.steps.air import Air
-from beamline.projections.steps.flags import Flags
 from beamline.scan import recorder as recorder_module
-from beamline.scan import run as module
+from beamline.scan import run as run_module
 from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
 from beamline.scan.states import State
@@ -132,15 +126,6 @@ def test_a_stop_before_the_start_makes_no_folder(tmp_path: Path) -> None:
     assert ran.instrument.log == []
 
 
-def test_a_broken_limit_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    ran = Ran(tmp_path / "runs", FakeInstrument(), "scan.period_s=0.021")
-    assert isinstance(ran.error, ConfigError)
-    assert "nothing was started" in str(ran.error)
-    assert ran.folder is None
-    assert ran.instrument.log == []
-    assert ran.events == []
-
-
 def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None:
     ran = Ran(tmp_path, FakeInstrument(Faults(errors={10: 99})))
     assert isinstance(ran.error, DeviceError)
@@ -167,7 +152,7 @@ def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:
 def test_a_full_disk_stops_the_scan_and_keeps_what_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: Exception
 ) -> None:
-    monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, failure))
+    monkeypatch.setattr(run_module, "NXtomoWriter", failing_writer(8, failure))
     ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=200", "scan.period_s=0.05")
     assert isinstance(ran.error, DataError)
     assert re.search(r"first 8 frames are safe in .*scan\.h5", str(ran.error))
@@ -193,7 +178,7 @@ def test_logs_on_a_full_disk_do_not_hide_why_the_run_ended(tmp_path: Path, monke
         return FullLog() if path.suffix in (".jsonl", ".log") else usual(path, mode, *args, **kwargs)  # type: ignore[call-overload]
 
     monkeypatch.setattr(Path, "open", opened)
-    monkeypatch.setattr(module, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
+    monkeypatch.setattr(run_module, "NXtomoWriter", failing_writer(8, DataError("the first 8 frames are safe.")))
     ran = Ran(tmp_path, FakeInstrument())
     assert str(ran.error) == "the first 8 frames are safe."
     ran.assert_good_file(8, "failed")
@@ -214,56 +199,6 @@ def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
     assert not instrument.is_open
 
 
-def test_a_disk_that_hangs_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import threading
-
-    free = threading.Event()
-
-    class Hanging(NXtomoWriter):
-        def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
-            if frame.index == 6:
-                free.wait(60)
-            super().append(frame, digest, flags)
-
-    monkeypatch.setattr(module, "NXtomoWriter", Hanging)
-    monkeypatch.setattr(recorder_module, "STALL", 0.05)
-    monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))
-    try:
-        ran = Ran(tmp_path, FakeInstrument())
-    finally:
-        free.set()
-    assert isinstance(ran.error, DataError)
-    assert "took no frame" in str(ran.error)
-    ran.assert_safe()
-
-
-def test_the_rhythm_expected_is_the_one_that_the_stage_can_turn_at(tmp_path: Path) -> None:
-    """Half a turn in 6 views is 3000 counts of the stage; a view every 2200 s would be 1.36 counts a second."""
-    ran = Ran(tmp_path, FakeInstrument(), "scan.angles.views=6", "scan.period_s=2200", "scan.exposure_s=0.02")
-    assert ran.error is None
-    assert ran.result is not None
-    assert ran.result.flags == {}
-    with h5py.File(ran.result.path) as file:
-        times = file["entry/frame_log/time"][5:11]
-        assert file["entry/record/period"][()] == pytest.approx(3000)
-        assert json.loads(file["entry/record/plan"][()])["period_s"] == 2200
-    np.testing.assert_allclose(np.diff(times), 3000, atol=1e-3)
-
-
-def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10, 11})))
-    assert ran.error is None
-    assert ran.result is not None
-    assert ran.folder is not None
-    assert ran.result.flags == {"stuck": {"alarm": 3}}
-    assert ran.result.alarmed_frames == ran.of("scan_done")[0].data["alarmed_frames"] == 3
-    assert [(e.data["check"], e.data["frame"], e.data["level"]) for e in ran.of("flag")] == [("stuck", 9, "alarm")]
-    with h5py.File(ran.folder / "scan.h5") as file:
-        flags = file["entry/frame_log/flags"][()]
-    assert np.flatnonzero(flags).tolist() == [9, 10, 11]
-    assert flags[9] == (1 << 2) | (1 << 18)
-
-
 def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recorder_module, "WAITING_FRAMES", (2, 2))  # on a virtual clock the writer would be far behind
     ran = Ran(
@@ -280,28 +215,6 @@ def test_an_alarm_stops_the_scan_where_the_operator_wants_that(tmp_path: Path, m
     assert done["status"] == "stopped"
     assert 10 <= done["n_frames"] < 20
     ran.assert_safe()
-
-
-def test_a_monitor_with_a_defect_costs_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ZeroDivisionError("defect")
-
-    monkeypatch.setattr(recorder_module, "look", broken)
-    ran = Ran(tmp_path, FakeInstrument())
-    assert ran.error is None
-    ran.assert_good_file(19, "complete")
-    assert ["monitor failed at frame 0" in event.data["message"] for event in ran.of("warning")] == [True]
-
-
-def test_a_check_with_a_defect_goes_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ZeroDivisionError("defect")
-
-    monkeypatch.setattr(MassCheck, "look", broken)
-    ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9})))
-    (warning,) = ran.of("warning")
-    assert "the check mass failed at frame 0 and is off, the other checks go on" in warning.data["message"]
-    assert {event.data["check"] for event in ran.of("flag")} == {"stuck"}
 
 
 def test_an_interpreter_interrupt_closes_the_file_too(tmp_path: Path) -> None:
@@ -322,7 +235,7 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
         raise DeviceError("stage", "its port does not close")
 
     instrument = replace(FakeInstrument().connected(), close=fail)
-    monkeypatch.setattr(module, "connect", lambda config, clock, ask, check_stop: instrument)
+    monkeypatch.setattr(run_module, "connect", lambda config, clock, ask, check_stop: instrument)
     events: list[Event] = []
     with pytest.raises(DeviceError, match="does not close"):
         run_scan(small(), tmp_path, [events.append])
@@ -351,83 +264,6 @@ def test_a_run_on_the_simulated_instrument(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.degrees(source.angles[views]), np.arange(0, 180, 6), atol=1e-9)
         flats, darks = (source.read(np.flatnonzero(source.image_key == kind)).mean() for kind in (1, 2))
         assert flats > darks + 1000
-
-
-@pytest.mark.parametrize("preview_bin", [1, 3])
-def test_the_bytes_predicted_are_what_the_file_takes(tmp_path: Path, preview_bin: int) -> None:
-    overrides = [*SMALL, "simulation.clock=virtual", "devices.stage.low_deg=-60", f"storage.preview_bin={preview_bin}"]
-    config = load(config_folder() / "simulated.yaml", overrides, environment={})
-    events: list[Event] = []
-    result = run_scan(config, tmp_path, [events.append])
-    predicted = next(event.data["total_bytes"] for event in events if event.event == "run_started")
-    assert 0 < result.bytes - predicted < 150_000  # numbers of each frame, in chunks of 4 kB, and the metadata
-
-
-@pytest.mark.parametrize("mode", ["fly", "step"])
-def test_the_duration_predicted_is_what_it_takes(tmp_path: Path, mode: str) -> None:
-    """From the stage's zero through a quarter turn away from it and back, with darks and flats at both ends."""
-    angles = "scan.angles={scheme: sector, views: 12, first_deg: 200, last_deg: 290}"
-    overrides = [*SMALL, f"scan.mode={mode}", angles, "simulation.clock=virtual", "scan.darks.at=both"]
-    overrides += ["devices.camera.roi=[1148, 2028, 8, 40]", "scan.flats.exposure_s=0.5", "references.on_fault=log"]
-    config = load(config_folder() / "simulated.yaml", overrides, environment={})
-    with connect(config) as instrument:
-        began = instrument.clock.now()
-        events: list[Event] = []
-        run_scan(config, tmp_path, [events.append], instrument=instrument)
-        seconds = instrument.clock.now() - began
-        assert instrument.devices.stage.position() == 0.0
-    predicted = next(event.data["duration"] for event in events if event.event == "run_started")
-    assert predicted == pytest.approx(seconds, rel=0.03, abs=0.05 * 12)  # looks at a moving stage are 20 ms apart
-
-
-def test_flats_with_an_exposure_of_their_own_give_the_same_line_integrals(tmp_path: Path) -> None:
-    """A cylinder about the axis, Beer-Lambert without effects: 2 mu sqrt(r^2 - u^2) in each column, from every side."""
-    radius, attenuation, pitch = 0.05, 5.0, 4e-3
-    overrides = [
-        *SMALL,
-        "scan.mode=step",
-        "scan.flats.exposure_s=0.005",
-        "devices.camera.roi=[1148, 2028, 8, 40]",
-        f"optics.pixel_size_um={pitch * 1e3}",
-        "simulation.clock=virtual",
-        "simulation.scene={phantom: {kind: solids, solids: [{kind: cylinder, radius: 0.05, height: 9.0,"
-        " attenuation: 5.0}]}, beam: {photons_per_s: 3.0e+5}}",
-    ]
-    result = run_scan(load(config_folder() / "simulated.yaml", overrides, environment={}), tmp_path)
-    assert set(result.flags) == {"stuck"}  # without noise one view is like the other; the beam is found to be the same
-    with open_scan(result.path) as source:
-        selection = Selection(axis_col=19.5, steps=(Air("none"), Flags("ignore")))
-        said: list[str] = []
-        prepared = prepare_projections(source, selection, said.append)
-        assert len(said) == 1 and said[0].startswith("--flags ignore")
-        assert sorted(set(source.exposures.tolist())) == [0.005, 0.02]
-    u = (np.arange(40) - 19.5) * pitch
-    expected = 2 * attenuation * np.sqrt(np.clip(radius**2 - u**2, 0, None))
-    # 14 000 counts in a flat of 5 ms, rounded to a half: 4e-5 of its light.
-    np.testing.assert_allclose(prepared.projections.data, np.broadcast_to(expected, (12, 8, 40)), atol=1e-4)
-
-
-@pytest.mark.parametrize("below", ["", "deeper/still"])
-def test_a_file_where_runs_should_go_is_refused(tmp_path: Path, below: str) -> None:
-    (tmp_path / "runs").write_text("a file")
-    instrument = FakeInstrument()
-    with pytest.raises(ConfigError, match="there is a file at"):
-        run_scan(small(), tmp_path / "runs" / below, instrument=instrument.connected())
-    assert instrument.log == []
-
-
-@pytest.mark.parametrize(
-    ("error", "code"),
-    [
-        (InstrumentError("x"), 3),
-        (DeviceError("stage", "x"), 3),
-        (ConfigError("x"), 2),
-        (KeyboardInterrupt(), 130),
-        (ZeroDivisionError(), 1),
-    ],
-)
-def test_exit_codes(error: BaseException, code: int) -> None:
-    assert module.exit_code(error) == code
 
 
 def test_memory_for_the_frames_is_ready_before_the_first_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,6 @@ from beamline.monitor.check import Flag, Level, Policy
 from beamline.scan import recorder as recorder_module
 from beamline.scan.states import State
 from beamline.scan.supervision import (
-    AlarmPolicy,
     AlarmReaction,
     BacklogGuard,
     BeamGuard,
@@ -84,12 +83,7 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
 ) -> None:
     stop, pause = StopRequest(), PauseRequest()
     events: list[tuple[str, Mapping[str, Any]]] = []
-    react = AlarmReaction(
-        AlarmPolicy(act_after=3, policies={"beam": policy}),
-        stop,
-        pause,
-        lambda event: events.append((event.event, event.data)),
-    )
+    react = AlarmReaction(3, {"beam": policy}, stop, pause, lambda event: events.append((event.event, event.data)))
     held = 0
     for level in frames:
         react(flags(level))
@@ -129,7 +123,7 @@ def test_a_pause_that_was_asked_for_outlasts_the_beam() -> None:
     pause = PauseRequest()
     pause.pause("look")
     pause.no_beam("no beam", 0.0)
-    pause.beam_back()
+    pause.release(Cause.BEAM)
     assert pause.reason.startswith("look")
     pause.resume()
     assert pause.reason == ""
@@ -227,7 +221,7 @@ def test_what_holds_a_scan_ends_by_itself_alone() -> None:
     pause.no_beam("dark", 0.0)
     pause.pause()
     pause.resume()
-    pause.beam_back()
+    pause.release(Cause.BEAM)
     assert pause.reason == "full"
     pause.release(Cause.SPACE)
     assert pause.reason == ""

@@ -12,7 +12,7 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.xafs.contrast import XafsCurve
-from beamline.xafs.measured import AbsorptionTable, FileOptions, Radiographs, open_measured, open_series
+from beamline.xafs.measured import FileOptions, Radiographs, open_measured, open_series
 from beamline.xafs.series import Series
 
 ENERGIES = np.linspace(8.3, 8.4, 11)
@@ -51,7 +51,7 @@ def _counts() -> dict[str, Any]:
 def test_tables_of_any_manner(tmp_path: Path, text: str) -> None:
     (tmp_path / "mu.csv").write_text(text, encoding="utf-8")
     with open_measured(tmp_path / "mu.csv", None, None) as table:
-        assert isinstance(table, AbsorptionTable)
+        assert isinstance(table, XafsCurve)
         assert (table.energies.tolist(), table.absorption.tolist()) == ([8.30, 8.31], [1.5, 1.6])
 
 

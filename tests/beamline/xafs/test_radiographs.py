@@ -1,11 +1,11 @@
-"""Depth: Beer-Lambert for any unit of counts, and no number where there was no light to tell one."""
+"""Radiographs: Beer-Lambert for any unit of counts, and no number where there was no light to tell one."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from beamline.xafs.depth import line_integrals
+from beamline.xafs.radiographs import line_integrals
 
 TRUE = np.linspace(0.0, 6.0, 12).reshape(3, 4)
 
