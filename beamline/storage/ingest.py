@@ -25,6 +25,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
 
 PER_FLUSH = 64  # rows
@@ -105,7 +106,7 @@ def _copy(
         file["/entry/record/no_data"] = float(no_data)
     if source.part_starts.size > 1:
         file[layout.PART_STARTS] = source.part_starts
-    rows = layout.Rows(file)
+    rows = Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0
     for i, (given, record) in enumerate(_frames(source)):
@@ -134,15 +135,15 @@ def _copy(
     return invalid
 
 
-def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
+def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
     """Pixels and metadata of each frame; a scan of ours (even if its writer died) keeps its log."""
     flags = source.flags
     if source.dtype == np.uint16:
         for i, frame in enumerate(source.frames()):
             known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
-            yield frame.counts, layout.Record(*known, UNMARKED if flags is None else flags.mark(i))
+            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i))
         return
     keys, angles, exposures = source.image_key, source.angles, source.exposures
     for i in range(keys.size):
-        record = layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
+        record = Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
         yield source.read([i])[0], record

@@ -22,19 +22,20 @@ from beamline.storage.hdf5 import require_real
 from beamline.storage.parts import require_joined
 from beamline.storage.readers.base import (
     WHOLE,
-    BaseSource,
     Opening,
     Quantity,
     ScanFormat,
+    ScanSource,
     count_in_blocks,
     frame_indices,
 )
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
+from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
 
 
-class NXtomoSource(BaseSource):
+class NXtomoSource(ScanSource):
     """A scan in NXtomo's structure; see ScanSource."""
 
     def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
@@ -124,7 +125,7 @@ class NXtomoSource(BaseSource):
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
         if self._ours and n > self.n:
-            rows = layout.altered_rows(self._file, self.n, n)
+            rows = altered_rows(self._file, self.n, n)
             self._altered |= {self.n + row for row in rows.tolist()}
         known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
@@ -202,7 +203,7 @@ class NXtomoSource(BaseSource):
     def _replaces(self) -> NDArray[np.int64]:
         rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n].astype(np.int64)
         rows[[*self._altered]] = -1
-        layout.require_earlier(rows)
+        require_earlier(rows)
         return rows
 
     @property

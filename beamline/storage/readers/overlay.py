@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.angle_table import assign
-from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, Quantity, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, frame_indices
 from drivers.base.frame import Frame, FrameKind
 
 
-class OverlaidSource(BaseSource):
+class OverlaidSource(ScanSource):
     """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
 
     If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.

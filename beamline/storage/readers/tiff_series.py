@@ -22,7 +22,7 @@ from beamline.core.errors import DataError
 from beamline.core.text import spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refuse_volume
 from drivers.base.frame import FrameKind
 
@@ -32,7 +32,7 @@ COUNTED = 100  # range of the numbers over the count of files; above it the numb
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
-class TiffSeriesSource(BaseSource):
+class TiffSeriesSource(ScanSource):
     """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series.
 
     Attribute `angle_text`: (name, content) of the one file that is named after angles, or None.

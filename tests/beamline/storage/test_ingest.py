@@ -16,7 +16,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.ingest import ingest
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import validate
-from beamline.storage.writers import layout
+from beamline.storage.writers.rows import Rows
 from drivers.base.frame import Frame, FrameKind
 
 SHAPE = (24, 32)
@@ -123,7 +123,7 @@ def test_a_full_disk_is_one_sentence_however_hdf5_tells_of_it(
         raise RuntimeError("file write failed: errno = 28, error message = 'No space left on device', buf = 0x5")
 
     monkeypatch.setattr(h5py.File, "close", no_room)
-    monkeypatch.setattr(layout.Rows, "write", no_room)
+    monkeypatch.setattr(Rows, "write", no_room)
     with pytest.raises(DataError) as error:
         ingest(SourceOptions(stack[0], angles=ANGLES), tmp_path / "out.h5")
     out = tmp_path / "out.h5"
