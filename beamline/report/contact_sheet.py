@@ -25,11 +25,9 @@ class FlaggedFrame:
     Attributes:
         image: [row, col] counts, binned where there are many.
         extent: (rows, cols) of the whole frame, in pixels of the detector.
-        title: which frame it is.
         reasons: a line for each flag.
         regions: of the flags, in pixels of the detector: first row, row after the last, first column, column after
             the last.
-        alarm: a flag is an alarm.
     """
 
     image: NDArray[np.float32]

@@ -43,14 +43,10 @@ class TradeoffOptions:
     """The scan and the trials to compare.
 
     Attributes:
-        source, selection: the scan and the part of it to use.
         folder: for the results; must not exist.
         methods: names in `recon.methods`.
-        depth: how many trials.
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
         truth: FILE or FILE:first:end to compare with.
-        seed: of everything random.
-        command: the command line that repeats the trade-off, for the record.
     """
 
     source: SourceOptions

@@ -65,7 +65,6 @@ class NXtomoWriter:
         """Create the file, ready to be followed.
 
         Args:
-            frame_shape: (rows, cols) of every frame.
             preview_bin: the bin that the digests' previews are made with.
             flush_every: frames between flushes; a crash loses at most the frames since the last one.
 
