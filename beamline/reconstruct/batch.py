@@ -207,8 +207,6 @@ def _begin(folder: Path, recipe: bytes) -> None:
     if folder.exists() and not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
     if not folder.exists():
-        if not folder.parent.is_dir():
-            raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
         with whole_file(folder) as partial:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)

@@ -127,7 +127,7 @@ class ScanSource(ABC):
         """Close the file."""
 
     def refresh(self) -> int:
-        """Number of frames that can be read; a format that grows looks again."""
+        """Look again at a growing file; how many frames can be read now."""
         return int(self.image_key.size)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:

@@ -49,9 +49,9 @@ class NXtomoSource(ScanSource):
             shape = places.data.shape
             self.shape = (int(shape[1]), int(shape[2]))
             self.dtype = places.data.dtype
-            definition = hdf5.text(_value(places.entry, "definition")) or hdf5.attribute(places.entry, "definition")
-            self.format = _format(definition, hdf5.text(_value(places.entry, "program_name")))
-            said = hdf5.text(_value(self._file, "/entry/record/quantity"))
+            definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
+            self.format = _format(definition, hdf5.text_at(places.entry, "program_name"))
+            said = hdf5.text_at(self._file, "/entry/record/quantity")
             self.quantity = _quantity(said, self.dtype)
             self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
             energy = (hdf5.scalar(places.entry, f"{where}/incident_energy", hdf5.ENERGY_UNITS) for where in BEAMS)
@@ -95,7 +95,6 @@ class NXtomoSource(ScanSource):
             )
 
     def refresh(self) -> int:
-        """Look again at a growing file; how many frames can be read now."""
         with hdf5.readable(self.path):
             return self._refreshed()
 
@@ -155,7 +154,7 @@ class NXtomoSource(ScanSource):
         entry = self._places.entry
         said: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
-            value = hdf5.text(_value(entry, where))
+            value = hdf5.text_at(entry, where)
             if value:
                 said[name] = value
         for name, where, units in NUMBERS:
@@ -216,7 +215,6 @@ class NXtomoSource(ScanSource):
         return starts.astype(np.int64)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order."""
         indices, height = frame_indices(frames, self.n), len(range(self.shape[0])[rows])
         out = np.empty((indices.size, height, self.shape[1]), self.dtype)
         compared = 2 * height >= self.shape[0] and self.checksummed
@@ -255,7 +253,7 @@ class NXtomoSource(ScanSource):
     @property
     def plan(self) -> Mapping[str, Any]:
         try:
-            plan = json.loads(hdf5.text(_value(self._file, "/entry/record/plan")) or "{}") if self._ours else {}
+            plan = json.loads(hdf5.text_at(self._file, "/entry/record/plan") or "{}") if self._ours else {}
         except (ValueError, RecursionError):
             return {}
         return plan if isinstance(plan, dict) else {}
@@ -326,11 +324,6 @@ NUMBERS = (
     ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
     ("source_distance_mm", "record/source_distance", hdf5.LENGTH_UNITS),
 )
-
-
-def _value(group: h5py.Group, path: str) -> Any:
-    item = hdf5.dataset(group, path)
-    return b"" if item is None else item[()]
 
 
 def _format(definition: str, program: str) -> str:

@@ -120,7 +120,6 @@ class OverlaidSource(ScanSource):
         return self._base.finished
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order."""
         n = len(self._front)
         indices = frame_indices(frames, n + self._base.image_key.size)
         front = indices < n

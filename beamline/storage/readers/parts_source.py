@@ -93,7 +93,6 @@ class PartsSource(ScanSource):
         return self._sources[-1].plan
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order."""
         indices = frame_indices(frames, self.image_key.size)
         of = np.searchsorted(self._firsts, indices, "right") - 1
         if indices.size and (of == of[0]).all():

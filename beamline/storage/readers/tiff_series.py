@@ -68,7 +68,6 @@ class TiffSeriesSource(ScanSource):
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the files asked for, in that order."""
         indices = frame_indices(frames, self.image_key.size)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for i, number in enumerate(indices):

@@ -76,7 +76,6 @@ class TiffStackSource(ScanSource):
         return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the pages asked for, in that order."""
         indices = frame_indices(frames, self.image_key.size)
         wanted = range(self.shape[0])[rows]
         out = np.empty((indices.size, len(wanted), self.shape[1]), self.dtype)
