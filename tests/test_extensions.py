@@ -213,11 +213,11 @@ READER = Extension(
         "beamline/storage/readers/npy_stack.py": """
 import numpy as np
 
-from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from drivers.base.frame import FrameKind
 
 
-class NpyStack(BaseSource):
+class NpyStack(ScanSource):
     format = "npy_stack"
 
     def __init__(self, path):

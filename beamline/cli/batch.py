@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
-from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import events_shown
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import Done
-from beamline.core.signals import terminated_like_interrupted
-from beamline.core.sinks import fan_out
 from beamline.reconstruct.batch import TABLE, BatchOptions, run_batch
 from drivers.base.clock import SystemClock
 
@@ -53,8 +49,7 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
     code 4). Exit code 5: a scan failed.
     """
     options, clock = BatchOptions(scans, config, output), SystemClock()
-    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
-        sink = fan_out(*(json_sinks or [terminal]))
+    with events_shown(as_json) as sink:
         try:
             rows = run_batch(options, sink, clock)
         except KeyboardInterrupt as stop:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -12,11 +11,10 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, json_option
-from beamline.cli.terminal import Terminal
+from beamline.cli.options import POSITIVE, json_option, parsed
+from beamline.cli.terminal import events_shown
 from beamline.core.events import BenchDone, BenchStarted, Done, Event, TrialReached
 from beamline.core.machine import machine, machine_line
-from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import size
 from drivers import orca_quest
 from drivers.base.clock import SystemClock
@@ -35,14 +33,10 @@ def bench() -> None:
     """Measure this machine."""
 
 
-def _frame_size(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
-    if value is None:
-        return None
+def _frame_size(value: str) -> tuple[int, int]:
     words = value.lower().split("x")
     if len(words) != 2 or not all(word.isdecimal() and 16 <= int(word) <= 32_768 for word in words):
-        raise click.BadParameter(
-            f"{value!r} is no size of a frame; expected rows x columns, of 16 to 32768, as in 2304x4096."
-        )
+        raise ValueError(f"{value!r} is no size of a frame; expected rows x columns, of 16 to 32768, as in 2304x4096.")
     return int(words[0]), int(words[1])
 
 
@@ -58,7 +52,7 @@ def _frame_size(ctx: click.Context, param: click.Parameter, value: str | None) -
     "--size",
     "shape",
     metavar="ROWSxCOLS",
-    callback=_frame_size,
+    callback=parsed(_frame_size),
     help="Rows and columns of a frame, instead of the camera's.",
 )
 @click.option("--seconds", type=POSITIVE, default=60.0, show_default=True, help="For all rounds; not the warm-up.")
@@ -78,13 +72,12 @@ def acquire(
     from beamline.doctor.rate import rates, summary
 
     clock, taken = SystemClock(), []
-    with terminated_like_interrupted(), json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
+    with events_shown(as_json) as sink:
         work = _load(file, shape)
         found = machine()
         start = {"machine": found, "folder": folder.absolute(), "rows": work.shape[0], "cols": work.shape[1]}
-        if as_json:
-            sinks[0](BenchStarted(start, time=clock.now()))
-        else:
+        sink(BenchStarted(start, time=clock.now()))
+        if not as_json:
             frame = f"{work.shape[0]} x {work.shape[1]} pixels, {size(work.frame_bytes)} a frame"
             click.echo(f"{machine_line(found)}\n{frame}, previews of {work.preview_bin} x {work.preview_bin}\n")
         began = clock.now()
@@ -92,16 +85,14 @@ def acquire(
         def progress(n: int, of: int, stage: str) -> None:
             per_min = 60 * n / max(clock.now() - began, 1e-9)
             left = (of - n) * 60 / per_min if n else None
-            shown = sinks[0] if as_json else terminal
-            shown(TrialReached("bench", n, of, stage, left, per_min, time=clock.now()))
+            sink(TrialReached("bench", n, of, stage, left, per_min, time=clock.now()))
 
         for one in rates(work, folder, clock, seconds, rounds, progress):
             taken.append(one)
         rows = summary(work, taken)
-        for row in rows if as_json else ():
-            sinks[0](BenchDone(row, time=clock.now()))
-        if as_json:
-            sinks[0](Done({}, time=clock.now()))
+        for row in rows:
+            sink(BenchDone(row, time=clock.now()))
+        sink(Done({}, time=clock.now()))
     if not as_json:
         click.echo(_rate_table(rows, rounds))
 
@@ -165,12 +156,11 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
     from recon.warm_up import warm_up
 
     clock = SystemClock()
-    with json_events(as_json) as sinks:
+    with json_events(as_json) as sink:
 
         def show(event: Event, text: str) -> None:
-            for sink in sinks:
-                sink(replace(event, time=clock.now()))
-            if not sinks:
+            sink(replace(event, time=clock.now()))
+            if not as_json:
                 click.echo(text)
 
         found = machine()
@@ -181,8 +171,7 @@ def recon(gaussians: int, side: int, volumes: bool, as_json: bool) -> None:
             show(BenchDone({**asdict(timing), "ns_per_pair": timing.ns_per_pair}), _line(timing))
         for row in _rows() if volumes else ():
             show(BenchDone(row), _volume_line(row))
-        for sink in sinks:
-            sink(Done({}, time=clock.now()))
+        sink(Done({}, time=clock.now()))
 
 
 def _timings(gaussians: int, side: int) -> Iterator[Timing]:

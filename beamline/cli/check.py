@@ -27,12 +27,11 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     from beamline.config.load import load
     from beamline.scan.preflight import dry_run, refuse_violations
 
-    with json_events(as_json) as sinks:
+    with json_events(as_json) as sink:
         worked = dry_run(load(file, overrides))
         if not as_json:
             click.echo("\n".join(worked.lines()))
         refuse_violations(worked.timeline)
-        for sink in sinks:
-            sink(Done(worked.data(), time=SystemClock().now()))
+        sink(Done(worked.data(), time=SystemClock().now()))
     if not as_json:
         click.echo(f"\n{file} is valid: no limit is violated.")

@@ -47,12 +47,12 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
     from beamline.config.load import config_folder, load
 
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
-    with json_events(as_json) as sinks:
+    with json_events(as_json) as json_sink:
         config = load(config_folder() / "demo.yaml", overrides)
         stop = StopRequest()
         last: list[Event] = []
         with stop_signals(stop), _compiling(), Terminal(sys.stderr) as terminal:
-            run_demo(config, output, [terminal, last.append, *sinks], stop, shlex.join(["beamline", *sys.argv[1:]]))
+            run_demo(config, output, [terminal, last.append, json_sink], stop, shlex.join(["beamline", *sys.argv[1:]]))
     if not as_json:
         done = last[-1]
         assert isinstance(done, VolumeDone)

@@ -56,17 +56,15 @@ def doctor(file: Path | None, session: bool, overrides: tuple[str, ...], as_json
     if file is None and overrides:
         raise click.UsageError("--set needs a CONFIG.")
     clock, checks = SystemClock(), list[Diagnosis]()
-    with terminated_like_interrupted(), json_events(as_json) as sinks:
+    with terminated_like_interrupted(), json_events(as_json) as sink:
         config = None if file is None else load(file, overrides)
         if not as_json:
             click.echo("Measuring the disk takes a few seconds.", err=True)
         for check in examine(config, clock, session=session):
             checks.append(check)
-            for sink in sinks:
-                sink(Diagnosed(check, time=clock.now()))
+            sink(Diagnosed(check, time=clock.now()))
         counts = Counter(check.verdict for check in checks)
-        for sink in sinks:
-            sink(Done({str(grade).replace(" ", "_"): counts[grade] for grade in Grade}, time=clock.now()))
+        sink(Done({str(grade).replace(" ", "_"): counts[grade] for grade in Grade}, time=clock.now()))
     if not as_json:
         _show(checks, compared=file is not None)
         click.echo(", ".join(f"{counts[verdict]} {verdict}" for verdict in Grade if counts[verdict]))

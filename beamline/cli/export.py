@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import json_option
-from beamline.cli.recon import parsed, refuse_shared, volume_path
+from beamline.cli.options import json_option, parsed, refuse_shared, volume_path
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
@@ -93,7 +92,7 @@ def export(
         raise click.UsageError(f"{format_of(output).name} holds the values themselves: leave out --bits and --window.")
     clock = SystemClock()
     began = clock.now()
-    with terminated_like_interrupted(), json_events(as_json) as sinks:
+    with terminated_like_interrupted(), json_events(as_json) as sink:
         refuse_existing(output)
         with opened_volume(volume, dataset) as record:
             if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
@@ -106,9 +105,8 @@ def export(
             shape = record.volume.grid.shape
         seconds = clock.now() - began
         share = clipped / math.prod(shape)
-        for sink in sinks:
-            facts = {"output": output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
-            sink(Done({**facts, "seconds": seconds}, time=clock.now()))
+        facts = {"output": output, "shape": shape, "bits": pixels.bits, "window": window, "clipped": share}
+        sink(Done({**facts, "seconds": seconds}, time=clock.now()))
     if as_json:
         return
     click.echo(f"output   {output} ({format_of(output).name}, {pixels.dtype.name})")
@@ -120,12 +118,11 @@ def export(
 def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
     from beamline.reconstruct.model import read_model, write_ply
 
-    with terminated_like_interrupted(), json_events(as_json) as sinks:
+    with terminated_like_interrupted(), json_events(as_json) as sink:
         refuse_existing(output)
         model = read_model(volume)
         write_ply(output, model)
-        for sink in sinks:
-            sink(Done({"output": output, "gaussians": model.gaussians.n}, time=SystemClock().now()))
+        sink(Done({"output": output, "gaussians": model.gaussians.n}, time=SystemClock().now()))
     if not as_json:
         click.echo(f"output     {output} (PLY)\ngaussians  {model.gaussians.n}, {model.gaussians.kernel}")
 

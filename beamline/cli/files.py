@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,11 @@ import click
 from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.scan_options import scan_options
-from beamline.cli.terminal import Terminal, counting
+from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError
 from beamline.core.events import Done, RuleBroken
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
-from beamline.core.sinks import fan_out
 from beamline.core.text import count, printable, size, spans
 from beamline.storage.codecs import CODECS
 from drivers.base.clock import SystemClock
@@ -35,10 +33,9 @@ def info(file: Path, as_json: bool, **said: Any) -> None:
     from beamline.storage.flag_legend import counted
     from beamline.storage.readers.open import SourceOptions
 
-    with json_events(as_json) as sinks:
+    with json_events(as_json) as sink:
         facts = dict(describe(SourceOptions(file, **said)))
-        for sink in sinks:
-            sink(Done(facts, time=SystemClock().now()))
+        sink(Done(facts, time=SystemClock().now()))
     if as_json:
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
@@ -80,14 +77,13 @@ def validate(file: Path, deep: bool, as_json: bool, **said: Any) -> None:
     from beamline.storage.rules.validate import validate as findings_of
 
     clock = SystemClock()
-    with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
-        progress = counting("validate", fan_out(*(sinks or [terminal])), clock)
+    with events_shown(as_json) as sink:
+        progress = counting("validate", sink, clock)
         findings, now = findings_of(SourceOptions(file, **said), progress if deep else None), clock.now()
         counts = {severity: sum(f.severity == severity for f in findings) for severity in ("error", "warning", "info")}
-        for sink in sinks:
-            for finding in findings:
-                sink(RuleBroken(**vars(finding), time=now))
-            sink(Done({"file": file, **counts}, time=now))
+        for finding in findings:
+            sink(RuleBroken(**vars(finding), time=now))
+        sink(Done({"file": file, **counts}, time=now))
     errors = count(counts["error"], "error")
     if not as_json:
         for finding in findings:
@@ -115,14 +111,13 @@ def recover(file: Path, as_json: bool) -> None:
     def say(what: str) -> None:
         click.echo(what, err=True)
 
-    with terminated_like_interrupted(), json_events(as_json) as sinks:
+    with terminated_like_interrupted(), json_events(as_json) as sink:
         run = file.parent if file.name == JOINED and (file.parent / SCAN).is_file() else file
         found, left_out = recover_run(run, say) if run.is_dir() else ([recover_scan(file, say)], [])
         for said in left_out:
             click.echo(f"Warning: {said}", err=True)
-        for sink in sinks:
-            for done in found:
-                sink(Done(done, time=SystemClock().now()))
+        for done in found:
+            sink(Done(done, time=SystemClock().now()))
     if not as_json:
         click.echo("\n".join(done.said() for done in found))
 
@@ -156,7 +151,7 @@ def ingest(
 
     clock = SystemClock()
     began = clock.now()
-    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+    with events_shown(as_json) as sink:
         refuse_existing(output)
         done = ingest_scan(
             SourceOptions(source, **said),
@@ -165,11 +160,10 @@ def ingest(
             energy_kev=energy_kev,
             sample=sample,
             no_data=no_data,
-            progress=counting("ingest", fan_out(*(json_sinks or [terminal])), clock),
+            progress=counting("ingest", sink, clock),
         )
         seconds = clock.now() - began
-        for sink in json_sinks:
-            sink(Done({**vars(done), "output": done.path, "seconds": seconds}, time=clock.now()))
+        sink(Done({**vars(done), "output": done.path, "seconds": seconds}, time=clock.now()))
     if as_json:
         return
     click.echo(f"output   {done.path} ({done.definition})")
@@ -200,13 +194,12 @@ def archive(scan: Path, output: Path, codec: str, keep_damaged: bool, as_json: b
 
     clock = SystemClock()
     began = clock.now()
-    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+    with events_shown(as_json) as sink:
         refuse_existing(output)
-        progress = counting("archive", fan_out(*(json_sinks or [terminal])), clock)
+        progress = counting("archive", sink, clock)
         done = archive_scan(scan, output, codec, keep_damaged=keep_damaged, progress=progress)
         facts = {**vars(done), "codec": codec, "ratio": done.raw_bytes / done.bytes, "seconds": clock.now() - began}
-        for sink in json_sinks:
-            sink(Done(facts, time=clock.now()))
+        sink(Done(facts, time=clock.now()))
     if as_json:
         return
     click.echo(f"output   {output} ({codec})")

@@ -15,16 +15,15 @@ from drivers.base.clock import SystemClock
 
 
 @contextmanager
-def json_events(wanted: bool) -> Iterator[list[Sink]]:
-    """The sinks for JSON on stdout; none unless `wanted`. An error in the block becomes the event `failed`."""
+def json_events(wanted: bool) -> Iterator[Sink]:
+    """The sink for JSON on stdout, idle unless `wanted`. An error in the block becomes the event `failed`."""
     if not wanted:
-        yield []
+        yield fan_out()
         return
     lines = JsonLines(sys.stdout)
     last: list[Event] = []
-
     try:
-        yield [fan_out(last.append, lines)]
+        yield fan_out(last.append, lines)
     except (Exit, ClickException):
         raise
     except (Exception, KeyboardInterrupt) as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
@@ -12,7 +12,7 @@ import click
 from click.core import ParameterSource
 
 from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
-from beamline.cli.options import POSITIVE
+from beamline.cli.options import POSITIVE, parsed, together
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
@@ -58,35 +58,11 @@ _STREAMED = (*_TIMED, "loss", "kernel", "plain_splatting")
 _FINISHED = (*(name for name in _OF_A_FIT if name not in _STREAMED), "allow_negative")  # of finished scans only
 
 
-def time_given(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
-    """A time such as 30s, 2m or 1h, in s."""
-    if value is None:
-        return None
-    try:
-        return parse_budget(value)
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from error
-
-
-def checkpoint_output(ctx: click.Context, param: click.Parameter, value: Path | None) -> Path | None:
-    """A file name."""
-    if value is not None and not value.name:
-        raise click.BadParameter(f"{str(value)!r} is no file; name one, such as fit.checkpoint.h5")
-    return value
-
-
-def method_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of the fit and of the iterative methods."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
-
-
-def row_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds the options of methods for every row of a table: length and start of the work."""
-    for option in reversed(_OF_ROWS):
-        command = option(command)
-    return command
+def checkpoint_output(path: Path) -> Path:
+    """The path, which names a file. ValueError for another."""
+    if not path.name:
+        raise ValueError(f"{str(path)!r} is no file; name one, such as fit.checkpoint.h5")
+    return path
 
 
 def row_settings(methods: Sequence[str], options: dict[str, Any]) -> dict[str, dict[str, Plain]]:
@@ -228,16 +204,12 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def preset_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --preset."""
-    return click.option(
-        "--preset",
-        type=click.Choice(PRESETS_OF_METHODS),
-        help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
-        "The same as the method r2-published.",
-    )(command)
-
-
+preset_option = click.option(
+    "--preset",
+    type=click.Choice(PRESETS_OF_METHODS),
+    help="published: R²-Gaussian with all settings as published (Zha et al. 2024): 30 000 steps, no finish. "
+    "The same as the method r2-published.",
+)
 _STEPS = click.option(
     "--steps",
     type=click.IntRange(min=1),
@@ -267,8 +239,9 @@ _ALLOW_NEGATIVE = click.option(
     help="Keep voxels below zero, also in the sweeps after a fit: where air is not at zero, weak matter is not clipped "
     "with it.",
 )
-_OF_ROWS = (heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
-_OPTIONS = (
+row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT)
+"""The options of methods for every row of a table: length and start of the work."""
+method_options = together(
     heading(METHOD),
     _STEPS,
     click.option(
@@ -279,7 +252,7 @@ _OPTIONS = (
     ),
     click.option(
         "--budget",
-        callback=time_given,
+        callback=parsed(parse_budget),
         metavar="30s|2m|1h",
         help="Time from line integrals to volume: chooses method, steps, Gaussians and binning to end in time.",
     ),
@@ -319,7 +292,7 @@ _OPTIONS = (
     click.option(
         "--checkpoint",
         type=click.Path(path_type=Path, dir_okay=False),
-        callback=checkpoint_output,
+        callback=parsed(checkpoint_output),
         help="Write the state of the fit to this file: every minute, at the end, and at Ctrl-C.",
     ),
     click.option(
@@ -348,3 +321,4 @@ _OPTIONS = (
         "May be repeated.",
     ),
 )
+"""The options of the fit and of the iterative methods."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,14 +13,10 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, json_option
-from beamline.cli.recon import parsed, refuse_shared, volume_path
-from beamline.cli.terminal import Terminal, counting
+from beamline.cli.options import POSITIVE, json_option, parsed, refuse_shared, volume_path
+from beamline.cli.terminal import counting, events_shown
 from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing
-from beamline.core.signals import terminated_like_interrupted
-from beamline.core.sinks import fan_out
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
@@ -64,9 +59,9 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
     from beamline.reconstruct.model import read_model  # here: help needs none of it
 
     refuse_shared({"VOLUME": volume, "--output": output})
-    with terminated_like_interrupted(), json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
+    with events_shown(as_json) as sink:
         refuse_existing(output)
-        yield read_model(volume), fan_out(*(sinks or [terminal])), SystemClock()
+        yield read_model(volume), sink, SystemClock()
 
 
 _VOLUME = click.argument("volume", type=click.Path(path_type=Path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -10,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.scan_options import scan_options
-from beamline.cli.terminal import Terminal, counting
+from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Done, FrameFlagged, Warned
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.signals import StopOnSignal
-from beamline.core.sinks import fan_out
 from beamline.core.text import spans
 from drivers.base.clock import SystemClock
 
@@ -81,12 +78,11 @@ def monitor(
     if sheet is not None:
         refuse_existing(sheet)
     clock = SystemClock()
-    with json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
+    with events_shown(as_json) as sink:
         checks, limits = CHECKS, None
         if config is not None:
             read = load(config, overrides)
             checks, limits = configured_checks(read.monitor), reference_limits(read.references)
-        sink = fan_out(*(json_sinks or [terminal]))
         progress = counting("monitor", sink, clock)
         found: list[Judged] = []
         active: set[tuple[str, Level]] = set()
@@ -114,8 +110,7 @@ def monitor(
             "aside": said_of.aside,
             "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in said_of.kinds],
         }  # fmt: skip
-        for json_sink in json_sinks:
-            json_sink(Done(done, time=clock.now()))
+        sink(Done(done, time=clock.now()))
     if not as_json:
         end = f"{file}: {n} frames, flagged: {counted(said_of.flags)}"
         end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""

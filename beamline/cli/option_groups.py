@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from beamline.cli.options import Decorator
 from beamline.cli.recipe import Repeatable
 
 DATA = "Data"
@@ -19,8 +20,6 @@ GROUPS = (DATA, CORRECTIONS, METHOD, OUTPUT, RESOURCES)
 
 _GROUP = "splatline_group"
 _ALL = "splatline_help_all"
-
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 def heading(group: str) -> Decorator:

@@ -1,8 +1,11 @@
-"""Arguments and options that several commands share: numbers, a configuration with overrides, JSON output."""
+"""Arguments and options that several commands share, and how their values are parsed and compared."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,3 +35,47 @@ set_option = click.option(
     help="Override a value of the configuration, such as scan.period_s=0.2. May be repeated.",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON event per line to stdout.")
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+def together(*options: Decorator) -> Decorator:
+    """A decorator that adds these options, in this order."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
+
+
+def parsed(parse: Callable[[Any], Any]) -> Callable[[click.Context, click.Parameter, Any], Any]:
+    """A callback that parses an option by `parse`; its ValueError becomes bad usage."""
+
+    def callback(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        try:
+            return None if value is None else parse(value)
+        except ValueError as error:
+            raise click.BadParameter(str(error)) from error
+
+    return callback
+
+
+def volume_path(text: str) -> Path:
+    """A path whose suffix names the format of a volume. ValueError for another."""
+    from beamline.storage.volumes.files import format_of  # here: help needs none of it
+
+    format_of(Path(text))
+    return Path(text)
+
+
+def refuse_shared(files: Mapping[str, Path | None]) -> None:
+    """Raises UsageError if two of `files`, by option, are the same file, which would then be overwritten.
+
+    Only --checkpoint may replace the file of --resume.
+    """
+    named = {option: os.path.normcase(path.resolve()) for option, path in files.items() if path is not None}
+    for one, other in itertools.combinations(named, 2):
+        if named[one] == named[other] and {one, other} != {"--checkpoint", "--resume"}:
+            raise click.UsageError(f"{one} and {other} are the same file, {files[other]}. Give two different files.")

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
-import os
 import re
-import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.json_output import json_events
+from beamline.cli.log import LogLines, logged
 from beamline.cli.method_options import (
     SETTINGS,
     method_options,
@@ -27,17 +24,15 @@ from beamline.cli.method_options import (
     resumes_slabs,
 )
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
-from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option
+from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option, parsed, refuse_shared, volume_path
 from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options, steps_said
-from beamline.cli.terminal import LogLines, Terminal, counting, results
-from beamline.core.errors import DataError, QualityError, ScanStopped, user_message
-from beamline.core.events import Done, Event, Failed, FitReached, Sink, StateEntered, VolumeDone
-from beamline.core.files import named_on_failure, refuse_existing, write_whole
-from beamline.core.signals import StopOnSignal, terminated_like_interrupted
-from beamline.core.sinks import fan_out, while_it_works
-from beamline.core.version import version
-from beamline.scan.run_folder import new_log
+from beamline.cli.terminal import counting, events_shown, results
+from beamline.core.errors import DataError, QualityError, ScanStopped
+from beamline.core.events import Done, Event, FitReached, VolumeDone
+from beamline.core.files import write_whole
+from beamline.core.signals import StopOnSignal
+from beamline.core.sinks import fan_out
 from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import Clock, SystemClock
 from recon.base.choices import AUTO, Filter, Quality
@@ -47,26 +42,6 @@ if TYPE_CHECKING:
     from beamline.reconstruct.axis_trials import AxisRange
     from beamline.reconstruct.options import ReconOptions
     from beamline.reconstruct.region import Region
-
-
-def parsed(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, str | None], Any]:
-    """A callback that parses an option by `parse`; its ValueError becomes bad usage."""
-
-    def callback(ctx: click.Context, param: click.Parameter, value: str | None) -> Any:
-        try:
-            return None if value is None else parse(value)
-        except ValueError as error:
-            raise click.BadParameter(str(error)) from error
-
-    return callback
-
-
-def volume_path(text: str) -> Path:
-    """A path whose suffix names the format of a volume. ValueError for another."""
-    from beamline.storage.volumes.files import format_of  # here: help needs none of it
-
-    format_of(Path(text))
-    return Path(text)
 
 
 def output_path(text: str) -> Path:
@@ -275,33 +250,32 @@ def recon(
         if step.needs_finished:
             raise click.UsageError(step.needs_finished)
     enough = None if enough_loss is enough_gain is None else Goal(enough_gain, enough_loss)
-    if enough is not None and not follow:
-        raise click.UsageError("--enough-loss and --enough-gain are for a scan that still runs: give --follow.")
-    if memory is not None and (follow or budget is not None):
-        raise click.UsageError("--memory does not go with --follow or --budget, which hold everything in memory.")
     partial = resume if resumes_slabs(resume) else None
-    if partial is not None and follow:
-        raise click.UsageError(f"--resume {resume} holds slabs of a finished scan; it does not go with --follow.")
-    if dry and (follow or budget is not None):
-        raise click.UsageError("--dry-run does not go with --follow or --budget, which says the time itself.")
     typed, output = output, output or Path(f"{file.stem}_{method}.h5")
     page = report_beside(output) if report else None
     files = {"FILE": file, "--output": output, "report": page, "--checkpoint": checkpoint}
     refuse_shared({**files, "--resume": resume, "--log": log})
     tried = None if values["axis"] is None or isinstance(values["axis"], float) else values["axis"]
-    if cluster is not None and (follow or budget is not None):
-        raise click.UsageError("--cluster does not go with --follow or --budget, which hold everything in memory.")
-    if roi is not None and (follow or truth is not None or tried is not None):
-        raise click.UsageError("--roi does not go with --follow, --truth or --axis try.")
-    if tried is not None and follow:
-        raise click.UsageError("--axis try is for a finished scan: it needs all views.")
-    if tried is not None and (dry or log is not None):
-        raise click.UsageError("--axis try does not go with --dry-run or --log: it writes a picture of slices only.")
-    if typed is not None and (typed.suffix.lower() == _SHEET) != (tried is not None):
-        what, suffix = ("--axis try writes a picture", _SHEET) if tried else ("only --axis try writes a picture", ".h5")
+    whole, tries = follow or budget is not None, tried is not None
+    for refused, why in (
+        (enough and not follow, "--enough-loss and --enough-gain are for a scan that still runs: give --follow."),
+        (memory and whole, "--memory does not go with --follow or --budget, which hold everything in memory."),
+        (partial and follow, f"--resume {resume} holds slabs of a finished scan; it does not go with --follow."),
+        (dry and whole, "--dry-run does not go with --follow or --budget, which says the time itself."),
+        (cluster and whole, "--cluster does not go with --follow or --budget, which hold everything in memory."),
+        (roi and (follow or truth or tries), "--roi does not go with --follow, --truth or --axis try."),
+        (tries and follow, "--axis try is for a finished scan: it needs all views."),
+        (
+            tries and (dry or log),
+            "--axis try does not go with --dry-run or --log: it writes a picture of slices only.",
+        ),
+        (earlier and not follow, "--earlier is for a run that goes on: give --follow, or the joined.h5 of its parts."),
+    ):
+        if refused:
+            raise click.UsageError(why)
+    if typed is not None and (typed.suffix.lower() == _SHEET) != tries:
+        what, suffix = ("--axis try writes a picture", _SHEET) if tries else ("only --axis try writes a picture", ".h5")
         raise click.UsageError(f"-o {typed}: {what}; give a name such as {typed.with_suffix(suffix)}.")
-    if earlier and not follow:
-        raise click.UsageError("--earlier is for a run that goes on: give --follow, or the joined.h5 of its parts.")
     source, selection = chosen(file, seed, values if tried is None else values | {"axis": None})
     options = ReconOptions(
         source=replace(source, earlier=earlier),
@@ -344,14 +318,10 @@ def recon(
         if isinstance(event, FitReached) and not event.unit:
             stop.ready = True
 
-    with (
-        terminated_like_interrupted(),
-        json_events(as_json) as json_sinks,
-        Terminal(sys.stderr) as terminal,
-    ):
-        shown = fan_out(*(json_sinks or [LogLines(sys.stderr, terminal=True) if verbose else terminal]))
-        with _logged(log, shown) as logged:
-            sink = fan_out(last.append, made, *logged, shown)
+    with events_shown(as_json) as usual:
+        shown = LogLines(sys.stderr, terminal=True) if verbose and not as_json else usual
+        with logged(log, shown) as lines:
+            sink = fan_out(last.append, made, *lines, shown)
             metrics = (follow_scan if follow else reconstruct_file)(options, sink, clock, stop_scope=stop)
     done = last[-1]
     assert isinstance(done, VolumeDone)
@@ -363,17 +333,6 @@ def recon(
         raise ScanStopped(f"The reconstruction was stopped early; {output} holds the volume reached by then.")
     if max_residual is not None:
         require(metrics, max_residual)
-
-
-def refuse_shared(files: Mapping[str, Path | None]) -> None:
-    """Raises UsageError if two of `files`, by option, are the same file, which would then be overwritten.
-
-    Only --checkpoint may replace the file of --resume.
-    """
-    named = {option: os.path.normcase(path.resolve()) for option, path in files.items() if path is not None}
-    for one, other in itertools.combinations(named, 2):
-        if named[one] == named[other] and {one, other} != {"--checkpoint", "--resume"}:
-            raise click.UsageError(f"{one} and {other} are the same file, {files[other]}. Give two different files.")
 
 
 def require(metrics: Mapping[str, float], max_residual: float) -> None:
@@ -391,10 +350,9 @@ def _dry_run(options: ReconOptions, clock: Clock, as_json: bool) -> None:
     """Print the time, memory and disk space of a reconstruction."""
     from beamline.reconstruct.estimate import estimate
 
-    with json_events(as_json) as sinks:
+    with json_events(as_json) as sink:
         found = estimate(options, clock)
-        for sink in sinks:
-            sink(Done(found, time=clock.now()))
+        sink(Done(found, time=clock.now()))
     if not as_json:
         click.echo("\n".join(found.lines()))
 
@@ -404,8 +362,8 @@ def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: boo
     from beamline.reconstruct.axis_trials import try_axes
 
     last: list[Event] = []
-    with json_events(as_json) as sinks, Terminal(sys.stderr) as terminal:
-        sink, clock = fan_out(last.append, *(sinks or [terminal])), SystemClock()
+    with events_shown(as_json) as shown:
+        sink, clock = fan_out(last.append, shown), SystemClock()
         try_axes(options, wanted, path, sink, clock, counting("axes", sink, clock))
     if not as_json:
         done = last[-1].data
@@ -417,33 +375,5 @@ def _try_axes(options: ReconOptions, wanted: AxisRange, path: Path, as_json: boo
 def _write_recipe(path: Path, text: str) -> None:
     if str(path) == "-":
         click.echo(text, nl=False)
-        return
-    write_whole(path, text)
-
-
-@contextmanager
-def _logged(path: Path | None, tell: Sink) -> Iterator[list[Sink]]:
-    """The sink that writes a log, if one is requested. An error in the block becomes its last line.
-
-    If its disk is full, `tell` gets a warning, and the work goes on.
-    """
-    if path is None:
-        yield []
-        return
-    refuse_existing(path)
-    with ExitStack() as closing:
-        with named_on_failure(path):
-            file = closing.enter_context(new_log(path))
-        write = LogLines(file)
-
-        def named(event: Event) -> None:
-            with named_on_failure(path):
-                write(event)
-
-        lines = while_it_works(named, tell)
-        lines(StateEntered("", f"splatline {version()}: {shlex.join(sys.argv)}", time=SystemClock().now()))
-        try:
-            yield [lines]
-        except (Exception, KeyboardInterrupt) as error:
-            lines(Failed(user_message(error), time=SystemClock().now()))
-            raise
+    else:
+        write_whole(path, text)

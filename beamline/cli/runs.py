@@ -37,10 +37,9 @@ def runs(folder: Path | None, as_json: bool) -> None:
     folder = folder or Path(RUNS)
     if not folder.is_dir():
         raise ConfigError(f"there is no folder {folder} here: name the one that has the runs.")
-    with json_events(as_json) as sinks:
+    with json_events(as_json) as sink:
         found = [describe(run) for run in runs_in(folder)]
-        for sink in sinks:
-            sink(Done({"folder": folder, "runs": found}, time=SystemClock().now()))
+        sink(Done({"folder": folder, "runs": found}, time=SystemClock().now()))
     if as_json:
         return
     if not found:

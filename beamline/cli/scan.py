@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -78,27 +77,27 @@ def scan(
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     if run is not None and (output is not None or (overrides and file is None)):
         raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
-    with json_events(as_json) as json_sinks, ExitStack() as held:
+    with json_events(as_json) as json_sink, ExitStack() as held:
         config = None if file is None else load(file, overrides)
         try:
             series = None if run is None else held.enter_context(open_for_resume(run, config))
         except NotJoined:
             if dry or run is None:
                 raise
-            _join(run, json_sinks)
+            _join(run, json_sink, as_json)
             return
         config = series.config if series else config
         assert config is not None
         for said in series.left_out if series else ():
             click.echo(f"Warning: {said}", err=True)
         if dry:
-            _dry_run(config, output, series, json_sinks)
+            _dry_run(config, output, series, json_sink, as_json)
             return
         stop, how = StopRequest(), commands_of(config, series) if not no_live else Commands()
         if how.remark:
             click.echo(how.remark, err=True)
         with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
-            sinks: list[Sink] = [terminal, *json_sinks, *([beside] if page else [])]
+            sinks: list[Sink] = [terminal, json_sink, *([beside] if page else [])]
             result = run_scan(
                 config, series or output, sinks, stop, live=how.live, afterwards=how.afterwards,
                 ask=lambda request: terminal.ask(request, ask_operator),
@@ -109,7 +108,7 @@ def scan(
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
 
 
-def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
+def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
     """Join the files of a run that has all its frames, and report it as `beamline recover` does."""
     from beamline.scan.resume import recover_run
 
@@ -117,9 +116,8 @@ def _join(run: Path, json_sinks: Sequence[Sink]) -> None:
     for said in left_out:
         click.echo(f"Warning: {said}", err=True)
     for done in found:
-        for sink in json_sinks:
-            sink(Done(done, time=SystemClock().now()))
-        if not json_sinks:
+        json_sink(Done(done, time=SystemClock().now()))
+        if not as_json:
             click.echo(done.said())
 
 
@@ -151,15 +149,14 @@ def _treated(path: Path) -> str:
     return ""
 
 
-def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sinks: Sequence[Sink]) -> None:
+def _dry_run(config: Config, output: Path | None, series: ResumableRun | None, json_sink: Sink, as_json: bool) -> None:
     from beamline.scan.preflight import dry_run, refuse_violations
 
     worked = dry_run(config, output) if series is None else dry_run(config, series.run, series.remaining)
-    if not json_sinks:
+    if not as_json:
         click.echo("\n".join(worked.lines()))
     refuse_violations(worked.timeline)
-    for sink in json_sinks:
-        sink(Done(worked.data(), time=SystemClock().now()))
+    json_sink(Done(worked.data(), time=SystemClock().now()))
 
 
 def _results(result: RunResult) -> str:

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
+
+from beamline.cli.options import parsed, together
 
 _PATH = click.Path(path_type=Path)
 
 
-def underscored(ctx: click.Context, param: click.Parameter, value: str | None) -> str | None:
-    """`line-integrals` on the command line becomes `line_integrals`."""
-    return None if value is None else value.replace("-", "_")
+underscored = parsed(lambda value: value.replace("-", "_"))
+"""`line-integrals` on the command line becomes `line_integrals`."""
 
-
-def scan_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds --quantity, --angles, --angle-rows, --darks, --flats, --data-path ...: the fields of SourceOptions."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
-
-
-_OPTIONS = (
+scan_options = together(
     click.option(
         "--quantity",
         type=click.Choice(["counts", "line-integrals"]),
@@ -50,3 +41,4 @@ _OPTIONS = (
         "--angles-unit", type=click.Choice(["deg", "rad"]), help="Of --angles-path, instead of what the file states."
     ),
 )
+"""The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""

@@ -98,11 +98,10 @@ def segment(
         command=repeating(click.get_current_context(), volume, output),
         **values,
     )
-    with terminated_like_interrupted(), json_events(as_json) as sinks:
+    with terminated_like_interrupted(), json_events(as_json) as sink:
         found = segment_volume(options)
         files = {"output": output, "table": options.table, "picture": options.picture}
-        for sink in sinks:
-            sink(Done({**files, **settings_of(found, options)}, time=SystemClock().now()))
+        sink(Done({**files, **settings_of(found, options)}, time=SystemClock().now()))
     if not as_json:
         click.echo(summary(found, options))
     if view:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from beamline.cli.option_groups import CORRECTIONS, DATA, heading
-from beamline.cli.options import POSITIVE
+from beamline.cli.options import POSITIVE, parsed, together
 from beamline.cli.scan_options import scan_options
 from beamline.projections.steps.registry import key_of, registered, steps_of
 from beamline.projections.steps.step import Option, PrepStep, options_of
@@ -23,18 +22,16 @@ if TYPE_CHECKING:
     from beamline.storage.readers.open import SourceOptions
 
 
-def span(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[int, int] | None:
-    """`first:end`, whole numbers."""
-    if value is None:
-        return None
+def span(value: str) -> tuple[int, int]:
+    """`first:end`, whole numbers. ValueError for anything else."""
     match = re.fullmatch(r"(\d+):(\d+)", value)
     if match is None or int(match[1]) >= int(match[2]):
-        raise click.BadParameter(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
+        raise ValueError(f"{value!r} is not FIRST:END with 0 <= FIRST < END, e.g. 100:200")
     return int(match[1]), int(match[2])
 
 
-def column(ctx: click.Context, param: click.Parameter, value: str) -> float | AxisRange | None:
-    """A column of the detector, or several to try; None for "auto"."""
+def column(value: str) -> float | AxisRange | None:
+    """A column of the detector, or several to try; None for "auto". ValueError for anything else."""
     if value == "auto":
         return None
     if value.startswith("try:"):
@@ -44,40 +41,32 @@ def column(ctx: click.Context, param: click.Parameter, value: str) -> float | Ax
             first, last, step = (float(part) for part in value.split(":")[1:])
             return AxisRange(first, last, step)
         except ValueError as error:
-            raise click.BadParameter(f"{value!r} is not try:FIRST:LAST:STEP, e.g. try:80:90:0.5 ({error})") from error
+            raise ValueError(f"{value!r} is not try:FIRST:LAST:STEP, e.g. try:80:90:0.5 ({error})") from error
     try:
         number = float(value)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise click.BadParameter(
+        raise ValueError(
             f"{value!r} is neither a column (0 is the centre of the first one), nor auto, nor try:FIRST:LAST:STEP"
         )
     return number
 
 
-def distances(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, float] | None:
-    """`sod:sdd` in mm."""
-    if value is None:
-        return None
+def distances(value: str) -> tuple[float, float]:
+    """`sod:sdd` in mm. ValueError for anything else."""
     try:
         sod, sdd = (float(part) for part in value.split(":"))
     except ValueError:
         sod = sdd = math.nan
     if not 0 < sod <= sdd < math.inf:
-        raise click.BadParameter(f"{value!r} is not SOD:SDD with 0 < SOD <= SDD in mm, e.g. 100:140")
+        raise ValueError(f"{value!r} is not SOD:SDD with 0 < SOD <= SDD in mm, e.g. 100:140")
     return sod, sdd
 
 
 def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Adds the options of `Selection`, from --views on, with those of every step, and what `scan_options` adds."""
-    after: list[Callable[..., Any]] = [*_AFTER, *map(_of_step, _step_options())]
-    for option in reversed(after):
-        command = option(command)
-    command = scan_options(command)
-    for option in reversed(_BEFORE):
-        command = option(command)
-    return command
+    return together(*_BEFORE, scan_options, *_AFTER, *map(_of_step, _step_options()))(command)
 
 
 def chosen(file: Path, seed: int, said: Mapping[str, Any]) -> tuple[SourceOptions, Selection]:
@@ -121,19 +110,12 @@ def _of_step(option: Option) -> Callable[..., Any]:
     return click.option(
         option.name,
         type=click.Choice(option.choices) if option.choices else click.Path(path_type=Path) if option.path else str,
-        callback=partial(_parsed, option),
+        callback=parsed(lambda value: option.parse(str(value))),
         default=option.default,
         show_default=option.default is not None,
         metavar=option.metavar,
         help=option.help,
     )
-
-
-def _parsed(option: Option, ctx: click.Context, param: click.Parameter, value: str | Path | None) -> Any:
-    try:
-        return None if value is None else option.parse(str(value))
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from error
 
 
 _BEFORE = (
@@ -147,7 +129,7 @@ _BEFORE = (
     ),
     click.option(
         "--rows",
-        callback=span,
+        callback=parsed(span),
         metavar="FIRST:END",
         help="Detector rows to use; the volume has one slice per row. Default: all.",
     ),
@@ -161,7 +143,7 @@ _BEFORE = (
     ),
     click.option(
         "--axis",
-        callback=column,
+        callback=parsed(column),
         metavar="PX|auto|try:A:B:STEP",
         default="auto",
         show_default=True,
@@ -178,7 +160,7 @@ _AFTER = (
     ),
     click.option(
         "--cone",
-        callback=distances,
+        callback=parsed(distances),
         metavar="SOD:SDD",
         help="Cone beam: mm from the source to the rotation axis and to the detector. Default: as in the file.",
     ),

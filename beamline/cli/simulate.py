@@ -81,7 +81,7 @@ def simulate(
     from beamline.simulate.write import check_output
 
     clock = SystemClock()
-    with terminated_like_interrupted(), json_events(as_json) as sinks, exposure_errors(scene):
+    with terminated_like_interrupted(), json_events(as_json) as sink, exposure_errors(scene):
         if not (explains or out or truth or picture):
             raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
         if truth_bin and not truth:
@@ -92,13 +92,13 @@ def simulate(
         scan = scan_of(opened, seed, views, clock.now())
         if out:
             check_output(scan, out)
-        output = _Output(fan_out(*sinks), clock, plain=not as_json)
+        output = _Output(sink, clock, plain=not as_json)
         if explains:
             _explain(scan, output)
         outputs: dict[str, object] = {}
         if truth:
             outputs |= _truth(scan, truth, truth_bin, output)
-        written = _scan(opened, scan, out, output, fan_out(*sinks)) if out else None
+        written = _scan(opened, scan, out, output, sink) if out else None
         if written:
             outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
         if picture and not (written and written.stopped):

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any, get_args
 
 import click
 
-from beamline.cli.json_output import json_events
 from beamline.cli.method_options import row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import SEED, json_option
 from beamline.cli.recipe import repeating
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
-from beamline.core.signals import terminated_like_interrupted
-from beamline.core.sinks import fan_out
 from beamline.study.studies import STUDIES
 from drivers.base.clock import SystemClock
 from recon.base.choices import Filter
@@ -113,8 +109,8 @@ def study(
         seed=seed,
         command=repeating(click.get_current_context(), file, output or Path(f"{file.stem}_{which}")),
     )
-    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
-        table = run_study(options, fan_out(*(json_sinks or [terminal])), SystemClock())
+    with events_shown(as_json) as sink:
+        table = run_study(options, sink, SystemClock())
     if not as_json:
         click.echo(text(table))
         click.echo(f"\n{'report':<10}{options.folder / 'report.html'}")

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import errno
 import math
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
-from datetime import UTC, datetime
-from types import TracebackType
+from contextlib import contextmanager
 from typing import Self, TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from beamline.cli.json_output import json_events
 from beamline.core.events import (
     Counted,
     Done,
@@ -24,13 +24,13 @@ from beamline.core.events import (
     FrameStored,
     KernelsCompiled,
     PhaseReached,
-    ReconStarted,
     RunDone,
     Sink,
     TrialReached,
     VolumeDone,
 )
 from beamline.core.narration import sentence
+from beamline.core.signals import terminated_like_interrupted
 from beamline.core.text import printable
 from beamline.report.metrics import METRICS, formatted
 from drivers.base.clock import Clock
@@ -83,11 +83,9 @@ class Terminal:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end_of_phase()
-        with _closed_terminal_ignored():
+        with closed_terminal_ignored():
             self._bar.stop()
 
     def ask(self, request: str, put: Ask) -> None:
@@ -101,12 +99,12 @@ class Terminal:
             self._asking = False
 
     def __call__(self, event: Event) -> None:
-        with self._lock, _closed_terminal_ignored():
+        with self._lock, closed_terminal_ignored():
             self._take(event)
 
     def say(self, text: str) -> None:
         """Print a line that is not an event."""
-        with self._lock, _closed_terminal_ignored():
+        with self._lock, closed_terminal_ignored():
             self._console.print(printable(text))
 
     def _take(self, event: Event) -> None:
@@ -165,33 +163,20 @@ class Terminal:
 
 
 @contextmanager
-def _closed_terminal_ignored() -> Iterator[None]:
+def events_shown(as_json: bool) -> Iterator[Sink]:
+    """The sink of a command's events: JSON on stdout, or else the terminal. SIGTERM and SIGHUP interrupt the block."""
+    with terminated_like_interrupted(), json_events(as_json) as json_sink, Terminal(sys.stderr) as terminal:
+        yield json_sink if as_json else terminal
+
+
+@contextmanager
+def closed_terminal_ignored() -> Iterator[None]:
     """Ignores errors from a closed terminal, so that the work goes on."""
     try:
         yield
     except OSError as error:
         if error.errno != errno.EIO:
             raise
-
-
-class LogLines:
-    """A sink that writes every event as a line: time, kind, and its sentence, or its values if it has no sentence.
-
-    Where `terminal`, errors of one that was closed are ignored; from a file the same error is one of its disk.
-    """
-
-    def __init__(self, stream: TextIO, *, terminal: bool = False) -> None:
-        self._stream, self._lock = stream, threading.Lock()
-        self._ignored = _closed_terminal_ignored if terminal else nullcontext
-
-    def __call__(self, event: Event) -> None:
-        said = None if isinstance(event, ReconStarted) else sentence(event)
-        if said is None:
-            said = ", ".join(f"{name} {value}" for name, value in event.data.items())
-        at = datetime.fromtimestamp(event.time, UTC).isoformat(timespec="milliseconds")
-        with self._lock, self._ignored():
-            self._stream.write(f"{at}  {event.event}: {printable(' '.join(said.split()))}\n")
-            self._stream.flush()
 
 
 def rates(frame: FrameStored) -> str:

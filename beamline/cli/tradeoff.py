@@ -2,33 +2,27 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
-from beamline.cli.json_output import json_events
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
-from beamline.cli.options import POSITIVE, SEED, json_option
+from beamline.cli.options import POSITIVE, SEED, json_option, parsed
 from beamline.cli.recipe import repeating
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
-from beamline.core.signals import terminated_like_interrupted
-from beamline.core.sinks import fan_out
 from drivers.base.clock import SystemClock
 from recon.methods import names, names_compared
 
 
-def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[str, ...]:
-    """Names of methods, separated by commas; by default those that are compared unasked."""
-    if value is None:
-        return names_compared()
+def listed(value: str) -> tuple[str, ...]:
+    """Names of methods, separated by commas. ValueError for another name."""
     wanted = tuple(dict.fromkeys(name.strip() for name in value.split(",")))
     unknown = [name for name in wanted if name not in names()]
     if unknown:
-        raise click.BadParameter(f"{unknown[0]!r} is not a method; expected {', '.join(names())}")
+        raise ValueError(f"{unknown[0]!r} is not a method; expected {', '.join(names())}")
     return wanted
 
 
@@ -47,7 +41,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 @heading(METHOD)
 @click.option(
     "--methods",
-    callback=listed,
+    callback=parsed(listed),
     metavar="A,B,...",
     help=f"Methods to compare, of {', '.join(names())}. "
     f"Default: all but {', '.join(name for name in names() if name not in names_compared())}.",
@@ -72,7 +66,7 @@ def listed(ctx: click.Context, param: click.Parameter, value: str | None) -> tup
 def tradeoff(
     file: Path,
     truth: str | None,
-    methods: tuple[str, ...],
+    methods: tuple[str, ...] | None,
     quick: bool,
     max_seconds: float | None,
     seed: int,
@@ -94,15 +88,15 @@ def tradeoff(
         source=source,
         selection=selection,
         folder=output or Path(f"{file.stem}_tradeoff"),
-        methods=methods,
+        methods=methods or names_compared(),
         depth="quick" if quick else "full",
         max_seconds=max_seconds,
         truth=truth,
         seed=seed,
         command=repeating(click.get_current_context(), file, output or Path(f"{file.stem}_tradeoff")),
     )
-    with terminated_like_interrupted(), json_events(as_json) as json_sinks, Terminal(sys.stderr) as terminal:
-        table = run_tradeoff(options, fan_out(*(json_sinks or [terminal])), SystemClock())
+    with events_shown(as_json) as sink:
+        table = run_tradeoff(options, sink, SystemClock())
     if not as_json:
         click.echo(text(table))
         click.echo(f"\n{'report':<10}{options.folder / 'tradeoff.html'}")

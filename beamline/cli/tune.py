@@ -12,7 +12,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import config_argument, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
-from beamline.core.events import Done, Sink
+from beamline.core.events import Done
 from beamline.core.signals import stop_signals
 from beamline.core.sinks import Announcer
 from beamline.core.stop import StopRequest
@@ -37,19 +37,18 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
     from beamline.instrument.operator import ask_operator
     from beamline.scan.tune import tune as tune_exposure
 
-    with json_events(as_json) as json_sinks:
+    with json_events(as_json) as json_sink:
         config = load(file, overrides)
         stop = StopRequest()
-        with stop_signals(stop), Terminal(sys.stderr) as terminal:
-            sinks: list[Sink] = [terminal, *json_sinks]
-            with (
-                connect(config, ask=lambda request: terminal.ask(request, ask_operator)) as instrument,
-                Announcer(sinks, instrument.clock) as emit,
-            ):
-                found = tune_exposure(config, instrument, stop, emit, None if angle is None else math.radians(angle))
-                now = instrument.clock.now()
-        for sink in json_sinks:
-            sink(Done(found, time=now))
+        with (
+            stop_signals(stop),
+            Terminal(sys.stderr) as terminal,
+            connect(config, ask=lambda request: terminal.ask(request, ask_operator)) as instrument,
+            Announcer([terminal, json_sink], instrument.clock) as emit,
+        ):
+            found = tune_exposure(config, instrument, stop, emit, None if angle is None else math.radians(angle))
+            now = instrument.clock.now()
+        json_sink(Done(found, time=now))
     if not as_json:
         click.echo("\n".join(found.lines()))
     if found.faults:

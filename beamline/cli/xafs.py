@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, SEED, FiniteRange
+from beamline.cli.options import POSITIVE, SEED, FiniteRange, parsed
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done
 from beamline.core.signals import stop_signals
-from beamline.core.sinks import fan_out
 from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
 
@@ -39,13 +38,11 @@ _OF_FILES = ("region", "around", "unit", "quantity")
 _BOX = "ROW:END,COL:END"
 
 
-def box(ctx: click.Context, param: click.Parameter, value: str | None) -> PixelBox | None:
-    """`first:end,first:end` of rows and columns."""
-    if value is None:
-        return None
+def box(value: str) -> PixelBox:
+    """`first:end,first:end` of rows and columns. ValueError for anything else."""
     match = re.fullmatch(r"(\d+):(\d+),(\d+):(\d+)", value)
     if match is None or int(match[1]) >= int(match[2]) or int(match[3]) >= int(match[4]):
-        raise click.BadParameter(f"{value!r} is not {_BOX}, e.g. 100:200,50:120")
+        raise ValueError(f"{value!r} is not {_BOX}, e.g. 100:200,50:120")
     return int(match[1]), int(match[2]), int(match[3]), int(match[4])
 
 
@@ -62,8 +59,12 @@ def box(ctx: click.Context, param: click.Parameter, value: str | None) -> PixelB
     help="At which the scene's stage stands; 0 unless given.",
 )
 @click.option("--seed", type=SEED, help="Seed of all random numbers of a scene. Default: 0.")
-@click.option("--region", callback=box, metavar=_BOX, help="The material in a file's frames; all of them unless given.")
-@click.option("--around", callback=box, metavar=_BOX, help="Its surroundings, for the contrast; none unless given.")
+@click.option(
+    "--region", callback=parsed(box), metavar=_BOX, help="The material in a file's frames; all of them unless given."
+)
+@click.option(
+    "--around", callback=parsed(box), metavar=_BOX, help="Its surroundings, for the contrast; none unless given."
+)
 @click.option(
     "--unit", type=click.Choice(["keV", "eV"]), help="Unit of a file's energies. Default: as in the file, else keV."
 )
@@ -117,7 +118,7 @@ def xafs(
     is_scene = Path(source).suffix.lower() in _SCENES
     _refuse_foreign(click.get_current_context(), _OF_FILES if is_scene else _OF_SCENES)
     clock, stop = SystemClock(), StopRequest()
-    with json_events(as_json) as sinks, ExitStack() as opened:
+    with json_events(as_json) as json_sink, ExitStack() as opened:
         refuse_existing_results(target)
         opened.enter_context(stop_signals(stop))
         series: Series | XafsCurve
@@ -137,16 +138,15 @@ def xafs(
                 within = " between --from and --to" if low or high else ""
                 raise DataError(f"{source}: {n} energies{within} are too few for an edge, which takes {LEAST}.")
         with Terminal(sys.stderr) as terminal:
-            sink = fan_out(*(sinks or [terminal]))
+            sink = json_sink if as_json else terminal
             if isinstance(series, XafsCurve):
                 run, title = SeriesResult(series), Path(source).name
             else:
                 run, title = run_series(series, sink, clock, lambda: stop.stopping), series.title
         result = _result(title, run)
         write(result, target)
-        for done in sinks:
-            data = result.data() | {"picture": target, "table": table_beside(target), "stopped": run.stopped}
-            done(Done(data, time=clock.now()))
+        data = result.data() | {"picture": target, "table": table_beside(target), "stopped": run.stopped}
+        json_sink(Done(data, time=clock.now()))
     if not as_json:
         click.echo("\n".join([*lines(result), f"written     {target}, {table_beside(target)}"]))
     if run.stopped:

@@ -51,9 +51,6 @@ def try_axes(
     The score is the share of a slice below 0 within the circle that all views see. A wrong axis takes away beside edges
     what it adds elsewhere (Donath et al. 2006, J. Opt. Soc. Am. A 23, 1048, integral of negativity).
 
-    Args:
-        progress: is told the number of axes done, and of all.
-
     Raises:
         ConfigError, DataError: with nothing written.
     """

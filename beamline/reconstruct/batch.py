@@ -38,11 +38,8 @@ class BatchRow:
 
     Attributes:
         name: of its folder of results, inside the batch's.
-        scan: its file, absolute.
         state: "done"; "poor": with a volume whose residual is beyond the recipe's --max-residual; "failed": without
             one; "waiting": not tried yet.
-        seconds: that it took.
-        method: that made the volume.
         residual: of the volume, of views held out where there were any.
         message: why it failed, or is poor.
     """
@@ -65,7 +62,6 @@ class BatchOptions:
     """What to reconstruct, how and where.
 
     Attributes:
-        scans: files or folders, each once.
         recipe: file with the options of `beamline recon`; None: its defaults.
         folder: of the results, new or of an earlier call with the same recipe.
     """
@@ -108,7 +104,6 @@ class Worker:
 
     Args:
         log: file for its stderr while it works on a scan.
-        command: of the process.
         silence: real s without a line, after which a scan is taken to hang.
     """
 
@@ -212,8 +207,6 @@ def _begin(folder: Path, recipe: bytes) -> None:
     if folder.exists() and not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
     if not folder.exists():
-        if not folder.parent.is_dir():
-            raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
         with whole_file(folder) as partial:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)

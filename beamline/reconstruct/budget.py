@@ -41,7 +41,6 @@ class Budgeted:
     """A reconstruction within a time limit.
 
     Attributes:
-        result: of the reconstruction.
         prepared: the reconstructed views, with binned pixels if the choice bins them.
         choice, speeds: what was chosen, and the measurements behind it.
         because: why this method, in words; empty if there was no other.

@@ -72,8 +72,8 @@ class CheckpointOptions:
     """Files of a fit's state.
 
     Attributes:
-        path: file to write; None: no checkpoint.
-        resume: file to resume from; None: begin anew.
+        path: to write; None: no checkpoint.
+        resume: to resume from; None: begin anew.
     """
 
     path: Path | None = None

@@ -22,8 +22,7 @@ from beamline.core.process import SAFE_PATH
 from beamline.reconstruct.slurm import is_slurm, require_accepted, slurm_jobs, submitted
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method, RunControl
-from recon.base.volume import Grid
+from recon.base.method import Method, RunControl
 from recon.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
@@ -46,7 +45,6 @@ class Cluster:
     """Workers that reconstruct; another worker repeats the work of a lost one.
 
     Attributes:
-        workers: how many.
         patience: s after which work without any worker is given up.
     """
 
@@ -60,11 +58,8 @@ class Cluster:
         geometry: Geometry,
         method: Method,
         *,
-        grid: Grid,
-        seed: int,
-        device: str,
-        use: DataUse,
         control: RunControl,
+        **settings: Any,
     ) -> Reconstruction:
         """As `recon.reconstruct`, by a worker with as many threads as there are here; without progress and stop.
 
@@ -74,7 +69,7 @@ class Cluster:
         import numba
         from distributed import KilledWorker
 
-        work = (np.array(projections), geometry, method, grid, seed, device, use, control.decide)
+        work = (np.array(projections), geometry, method, settings, control.decide)
         future = self._client.submit(_reconstruct, work, numba.get_num_threads(), pure=False)
         try:
             self._wait_for(future)
@@ -111,12 +106,10 @@ def _reconstruct(work: tuple[Any, ...], threads: int) -> Reconstruction:
     """On a worker. The same number of threads gives the same bits."""
     import numba
 
-    data, geometry, method, grid, seed, device, use, decide = work
+    data, geometry, method, settings, decide = work
     assert decide is None or isinstance(decide, Decisions)
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-    found = recon.reconstruct(
-        data, geometry, method, grid=grid, seed=seed, device=device, use=use, control=RunControl(decide=decide)
-    )
+    found = recon.reconstruct(data, geometry, method, control=RunControl(decide=decide), **settings)
     return replace(found, gaussians=None, checkpoint=None, settings=dict(found.settings))
 
 

@@ -54,10 +54,6 @@ class EnoughViews:
 
     A prediction scatters by about half a decibel, so each one uses the samples of two. The earlier samples are larger,
     which errs on the side of more views.
-
-    Args:
-        goal: when they are enough.
-        seed: of the predictions.
     """
 
     def __init__(self, goal: Goal, seed: int) -> None:

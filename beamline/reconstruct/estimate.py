@@ -23,17 +23,14 @@ class Estimate:
     """The resources of a reconstruction.
 
     Attributes:
-        method: its name.
-        views: that are used.
         shape: of the volume [z, y, x].
         at_once: bytes of memory with everything in it.
         allowed: bytes of memory that may be used.
         memory: bytes that will be used.
-        slabs: how many are still to be made.
+        slabs: that are still to be made.
         done: slices that a partial volume has.
         scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
-        output: bytes of the result.
-        free: bytes on that disk.
+        output, free: bytes of the result, and bytes on its disk.
         seconds: without reading and correction.
     """
 

@@ -27,24 +27,17 @@ from recon.voxels.fbp import Filter
 
 @dataclass(frozen=True)
 class ReconOptions:
-    """The options of a reconstruction.
+    """The options of a reconstruction; those of `beamline recon` say more in its help.
 
     Attributes:
-        source: the scan.
-        target: where results go.
-        selection: which part of the scan, and its correction.
         method: with its settings; `R2.seconds` are those of the whole call, of a followed scan from its end.
         budget: s for everything from line integrals to volume; chooses the method and all settings.
         quality: a preset instead of the fit's steps, Gaussians.
-        device: to compute on.
-        checkpoints: of the fit's state.
         filter: of the FBP that the volume is compared with.
-        seed: of all random numbers.
         truth: FILE or FILE:first:end to compare with.
         unfinished: take the present frames of a scan that still runs or died.
         enough: for a followed scan: when its views are enough; None: no such goal.
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
-        region: requested part of the volume; None: all of it.
         cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
         partial: volume whose missing slabs are reconstructed; None begins anew.
         command: that repeats this, for the record.

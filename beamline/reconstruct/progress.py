@@ -11,11 +11,7 @@ from recon.base.method import Progress
 
 def progress_events(sink: Sink, clock: Clock, seconds: float | None = None) -> Callable[[Progress], None]:
     """A listener that passes progress on as events, with `per_s` (steps) and `eta_s`; None where they are not known.
-
-    Args:
-        sink: is told.
-        clock: that events are stamped by.
-        seconds: time of the fit, if no number of steps is planned.
+    `seconds`: time of the fit, if no number of steps is planned.
     """
     first: Progress | None = None
     step = 0

@@ -42,14 +42,11 @@ class ScanFacts:
     """The facts of a scan for a report.
 
     Attributes:
-        path, name: of the file.
-        sample: its name, if known.
         table: facts for people, by name.
         frames: frames in the file of those triggered, e.g. "110/110".
         remarks: faults during the scan, by the file.
         flagged: the worst of the flagged frames.
         references: mean darks and flats [row, col], binned, by title.
-        shape: (rows, cols) of the detector.
     """
 
     path: Path
@@ -68,10 +65,8 @@ class ReconOutcome:
     """A reconstruction and how it was made.
 
     Attributes:
-        volume, method: of recon.reconstruct.
         seconds: of reconstruction alone.
         history: of the fit or the iterations; empty for FBP.
-        settings: every setting of the reconstructor, by name.
         filter: of the FBP (also of the one it is compared with).
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
         chosen: what a budget or a preset chose, in a line; empty where the settings were given.

@@ -138,18 +138,20 @@ def write_result(
     all_rays = (clock.now() - before) / residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
     waited_for, direct_method = "ended_early" in made.settings, by_name(made.method).traits.direct
     left_out = []
-    hiding = ""
+    remarks, hiding = list(context.warnings), ""
+
+    def warn(said: str) -> None:
+        if said:
+            sink(Warned(said, time=clock.now()))
+            remarks.append(said)
+
     if left is not None:
         metrics[made.method]["unexplained"] = left.share
-        hiding = hiding_warning(made, left)
-        if hiding:
-            sink(Warned(hiding, time=clock.now()))
-            context = replace(context, warnings=[*context.warnings, hiding])
+        warn(hiding := hiding_warning(made, left))
     if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
         left_out.append("the look for views that do not fit the volume")
-    elif odd := odd_views_warning(made, prepared, context.selection, phases.progress):
-        sink(Warned(odd, time=clock.now()))
-        context = replace(context, warnings=[*context.warnings, odd])
+    else:
+        warn(odd_views_warning(made, prepared, context.selection, phases.progress))
     volumes = {made.method: made.volume}
     compared = not direct_method and target.report is not None and has_direct_method(prepared.geometry)
     if compared and (waited_for or not context.leaves(_DIRECT * all_rays)):
@@ -169,14 +171,13 @@ def write_result(
             if beside_fbp is None:
                 break  # it shows no air
             metrics[name]["air"] = beside_fbp.air
-            if lost := lost_mass_warning(made, beside_fbp):
-                sink(Warned(lost, time=clock.now()))
-                context = replace(context, warnings=[*context.warnings, lost])
+            warn(lost_mass_warning(made, beside_fbp))
     if left_out:
         why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
         remark = f"Left out, as {why}: {', '.join(left_out)}."
         sink(StateEntered("left_out", remark, time=clock.now()))
-        context = replace(context, warnings=[*context.warnings, remark])
+        remarks.append(remark)
+    context = replace(context, warnings=remarks)
     own = metrics[made.method]
     phases.enter("report")
     parameters = parameters_of(made, prepared, context)

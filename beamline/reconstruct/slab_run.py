@@ -65,9 +65,7 @@ def in_slabs(
     stopped and resumed is equal to the bit.
 
     Args:
-        run: reconstructs a slab.
         control: of all slabs together.
-        say: is told of each slab.
         warn: is told of slices that are not by the method.
         workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
 

@@ -52,10 +52,8 @@ class Needs:
     """Bytes that a reconstruction needs.
 
     Attributes:
-        method: with its settings.
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
-        weighted: rays have weights.
         copies: float32 views that a step of the correction takes, see `ViewFilter`.
     """
 

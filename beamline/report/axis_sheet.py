@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from beamline.report.figures import grey_window, png
+from beamline.report.figures import grey_window, png, show_grey
 
 _WIDTH, _DPI, _COLUMNS = 8.6, 110, 4
 _CROP = 200  # voxels: where slices are larger, the part that changes most
@@ -36,7 +35,7 @@ def axis_sheet(trials: list[AxisTrial], title: str) -> bytes:
     best = min(trials, key=lambda trial: trial.score)
     part = _changes_most([image for _, image in shown])
     images = [image[part] for _, image in shown]
-    window, down = Normalize(*grey_window(images, 0.5, 99.5)), -(-len(images) // _COLUMNS)
+    window, down = grey_window(images, 0.5, 99.5), -(-len(images) // _COLUMNS)
     tall, wide = images[0].shape
     height = _WIDTH / _COLUMNS * tall / wide + 0.22
     figure = Figure(figsize=(_WIDTH, 2.4 + height * down), dpi=_DPI, layout="constrained")
@@ -48,7 +47,7 @@ def axis_sheet(trials: list[AxisTrial], title: str) -> bytes:
     curve.legend(fontsize=8)
     for n, ((trial, _), image) in enumerate(zip(shown, images, strict=True)):
         axes = figure.add_subplot(panels[1 + n // _COLUMNS, n % _COLUMNS])
-        axes.imshow(image, cmap="gray", norm=window, interpolation="nearest")
+        show_grey(axes, image, window)
         axes.set(xticks=[], yticks=[])
         if n == 0:
             axes.set(xlabel="x →", ylabel="← y")

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.colors import Normalize
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from beamline.report.figures import DPI, WIDTH, grey_window, png
+from beamline.report.figures import DPI, WIDTH, GreyWindow, grey_window, png, show_grey
 
 COLUMNS = 4
 _COLOURS = {True: "tab:red", False: "tab:orange"}  # of alarms and of warnings
@@ -24,11 +25,9 @@ class FlaggedFrame:
     Attributes:
         image: [row, col] counts, binned where there are many.
         extent: (rows, cols) of the whole frame, in pixels of the detector.
-        title: which frame it is.
         reasons: a line for each flag.
         regions: of the flags, in pixels of the detector: first row, row after the last, first column, column after
             the last.
-        alarm: a flag is an alarm.
     """
 
     image: NDArray[np.float32]
@@ -47,21 +46,12 @@ def contact_sheet(frames: Sequence[FlaggedFrame]) -> bytes:
     width = WIDTH / COLUMNS
     height = np.clip(width * rows / cols, 0.5, 3.0) + 0.25 + 0.13 * lines
     figure = Figure(figsize=(WIDTH, float(height) * down), dpi=DPI, layout="constrained")
-    window = Normalize(*grey_window([frame.image for frame in frames], 0.5, 99.5))
+    window = grey_window([frame.image for frame in frames], 0.5, 99.5)
     panels = np.ravel(figure.subplots(down, COLUMNS, squeeze=False))
     for axes in panels[len(frames) :]:
         axes.set_axis_off()
     for axes, frame in zip(panels, frames, strict=False):
-        rows, cols = frame.extent
-        thin = rows < 0.15 * cols
-        axes.imshow(
-            frame.image,
-            cmap="gray",
-            norm=window,
-            extent=(-0.5, cols - 0.5, rows - 0.5, -0.5),
-            aspect="auto" if thin else "equal",
-            interpolation="nearest",
-        )
+        _show(axes, frame.image, window, frame.extent)
         colour = _COLOURS[frame.alarm]
         for top, bottom, left, right in frame.regions:
             box = Rectangle((left - 0.5, top - 0.5), right - left, bottom - top, fill=False, ec=colour, lw=1.2)
@@ -81,22 +71,21 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
         shape: (rows, cols) of the detector.
     """
     rows, cols = shape
-    thin = rows < 0.15 * cols
     width = WIDTH / max(len(images), 2)
     size = (width * len(images), float(np.clip(0.8 * width * rows / cols, 0.6, 4.0)) + 0.6)
     figure = Figure(figsize=size, dpi=DPI, layout="constrained")
     for axes, (title, image) in zip(figure.subplots(1, len(images), squeeze=False)[0], images.items(), strict=True):
-        shown = axes.imshow(
-            image,
-            cmap="gray",
-            norm=Normalize(*grey_window([image], 0.5, 99.5)),
-            extent=(-0.5, cols - 0.5, rows - 0.5, -0.5),
-            aspect="auto" if thin else "equal",
-            interpolation="nearest",
-        )
+        shown = _show(axes, image, grey_window([image], 0.5, 99.5), shape)
         axes.tick_params(labelsize=6)
         axes.set_title(title, fontsize=8)
         axes.set_xlabel("column", fontsize=7)
         axes.set_ylabel("← row", fontsize=7)
         figure.colorbar(shown, ax=axes, shrink=0.8, pad=0.02).ax.tick_params(labelsize=6)
     return png(figure)
+
+
+def _show(axes: Axes, image: NDArray[np.float32], window: GreyWindow, shape: tuple[int, int]) -> AxesImage:
+    """Draw an image of the whole detector of so many rows and columns, in its pixels."""
+    rows, cols = shape
+    edges = -0.5, cols - 0.5, rows - 0.5, -0.5
+    return show_grey(axes, image, window, edges, stretched=rows < 0.15 * cols)

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -36,22 +37,33 @@ def grey_window(arrays: Sequence[NDArray[np.floating]], low: float = 1.0, high: 
     return (bottom, top) if top > bottom else (bottom, bottom + 1.0)
 
 
+def show_grey(
+    axes: Axes,
+    image: NDArray[np.floating],
+    window: GreyWindow,
+    extent: tuple[float, float, float, float] | None = None,
+    stretched: bool = False,
+) -> AxesImage:
+    """Draw an image, row 0 at the top, in a grey window, a pixel as a square unless `stretched`.
+
+    Args:
+        extent: edges left, right, bottom, top; None: pixels.
+    """
+    return axes.imshow(
+        image, cmap="gray", norm=Normalize(*window), extent=extent, aspect="auto" if stretched else "equal",
+        interpolation="nearest",
+    )  # fmt: skip
+
+
 def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: str) -> bytes:
     """One corrected view [row, col] with the rotation axis, as the camera sees it: row 0 at the top, z downwards."""
     rows, cols = geometry.detector_shape
     pitch = geometry.sample_pitch
     left, right = -0.5 - geometry.axis_col, cols - 0.5 - geometry.axis_col
     height = np.clip(0.82 * WIDTH * rows / cols, 1.6, 6.0)
-    thin = rows < _THIN * cols
     figure, axes = _figure((WIDTH, height + 0.8))
-    image = axes.imshow(
-        data[view],
-        cmap="gray",
-        extent=(left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch),
-        aspect="auto" if thin else "equal",
-        interpolation="nearest",
-        norm=Normalize(*grey_window([data[view]])),
-    )
+    edges = left * pitch, right * pitch, rows / 2 * pitch, -rows / 2 * pitch
+    image = show_grey(axes, data[view], grey_window([data[view]]), edges, stretched=rows < _THIN * cols)
     axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     axes.set(
@@ -69,9 +81,7 @@ def sinogram(data: NDArray[np.float32], geometry: Geometry, row: int) -> bytes:
     angles = np.degrees(geometry.angles[order])
     image_rows = data[order, row]
     figure, axes = _figure((WIDTH, 4.2))
-    image = axes.imshow(
-        image_rows, cmap="gray", aspect="auto", interpolation="nearest", norm=Normalize(*grey_window([image_rows]))
-    )
+    image = show_grey(axes, image_rows, grey_window([image_rows]), stretched=True)
     axes.axvline(geometry.axis_col, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     ticks = MaxNLocator(7, steps=[1, 1.5, 2, 3, 4.5, 6, 9, 10]).tick_values(angles[0], angles[-1])
@@ -117,14 +127,7 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Gre
         for i, (image, (across, down, h_edges, v_edges)) in enumerate(zip(images, planes(first), strict=True)):
             axes = panels[i][j]
             thin = image.shape[0] < _THIN * image.shape[1]
-            shown = axes.imshow(
-                image,
-                cmap="gray",
-                extent=(*h_edges, *v_edges),
-                aspect="auto" if thin else "equal",
-                interpolation="nearest",
-                norm=Normalize(*window),
-            )
+            shown = show_grey(axes, image, window, (*h_edges, *v_edges), stretched=thin)
             axes.tick_params(labelsize=7)
             axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))  # the next panel's ticks begin at its edge
             axes.set_xlabel(f"{across} ({unit})", fontsize=8)

@@ -32,15 +32,10 @@ class Report:
     """The content of the page on a reconstruction.
 
     Attributes:
-        title: of the page.
         summary: one or two sentences, the result first.
-        scan: facts of the scan.
-        settings: of the reconstruction.
         metrics: by method, then by name of the metric (see METRICS); a method may lack some.
         frames: frames in the file of those triggered, e.g. "90/90".
         flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
-        pictures: in order.
-        command: that repeats the reconstruction.
         recipe: its options that hold for other scans; empty: none are shown.
         footnotes: definitions that the metrics need.
         live_picture: name of the picture of the growing volume, in the folder of the page; empty: no picture.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from beamline.report.figures import downwards, grey_window, png
+from beamline.report.figures import downwards, grey_window, png, show_grey
 from recon.base.volume import Volume
 from recon.post.particles import Particles
 
@@ -26,24 +26,18 @@ def picture_of(volume: Volume, unit: str, labels: NDArray[np.int32], particles: 
     ratios = (2 * column * y.size / x.size + 0.8, 2.4)
     upper, lower = np.ravel(figure.subfigures(2, 1, squeeze=False, height_ratios=ratios))
     panels = upper.subplots(2, _SLICES, sharex=True, sharey=True)
-    window = Normalize(*grey_window([volume.data[at]]))
+    window = grey_window([volume.data[at]])
     # Neighbours in the order of labels get different colours; the same colour comes again after twelve.
     colours = ListedColormap([(0, 0, 0, 0), *figure_colours()])
     for column_of, k in zip(panels.T, at, strict=True):
         for axes in column_of:
-            axes.imshow(volume.data[k], cmap="gray", norm=window, extent=extent, interpolation="nearest")
+            show_grey(axes, volume.data[k], window, extent)
             axes.tick_params(labelsize=6)
         shown = np.where(labels[k] > 0, (labels[k] - 1) % _COLOURS + 1, 0)
         shown[1:][(labels[k][1:] != labels[k][:-1]) & (labels[k][:-1] > 0)] = 0  # a line between those that touch
         shown[:, 1:][(labels[k][:, 1:] != labels[k][:, :-1]) & (labels[k][:, :-1] > 0)] = 0
         column_of[1].imshow(
-            shown,
-            cmap=colours,
-            vmin=0,
-            vmax=_COLOURS,
-            extent=extent,
-            interpolation="nearest",
-            alpha=0.65,
+            shown, cmap=colours, vmin=0, vmax=_COLOURS, extent=extent, interpolation="nearest", alpha=0.65
         )
         n = np.unique(labels[k]).size - bool((labels[k] == 0).any())
         column_of[1].set_xlabel(f"x ({unit})", fontsize=7)

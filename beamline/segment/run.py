@@ -33,16 +33,12 @@ class SegmentOptions:
     """What to segment and how; the steps are those of recon.post.
 
     Attributes:
-        volume, dataset: the file, and the array in it; None: the volume of a reconstruction, or the only array.
+        dataset: the array in the file; None: the volume of a reconstruction, or the only array.
         output: HDF5 file of the labels; the table and the picture lie beside it.
         voxel_mm: edge of a voxel where the file does not say it; None: as the file says, or 1 px.
         margin: of the square inside the sample's circle; None: the whole volume.
-        percentiles, gamma, sigma: of the enhancement.
         n_clusters: of grey values; None: by the elbow rule.
-        radius, smallest: of the cleaning.
         neck: where touching particles are parted; 0: nowhere.
-        seed: of the clusters' starts.
-        command: that repeats this, for the record.
     """
 
     volume: Path

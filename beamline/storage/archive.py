@@ -56,7 +56,6 @@ class Archived:
     """What was written, and compared with the raw file.
 
     Attributes:
-        frames: in the file.
         sources: the raw file, then the files that it draws frames from; raw_bytes: of all of them.
         damaged: rows whose pixels differ from the checksum that was written with them, in the raw file already.
         altered: rows of the frame log that differ from their checksum in the raw file already.
@@ -79,7 +78,6 @@ def archive(
     The raw file is only read. The memory is that of a few frames.
 
     Args:
-        codec: a name in `codecs.CODECS`.
         keep_damaged: frames and rows that differ from their stored checksums are copied as they are, with the
             checksums.
         progress: counts the MB of images twice, when they are written and when they are compared.

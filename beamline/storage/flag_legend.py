@@ -1,7 +1,4 @@
-"""Flags of the monitor in a scan file: the bits of each frame, and the legend that says which check a bit stands for.
-
-Files without a legend hold the bits of the checks as they are numbered today, because a bit is never used again.
-"""
+"""Flags of the monitor in a scan file: the bits of each frame, and the legend, which says what each bit stands for."""
 
 from __future__ import annotations
 
@@ -83,7 +80,7 @@ class FrameFlags:
     Attributes:
         bits: uint64 [frame] as `beamline.monitor.checks.bitmask` makes them.
         legend: the checks behind the bits.
-        scores: [frame, check] as in `Mark`; None where the file holds none.
+        scores: [frame, check] as in `Mark`; None of frames that no monitor looked at.
         regions: [frame, check, 4], likewise.
     """
 
@@ -203,13 +200,11 @@ def write_legend(file: h5py.File) -> None:
 
 
 def read_legend(file: h5py.File) -> tuple[FlagBit, ...]:
-    """The legend of a scan file; today's checks where an older file has none. ValueError for impossible bits."""
-    columns = [hdf5.dataset(file, f"{LEGEND}/{name}") for name in ("name", "bit", "unit", "meaning")]
-    if any(column is None for column in columns):
-        return TODAY
+    """The legend of a scan file. ValueError for impossible bits."""
+    columns = (file[f"{LEGEND}/{name}"][()] for name in ("name", "bit", "unit", "meaning"))
     legend = tuple(
         FlagBit(hdf5.text(name), int(bit), hdf5.text(unit), hdf5.text(meaning))
-        for name, bit, unit, meaning in zip(*(column[()] for column in columns if column is not None), strict=True)
+        for name, bit, unit, meaning in zip(*columns, strict=True)
     )
     bits = [entry.bit for entry in legend]
     if len({*bits}) != len(bits) or any(not 0 <= bit < 64 - ALARM_SHIFT for bit in bits):
@@ -223,9 +218,8 @@ def read_flags(file: h5py.File, n: int) -> FrameFlags:
     Raises:
         ValueError: a dataset of them has another shape than the frames and the legend.
     """
-    legend, scores, regions = read_legend(file), None, None
-    if SCORES in file and REGIONS in file:
-        scores, regions = _read(file, SCORES, (n, len(legend))), _read(file, REGIONS, (n, len(legend), 4))
+    legend = read_legend(file)
+    scores, regions = _read(file, SCORES, (n, len(legend))), _read(file, REGIONS, (n, len(legend), 4))
     return FrameFlags(_read(file, FLAGS, (n,)).astype(np.uint64), legend, scores, regions)
 
 

@@ -267,6 +267,12 @@ def attribute(item: h5py.HLObject, name: str) -> str:
     return text(item.attrs[name]) if name in item.attrs else ""
 
 
+def text_at(group: h5py.Group, path: str) -> str:
+    """A dataset as text; "" if it is missing."""
+    item = dataset(group, path)
+    return "" if item is None else text(item[()])
+
+
 def resolve(group: h5py.Group, path: str) -> Any | None:
     """The object at a path; None without one, as after a link to a missing file, or in a circle of links."""
     try:
@@ -381,19 +387,21 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
         DataError: the file does not give them: damaged or cut chunks, or a compression that is not installed.
     """
     start = 0
-    while start < indices.size:
-        stop = start + 1
-        while stop < indices.size and indices[stop] == indices[stop - 1] + 1:
-            stop += 1
-        first, last = int(indices[start]), int(indices[stop - 1])
+    for first, end in runs(indices):
         try:
-            out[start:stop] = item[first : last + 1, rows]
+            out[start : start + end - first] = item[first:end, rows]
         except OSError as error:
-            which = f"Frame {first}" if first == last else f"One of the frames {first} to {last}"
+            which = f"Frame {first}" if end == first + 1 else f"One of the frames {first} to {end - 1}"
             raise DataError(
                 f"{which} of {item.name} in {item.file.filename} cannot be read ({reason(error)})."
             ) from error
-        start = stop
+        start += end - first
+
+
+def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
+    """Half-open runs [a, b) of consecutive numbers, in order: 3 4 5 9 -> (3, 6), (9, 10)."""
+    parts = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return [(int(part[0]), int(part[-1]) + 1) for part in parts if part.size]
 
 
 _SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "text", "S": "text", "U": "text"}

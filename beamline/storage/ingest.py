@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError, ScanStopped
+from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
@@ -25,6 +25,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import FrameKind
 
 PER_FLUSH = 64  # rows
@@ -50,20 +51,16 @@ def ingest(
     sample: str | None = None,
     no_data: float | None = None,
     progress: Callable[[int, int], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
 ) -> Ingested:
     """Copy a scan into the new file `out`, one frame in memory at a time.
 
     Args:
-        scan: of any format that open_scan reads.
         pixel_size_mm, energy_kev, sample: for the record, where the input does not say.
         no_data: a value that marks pixels without a measurement; they count as invalid in the statistics.
         progress: called with (frames written, frames in all) after each.
-        should_stop: asked before each frame.
 
     Raises:
         DataError: unreadable input, `out` exists, or the disk does not take it. No half file is left.
-        ScanStopped: should_stop said so. No half file is left.
     """
     out = Path(out)
     with whole_file(out) as partial, open_scan(scan) as source:
@@ -83,7 +80,7 @@ def ingest(
             axis_col=source.axis_col,
         )
         with hdf5.created(partial, layout.LIBVER) as file:
-            invalid = _copy(source, file, out, info, no_data, progress, should_stop)
+            invalid = _copy(source, file, out, info, no_data, progress)
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = int(source.image_key.size)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
@@ -97,7 +94,6 @@ def _copy(
     info: layout.ScanInfo,
     no_data: float | None,
     progress: Callable[[int, int], None] | None,
-    should_stop: Callable[[], bool] | None,
 ) -> int:
     dtype = source.dtype.newbyteorder("<")
     layout.create(file, info, source.shape, dtype, quantity=source.quantity, preview_bin=4, start=None)
@@ -105,13 +101,11 @@ def _copy(
         file["/entry/record/no_data"] = float(no_data)
     if source.part_starts.size > 1:
         file[layout.PART_STARTS] = source.part_starts
-    rows = layout.Rows(file)
+    rows = Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
     n, invalid = int(source.image_key.size), 0
     for i, (given, record) in enumerate(_frames(source)):
         image = given.astype(dtype, copy=False)
-        if should_stop is not None and should_stop():
-            raise ScanStopped(f"Stopped after {i} of {n} frames; nothing is left of {out}.")
         if i in source.damaged:
             raise DataError(
                 f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
@@ -134,15 +128,15 @@ def _copy(
     return invalid
 
 
-def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], layout.Record]]:
+def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
     """Pixels and metadata of each frame; a scan of ours (even if its writer died) keeps its log."""
     flags = source.flags
     if source.dtype == np.uint16:
         for i, frame in enumerate(source.frames()):
             known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
-            yield frame.counts, layout.Record(*known, UNMARKED if flags is None else flags.mark(i))
+            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i))
         return
     keys, angles, exposures = source.image_key, source.angles, source.exposures
     for i in range(keys.size):
-        record = layout.Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
+        record = Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))
         yield source.read([i])[0], record

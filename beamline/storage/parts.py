@@ -26,6 +26,7 @@ from beamline.storage import hdf5
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import add_exchange_view
+from beamline.storage.writers.rows import altered_rows, record_checksums, require_earlier
 from drivers.base.frame import FrameKind
 
 JOINED = "joined.h5"
@@ -44,9 +45,9 @@ def views_in(file: h5py.File) -> frozenset[int]:
     """
     n = int(file[layout.COMMITTED][()])
     triggers, replaces, kinds = (file[path][:n] for path in (layout.TRIGGER, layout.REPLACES, layout.KIND))
-    altered = layout.altered_rows(file, 0, n)
+    altered = altered_rows(file, 0, n)
     replaces[altered], kinds[altered] = -1, FrameKind.INVALID
-    layout.require_earlier(replaces)
+    require_earlier(replaces)
     views = set()
     for row in np.flatnonzero(kinds == FrameKind.PROJECTION):
         while replaces[row] >= 0:  # a view that was taken again has the number of the first one
@@ -88,7 +89,7 @@ def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
     views = np.flatnonzero(kinds == FrameKind.PROJECTION)
     firsts = np.cumsum([0, *rows])
     for file, first, n in zip(files, firsts, rows, strict=False):
-        kinds[first + layout.altered_rows(file, 0, n)] = FrameKind.INVALID
+        kinds[first + altered_rows(file, 0, n)] = FrameKind.INVALID
     after = np.arange(kinds.size) > (views[-1] if views.size else kinds.size)
     return {kind: set(triggers[after & (kinds == kind)].tolist()) for kind in (FrameKind.FLAT, FrameKind.DARK)}
 
@@ -210,9 +211,9 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in layout.GROWING}
     for i, (file, n, first) in enumerate(zip(files, rows, firsts[:-1], strict=True)):
         record = {path: values[path][i] for path in layout.RECORDED}
-        again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), layout.altered_rows(file, 0, n))
+        again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), altered_rows(file, 0, n))
         record[layout.REPLACES][again] += first
-        values[layout.RECORD_CHECKSUM][i][again] = layout.record_checksums(record)[again]
+        values[layout.RECORD_CHECKSUM][i][again] = record_checksums(record)[again]
     values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
     _copy(files[0]["/"], joined, {path: np.concatenate(parts) for path, parts in values.items()})
     for path in _VIRTUAL:

@@ -30,6 +30,7 @@ from beamline.storage.superblock import SIZE, Superblock, superblock
 from beamline.storage.writer_lock import WriterLock, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import has_exchange_view, with_exchange_view
+from beamline.storage.writers.rows import altered_rows
 
 QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
 COMPARED = 2**31  # bytes of the last frames: more than a machine that loses power has not brought to the disk yet
@@ -261,7 +262,7 @@ def _damaged(file: h5py.File) -> tuple[int, ...]:
 
 
 def _altered(file: h5py.File, frames: int) -> tuple[int, ...]:
-    return tuple(layout.altered_rows(file, 0, frames).tolist())
+    return tuple(altered_rows(file, 0, frames).tolist())
 
 
 def _views_missing(file: h5py.File) -> int | None:

@@ -19,12 +19,7 @@ _WORD = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class Superblock:
-    """The fields of a file's head.
-
-    Attributes:
-        head: its bytes.
-        size: of the file.
-    """
+    """The bytes of a file's head, their fields, and the size of the file."""
 
     head: bytes
     size: int

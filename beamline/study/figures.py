@@ -13,7 +13,7 @@ from beamline.core.machine import machine_line
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
 from beamline.report.slice_sheet import SliceSheet
-from beamline.study.table import HEADINGS, StudyTable, formatted, write_text
+from beamline.study.table import HEADINGS, StudyTable, formatted
 from beamline.tradeoff.varied import colour_of
 from recon.methods import by_name
 
@@ -75,4 +75,4 @@ def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
         scan=table.scan,
         command=table.command,
     )
-    write_text(folder / "report.html", page)
+    write_whole(folder / "report.html", page, replace=True)

@@ -46,16 +46,13 @@ class StudyOptions:
     """The scan and the study.
 
     Attributes:
-        source, selection: the scan and the part of it to use; the study chooses from its views.
-        study: what is asked.
+        selection: the study chooses from its views.
         folder: for the results; must not exist.
         methods: names in `recon.methods`.
         settings: of these methods, by name; methods left out have their own.
         filter: of the FBP of all views that rows are compared with.
         truth: FILE or FILE:first:end to compare with, too.
         draws: how often random views are drawn.
-        seed: of everything random.
-        command: the command line that repeats the study, for the record.
     """
 
     source: SourceOptions

@@ -70,9 +70,7 @@ class Study:
     """A question to a scan, and the rows that answer it.
 
     Attributes:
-        name: on the command line.
-        title: of its page.
-        question: in a sentence.
+        name: on the command line; `title`: of its page.
         rows: all rows, those that the scan is too small for with the reason.
     """
 

@@ -35,12 +35,9 @@ class Cell:
     """One row of a study by one method.
 
     Attributes:
-        row: which views.
-        method: its name in `recon.methods`.
         status: only "done" comes with figures; "not run" with a message: the row was left out.
         figures: by the names of HEADINGS.
         seconds, cpu_seconds: of the reconstruction.
-        message: why there are no figures.
     """
 
     row: StudyRow
@@ -66,11 +63,8 @@ class StudyTable:
     """All cells of a study.
 
     Attributes:
-        study: what was asked.
         cells: in the order of the rows, each by all methods.
         scan: facts for people, by name.
-        machine: of `beamline.core.machine.machine`.
-        command: the command that repeats the study.
         notes: sentences on what the figures mean.
         stopped: it was interrupted before all rows were done.
     """
@@ -148,16 +142,13 @@ def write_table(folder: Path, table: StudyTable) -> None:
         "notes": list(table.notes),
         "rows": [_record(cell) for cell in table.cells],
     }
-    write_text(folder / "study.json", json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False))
+    record_text = json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False)
+    write_whole(folder / "study.json", record_text, replace=True)
     out = io.StringIO()
     writer = csv.DictWriter(out, list(_record(table.cells[0])), lineterminator="\n")
     writer.writeheader()
     writer.writerows(finite(_record(cell)) for cell in table.cells)
-    write_text(folder / "study.csv", out.getvalue())
-
-
-def write_text(path: Path, content: str) -> None:
-    write_whole(path, content, replace=True)
+    write_whole(folder / "study.csv", out.getvalue(), replace=True)
 
 
 def _record(cell: Cell) -> dict[str, str | float | None]:

@@ -126,8 +126,9 @@ def write_table(folder: Path, table: TrialTable) -> None:
         "front_seconds": [table.compared[i].trial.label for i in table.front(TIME)],
         "front_memory": [table.compared[i].trial.label for i in table.front(MEMORY)],
     }
-    _write(folder / "tradeoff.json", json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False))
-    _write(folder / "tradeoff.csv", to_csv(table))
+    text = json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False)
+    write_whole(folder / "tradeoff.json", text, replace=True)
+    write_whole(folder / "tradeoff.csv", to_csv(table), replace=True)
 
 
 def to_csv(table: TrialTable) -> str:
@@ -171,7 +172,7 @@ def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
         pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     for name, picture in pictures:
         write_whole(folder / name, picture.png, replace=True)
-    _write(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]))
+    write_whole(folder / "tradeoff.html", to_html(table, [picture for _, picture in pictures]), replace=True)
 
 
 def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
@@ -216,7 +217,7 @@ def _cells(outcome: Outcome, names: Sequence[str]) -> list[str]:
     return [
         _time(outcome.seconds),
         _time(outcome.cpu_seconds),
-        _megabytes(outcome),
+        "n/a" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}",
         *(_cell(name, outcome) for name in names),
     ]
 
@@ -234,10 +235,6 @@ def _cell(name: str, outcome: Outcome) -> str:
     return f"{value:.{METRICS[name].digits}f}" if math.isfinite(value) else "undefined"
 
 
-def _megabytes(outcome: Outcome) -> str:
-    return "n/a" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
-
-
 def finite(value: Any) -> Any:
     """Plain values for JSON and CSV; numbers that are not finite become None."""
     if isinstance(value, Mapping):
@@ -245,7 +242,3 @@ def finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _write(path: Path, content: str) -> None:
-    write_whole(path, content, replace=True)

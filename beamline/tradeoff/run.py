@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from beamline.core.errors import DataError
 from beamline.core.events import Done, Sink, StateEntered, TradeoffStarted, TrialReached
-from beamline.core.files import result_folder
+from beamline.core.files import refuse_existing, result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.projections.held_out import hold_out
@@ -43,14 +42,10 @@ class TradeoffOptions:
     """The scan and the trials to compare.
 
     Attributes:
-        source, selection: the scan and the part of it to use.
         folder: for the results; must not exist.
         methods: names in `recon.methods`.
-        depth: how many trials.
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
         truth: FILE or FILE:first:end to compare with.
-        seed: of everything random.
-        command: the command line that repeats the trade-off, for the record.
     """
 
     source: SourceOptions
@@ -77,10 +72,7 @@ def run_tradeoff(
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
     folder, started = options.folder, clock.now()
-    if folder.exists():
-        raise DataError(f"{folder} exists and results are never overwritten. Name another folder, or move it away.")
-    if not folder.parent.is_dir():
-        raise DataError(f"The folder {folder.parent} does not exist. Create it first.")
+    refuse_existing(folder)
     wanted = None if options.truth is None else read_truth(options.truth)
     warn = Warnings(sink, clock)
     with options.source.open() as source:

@@ -16,10 +16,8 @@ class TrialCost:
     """A cost of a trial, and how a picture shows it.
 
     Attributes:
-        name: in file names.
-        words: in titles and captions.
-        axis: label with its unit.
-        scale: from the value to that unit.
+        name: in file names; `words`: in titles and captions.
+        axis: label with its unit; `scale`: from the value to that unit.
         of: the cost of an outcome; NaN where it is not known.
     """
 
@@ -45,9 +43,7 @@ class TrialTable:
         outcomes: in the order of the plan.
         by: the measure of quality: "psnr" or "residual_held_out", both as dB.
         length_unit: of the resolution, "mm" or "px".
-        machine: of `beamline.core.machine.machine`.
         scan: facts for people, by name.
-        command: the command that repeats the trade-off.
         stopped: it was interrupted before all trials were done.
     """
 

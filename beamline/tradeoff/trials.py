@@ -80,7 +80,6 @@ class Outcome:
     """What became of a trial.
 
     Attributes:
-        trial: what was tried.
         status: only "done" comes with figures.
         seconds: wall time of the reconstruction, without compilation and measuring.
         peak_bytes: of its process; None where the system does not tell.
@@ -88,7 +87,6 @@ class Outcome:
         gaussians: in the model at the end; None for voxel methods.
         curve: (seconds, dB) of its own record of the residual.
         curve_of: which views that record is of, in words.
-        message: why there are no figures.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
     """
 
@@ -128,7 +126,6 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
 
     Args:
         methods: names in `recon.methods`, in the order wanted.
-        n_views: how many there are.
         gaussians: how many a fit would start from by itself.
         depth: "quick" has about half as many trials as "full", and shorter ones.
 

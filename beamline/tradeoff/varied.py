@@ -45,7 +45,6 @@ def trials_of(method: str, gaussians: int, depth: Depth) -> Sequence[TrialSettin
     """The settings that a trade-off tries on all views, the baseline first.
 
     Args:
-        method: its name.
         gaussians: how many a fit starts from by default.
         depth: "quick" has fewer trials, and shorter ones.
     """

@@ -17,6 +17,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.writers.rows import record_checksums
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
@@ -102,7 +103,7 @@ def seal(file: h5py.File) -> None:
     """Make what the columns of a scan file of ours say what was written: its rows get their checksums anew."""
     with suppress(ValueError):  # a column of another length, which the readers refuse
         columns = {path: file[path][()] for path in layout.RECORDED}
-        file[layout.RECORD_CHECKSUM][...] = layout.record_checksums(columns)
+        file[layout.RECORD_CHECKSUM][...] = record_checksums(columns)
 
 
 def write_flagged(

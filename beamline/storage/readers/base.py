@@ -1,4 +1,4 @@
-"""ScanSource: a scan of any file format. BaseSource and ScanFormat: the parts that a file format adds."""
+"""ScanSource: a scan of any file format; a format adds a subclass, and a ScanFormat for the registry."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,8 +21,11 @@ Attributes = Mapping[str, str | float | int]
 WHOLE = slice(None)
 
 
-class ScanSource(Protocol):
+class ScanSource(ABC):
     """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
+
+    A format's subclass has `read` and `close`. It sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and
+    `facts` where it opens the file, and those of the other fields that its format states.
 
     Attributes:
         path: of the opened scan.
@@ -34,123 +36,10 @@ class ScanSource(Protocol):
         image_key: int32 [frame], values of drivers.base.frame.FrameKind.
         angles: float64 [frame] radians, NaN where unknown.
         exposures: float64 [frame] s, NaN where unknown.
-        currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit.
-            NaN where unknown; None where there is no monitor.
+        facts: `attributes` of a format in which they do not change.
         pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        attributes: other facts of the file, for the record.
-        flags: of the monitor, by frame; None where no monitor looked at the frames.
-        replaces: int64 [frame], the row of the view that a frame repeats (the old row is then INVALID), -1 in others.
-        None if no view was repeated.
-        part_starts: int64 [part], ascending, the first row of each part: between two parts the scan was interrupted,
-            so that beam and camera may have changed. [0] where it was not.
-        checksummed: the file holds a checksum of every frame.
-        altered: rows whose record differs from its checksum. They are INVALID, because their metadata cannot be
-        trusted.
-        damaged: rows read so far whose pixels are not those that were written, by these checksums. Frames are compared
-            only where half of them or more is read.
-        plan: the requested scan, as our files record it; empty if unknown.
-        finished: no more frames will come. Ask before refresh(): refresh() then finds all frames.
-    """
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def format(self) -> str: ...
-    @property
-    def shape(self) -> tuple[int, int]: ...
-    @property
-    def dtype(self) -> np.dtype[Any]: ...
-    @property
-    def quantity(self) -> Quantity: ...
-    @property
-    def image_key(self) -> NDArray[np.int32]: ...
-    @property
-    def angles(self) -> NDArray[np.float64]: ...
-    @property
-    def exposures(self) -> NDArray[np.float64]: ...
-    @property
-    def currents(self) -> NDArray[np.float64] | None: ...
-    @property
-    def pixel_size_mm(self) -> float | None: ...
-    @property
-    def energy_kev(self) -> float | None: ...
-    @property
-    def axis_col(self) -> float | None: ...
-    @property
-    def cone(self) -> tuple[float, float] | None: ...
-    @property
-    def attributes(self) -> Attributes: ...
-    @property
-    def flags(self) -> FrameFlags | None: ...
-    @property
-    def replaces(self) -> NDArray[np.int64] | None: ...
-    @property
-    def part_starts(self) -> NDArray[np.int64]: ...
-    @property
-    def checksummed(self) -> bool: ...
-    @property
-    def altered(self) -> frozenset[int]: ...
-    @property
-    def damaged(self) -> frozenset[int]: ...
-    @property
-    def plan(self) -> Mapping[str, Any]: ...
-    @property
-    def finished(self) -> bool: ...
-
-    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order. IndexError beyond the readable frames."""
-        ...
-
-    def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on, as a camera gave them. DataError where pixels are not uint16 counts."""
-        ...
-
-    def refresh(self) -> int:
-        """Look again at a growing file; how many frames can be read now."""
-        ...
-
-    def close(self) -> None: ...
-    def __enter__(self) -> Self: ...
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
-
-
-def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
-    """Frame numbers of a slice or an array (negative ones count from the end); IndexError beyond the n readable."""
-    if isinstance(frames, slice):
-        return np.arange(n)[frames]
-    indices = np.atleast_1d(np.asarray(frames))
-    if indices.size == 0:
-        return np.empty(0, np.int64)
-    if indices.ndim != 1 or indices.dtype.kind not in "ui":
-        raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
-    indices = indices.astype(np.int64)
-    if indices.min() < -n or indices.max() >= n:
-        raise IndexError(f"Frames {indices.min()}..{indices.max()} asked for, but only 0..{n - 1} can be read.")
-    return np.where(indices < 0, indices + n, indices)
-
-
-def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
-    """0, 1, 2, ... from each change of kind on: the trigger of each frame within its block."""
-    rows = np.arange(image_key.size)
-    starts = np.where(np.diff(image_key, prepend=image_key[:1] - 1) != 0, rows, 0)
-    return rows - np.maximum.accumulate(starts)
-
-
-def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
-    """Rows of the views that were taken again, ascending."""
-    replaces = source.replaces
-    return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
-
-
-class BaseSource(ABC):
-    """Base class of the readers: a format adds its fields and `read`; the rest is here.
-
-    A subclass sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and `facts` (its attributes) where it
-    opens the file. It also sets those of the other fields that its format states; see ScanSource for their meaning.
     """
 
     path: Path
@@ -169,42 +58,64 @@ class BaseSource(ABC):
 
     @property
     def finished(self) -> bool:
+        """No more frames will come. Ask before refresh(): refresh() then finds all frames."""
         return True
 
     @property
     def attributes(self) -> Attributes:
+        """Other facts of the file, for the record."""
         return self.facts
 
     @property
     def flags(self) -> FrameFlags | None:
+        """Of the monitor, by frame; None where no monitor looked at the frames."""
         return None
 
     @property
     def currents(self) -> NDArray[np.float64] | None:
+        """float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit.
+
+        NaN where unknown; None where there is no monitor.
+        """
         return None
 
     @property
     def replaces(self) -> NDArray[np.int64] | None:
+        """int64 [frame], the row of the view that a frame repeats (the old row is then INVALID), -1 in others.
+
+        None if no view was repeated.
+        """
         return None
 
     @property
     def part_starts(self) -> NDArray[np.int64]:
+        """int64 [part], ascending, the first row of each part; [0] where the scan was not interrupted.
+
+        Between two parts beam and camera may have changed.
+        """
         return np.zeros(1, np.int64)
 
     @property
     def checksummed(self) -> bool:
+        """The file holds a checksum of every frame."""
         return False
 
     @property
     def altered(self) -> frozenset[int]:
+        """Rows whose record differs from its checksum. They are INVALID: their metadata cannot be trusted."""
         return frozenset()
 
     @property
     def damaged(self) -> frozenset[int]:
+        """Rows read so far whose pixels are not those that were written, by their checksums.
+
+        Frames are compared only where half of them or more is read.
+        """
         return frozenset()
 
     @property
     def plan(self) -> Mapping[str, Any]:
+        """The requested scan, as our files record it; empty if unknown."""
         return {}
 
     @abstractmethod
@@ -216,7 +127,7 @@ class BaseSource(ABC):
         """Close the file."""
 
     def refresh(self) -> int:
-        """Number of frames that can be read; a format that grows looks again."""
+        """Look again at a growing file; how many frames can be read now."""
         return int(self.image_key.size)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
@@ -250,10 +161,36 @@ class BaseSource(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
+    """Frame numbers of a slice or an array (negative ones count from the end); IndexError beyond the n readable."""
+    if isinstance(frames, slice):
+        return np.arange(n)[frames]
+    indices = np.atleast_1d(np.asarray(frames))
+    if indices.size == 0:
+        return np.empty(0, np.int64)
+    if indices.ndim != 1 or indices.dtype.kind not in "ui":
+        raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
+    indices = indices.astype(np.int64)
+    if indices.min() < -n or indices.max() >= n:
+        raise IndexError(f"Frames {indices.min()}..{indices.max()} asked for, but only 0..{n - 1} can be read.")
+    return np.where(indices < 0, indices + n, indices)
+
+
+def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
+    """0, 1, 2, ... from each change of kind on: the trigger of each frame within its block."""
+    rows = np.arange(image_key.size)
+    starts = np.where(np.diff(image_key, prepend=image_key[:1] - 1) != 0, rows, 0)
+    return rows - np.maximum.accumulate(starts)
+
+
+def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
+    """Rows of the views that were taken again, ascending."""
+    replaces = source.replaces
+    return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
 
 
 @dataclass(frozen=True)
@@ -282,4 +219,4 @@ class ScanFormat:
 
     name: str
     recognises: Callable[[Path, Opening], bool]
-    open: Callable[[Path, Opening], BaseSource]
+    open: Callable[[Path, Opening], ScanSource]

@@ -22,19 +22,20 @@ from beamline.storage.hdf5 import require_real
 from beamline.storage.parts import require_joined
 from beamline.storage.readers.base import (
     WHOLE,
-    BaseSource,
     Opening,
     Quantity,
     ScanFormat,
+    ScanSource,
     count_in_blocks,
     frame_indices,
 )
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
+from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
 
 
-class NXtomoSource(BaseSource):
+class NXtomoSource(ScanSource):
     """A scan in NXtomo's structure; see ScanSource."""
 
     def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
@@ -48,9 +49,9 @@ class NXtomoSource(BaseSource):
             shape = places.data.shape
             self.shape = (int(shape[1]), int(shape[2]))
             self.dtype = places.data.dtype
-            definition = hdf5.text(_value(places.entry, "definition")) or hdf5.attribute(places.entry, "definition")
-            self.format = _format(definition, hdf5.text(_value(places.entry, "program_name")))
-            said = hdf5.text(_value(self._file, "/entry/record/quantity"))
+            definition = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
+            self.format = _format(definition, hdf5.text_at(places.entry, "program_name"))
+            said = hdf5.text_at(self._file, "/entry/record/quantity")
             self.quantity = _quantity(said, self.dtype)
             self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
             energy = (hdf5.scalar(places.entry, f"{where}/incident_energy", hdf5.ENERGY_UNITS) for where in BEAMS)
@@ -94,7 +95,6 @@ class NXtomoSource(BaseSource):
             )
 
     def refresh(self) -> int:
-        """Look again at a growing file; how many frames can be read now."""
         with hdf5.readable(self.path):
             return self._refreshed()
 
@@ -124,7 +124,7 @@ class NXtomoSource(BaseSource):
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
         if self._ours and n > self.n:
-            rows = layout.altered_rows(self._file, self.n, n)
+            rows = altered_rows(self._file, self.n, n)
             self._altered |= {self.n + row for row in rows.tolist()}
         known = np.isin(keys[:n], list(FrameKind))  # codes that nobody defined belong to no frame that can be used
         self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
@@ -154,7 +154,7 @@ class NXtomoSource(BaseSource):
         entry = self._places.entry
         said: dict[str, str | float | int] = {}
         for name, where in TEXTS.items():
-            value = hdf5.text(_value(entry, where))
+            value = hdf5.text_at(entry, where)
             if value:
                 said[name] = value
         for name, where, units in NUMBERS:
@@ -202,7 +202,7 @@ class NXtomoSource(BaseSource):
     def _replaces(self) -> NDArray[np.int64]:
         rows = self._column("frame_log/replaces", np.full(self.n, -1))[: self.n].astype(np.int64)
         rows[[*self._altered]] = -1
-        layout.require_earlier(rows)
+        require_earlier(rows)
         return rows
 
     @property
@@ -215,7 +215,6 @@ class NXtomoSource(BaseSource):
         return starts.astype(np.int64)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order."""
         indices, height = frame_indices(frames, self.n), len(range(self.shape[0])[rows])
         out = np.empty((indices.size, height, self.shape[1]), self.dtype)
         compared = 2 * height >= self.shape[0] and self.checksummed
@@ -254,7 +253,7 @@ class NXtomoSource(BaseSource):
     @property
     def plan(self) -> Mapping[str, Any]:
         try:
-            plan = json.loads(hdf5.text(_value(self._file, "/entry/record/plan")) or "{}") if self._ours else {}
+            plan = json.loads(hdf5.text_at(self._file, "/entry/record/plan") or "{}") if self._ours else {}
         except (ValueError, RecursionError):
             return {}
         return plan if isinstance(plan, dict) else {}
@@ -325,11 +324,6 @@ NUMBERS = (
     ("distance_mm", "instrument/detector/distance", hdf5.LENGTH_UNITS),
     ("source_distance_mm", "record/source_distance", hdf5.LENGTH_UNITS),
 )
-
-
-def _value(group: h5py.Group, path: str) -> Any:
-    item = hdf5.dataset(group, path)
-    return b"" if item is None else item[()]
 
 
 def _format(definition: str, program: str) -> str:

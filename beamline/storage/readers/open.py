@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
-from beamline.storage.readers.base import BaseSource, Opening, Quantity, ScanFormat, ScanSource
+from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.parts_source import PartsSource
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
@@ -103,7 +103,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     _refuse(options, follow)
     if options.data_path is not None:
         with hdf5.readable(path):
-            base: BaseSource = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
+            base: ScanSource = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
     else:
         base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
@@ -148,7 +148,7 @@ def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str
         )
 
 
-def _of_parts(earlier: Sequence[Path], last: BaseSource) -> BaseSource:
+def _of_parts(earlier: Sequence[Path], last: ScanSource) -> ScanSource:
     with ExitStack() as opened:
         sources = [opened.enter_context(_open(path, Opening())) for path in earlier]
         parts = PartsSource(sources, last)
@@ -156,7 +156,7 @@ def _of_parts(earlier: Sequence[Path], last: BaseSource) -> BaseSource:
     return parts
 
 
-def _open(path: Path, opening: Opening) -> BaseSource:
+def _open(path: Path, opening: Opening) -> ScanSource:
     with hdf5.readable(path):
         for kind in FORMATS:
             if kind.recognises(path, opening):

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.angle_table import assign
-from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, Quantity, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, frame_indices
 from drivers.base.frame import Frame, FrameKind
 
 
-class OverlaidSource(BaseSource):
+class OverlaidSource(ScanSource):
     """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
 
     If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.
@@ -120,7 +120,6 @@ class OverlaidSource(BaseSource):
         return self._base.finished
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order."""
         n = len(self._front)
         indices = frame_indices(frames, n + self._base.image_key.size)
         front = indices < n

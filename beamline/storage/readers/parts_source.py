@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 
 
-class PartsSource(BaseSource):
+class PartsSource(ScanSource):
     """A ScanSource of the frames of `earlier`, which have ended, and then of `last`, whose path and facts it has.
 
     Row numbers, such as the row that a frame replaces, count from the first frame of all files.
@@ -93,7 +93,6 @@ class PartsSource(BaseSource):
         return self._sources[-1].plan
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the frames asked for, in that order."""
         indices = frame_indices(frames, self.image_key.size)
         of = np.searchsorted(self._firsts, indices, "right") - 1
         if indices.size and (of == of[0]).all():

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import WHOLE, Attributes, BaseSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from drivers.base.frame import FrameKind
 
 _LISTED = 10  # datasets of a file that an error names
@@ -38,7 +38,7 @@ class Closable(Protocol):
     def close(self) -> None: ...
 
 
-class StacksSource(BaseSource):
+class StacksSource(ScanSource):
     """A scan in stacks; see ScanSource. `finished` is always True: such a layout has no way to grow.
 
     Quantity: "counts" if there are darks and flats, otherwise "unknown".

@@ -22,7 +22,7 @@ from beamline.core.errors import DataError
 from beamline.core.text import spans
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refuse_volume
 from drivers.base.frame import FrameKind
 
@@ -32,7 +32,7 @@ COUNTED = 100  # range of the numbers over the count of files; above it the numb
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
 
-class TiffSeriesSource(BaseSource):
+class TiffSeriesSource(ScanSource):
     """A folder or .zip with one image a file; see ScanSource. Frames: darks, flats, then the series.
 
     Attribute `angle_text`: (name, content) of the one file that is named after angles, or None.
@@ -68,7 +68,6 @@ class TiffSeriesSource(BaseSource):
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the files asked for, in that order."""
         indices = frame_indices(frames, self.image_key.size)
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for i, number in enumerate(indices):

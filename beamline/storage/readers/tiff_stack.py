@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
-from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, appended, pages_one_by_one, refuse_volume
 from drivers.base.frame import FrameKind
 
 _MANY = 500  # pages; tifffile takes the square of their number to tell how appended ones belong together
 
 
-class TiffStackSource(BaseSource):
+class TiffStackSource(ScanSource):
     """One TIFF with a page for each frame, read page by page; see ScanSource. Angles come from the caller."""
 
     format = "tiff_stack"
@@ -76,7 +76,6 @@ class TiffStackSource(BaseSource):
         return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Pixels [frame, row, col] of the pages asked for, in that order."""
         indices = frame_indices(frames, self.image_key.size)
         wanted = range(self.shape[0])[rows]
         out = np.empty((indices.size, len(wanted), self.shape[1]), self.dtype)

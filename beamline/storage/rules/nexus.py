@@ -33,7 +33,7 @@ def _found(rule: Rule, places: Places) -> list[Finding]:
 
 def definition_said(places: Places) -> Iterator[Finding]:
     """The entry says that it is an NXtomo."""
-    said = _text(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
+    said = hdf5.text_at(places.entry, "definition") or hdf5.attribute(places.entry, "definition")
     if said == layout.FLOAT_DEFINITION:
         yield Finding("info", "definition", f"{said}: float frames in NXtomo's places, on purpose not an NXtomo.")
     elif said != layout.NXTOMO:
@@ -42,7 +42,7 @@ def definition_said(places: Places) -> Iterator[Finding]:
 
 def integer_frames(places: Places) -> Iterator[Finding]:
     """NXtomo's data are what the detector counted (NX_INT)."""
-    if places.data.dtype.kind not in "iu" and _text(places.entry, "definition") != layout.FLOAT_DEFINITION:
+    if places.data.dtype.kind not in "iu" and hdf5.text_at(places.entry, "definition") != layout.FLOAT_DEFINITION:
         yield Finding(
             "error",
             "integer-frames",
@@ -123,7 +123,7 @@ def axis_order(places: Places) -> Iterator[Finding]:
 def names_said(places: Places) -> Iterator[Finding]:
     """Sample name and title, which validators and people look for."""
     for where in ("sample/name", "title"):
-        if not _text(places.entry, where):
+        if not hdf5.text_at(places.entry, where):
             yield Finding("warning", "names", f"{places.entry.name}/{where} is empty or not there.")
 
 
@@ -131,7 +131,7 @@ def iso_times(places: Places) -> Iterator[Finding]:
     """start_time and end_time are ISO 8601 and in order."""
     found = []
     for name in ("start_time", "end_time"):
-        said = _text(places.entry, name)
+        said = hdf5.text_at(places.entry, name)
         if not said:
             continue
         try:
@@ -241,11 +241,6 @@ RULES: tuple[Rule, ...] = (
     frames_differ,
     writer_finished,
 )
-
-
-def _text(group: h5py.Group, path: str) -> str:
-    item = hdf5.dataset(group, path)
-    return "" if item is None else hdf5.text(item[()])
 
 
 def _column(places: Places, path: str) -> NDArray[Any]:

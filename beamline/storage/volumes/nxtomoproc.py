@@ -30,8 +30,7 @@ class NXtomoproc:
             return False
         try:
             with hdf5.open_hdf5(path) as file:
-                definition = hdf5.dataset(file, "entry/definition")
-                return definition is not None and hdf5.text(definition[()]) == DEFINITION
+                return hdf5.text_at(file, "entry/definition") == DEFINITION
         except (DataError, OSError, TypeError):
             return False
 

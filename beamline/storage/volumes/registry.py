@@ -21,7 +21,6 @@ class FormatEntry:
     """A format of volume files.
 
     Attributes:
-        module, cls: of its class.
         suffixes: that a file's name ends in, the usual one first; "" for a folder.
         note: what help says of it.
     """

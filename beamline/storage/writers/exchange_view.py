@@ -24,14 +24,6 @@ NAMES = {FrameKind.PROJECTION: "data", FrameKind.FLAT: "data_white", FrameKind.D
 THETA = {"data": "theta", "data_white": "theta_white", "data_dark": "theta_dark"}
 
 
-def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
-    """Half-open runs [a, b) of consecutive numbers, in order: 3 4 5 9 -> (3, 6), (9, 10)."""
-    if rows.size == 0:
-        return []
-    cuts = np.flatnonzero(np.diff(rows) != 1) + 1
-    return [(int(part[0]), int(part[-1]) + 1) for part in np.split(rows, cuts)]
-
-
 def add_exchange_view(file: h5py.File) -> None:
     """Fill /exchange with the rows that exist. Kinds without a frame get no dataset, and neither do invalid frames."""
     source, angles, group = file[layout.DATA], file[layout.ANGLE][()], file.require_group(layout.EXCHANGE)
@@ -39,7 +31,7 @@ def add_exchange_view(file: h5py.File) -> None:
     for name, rows in _rows(file).items():
         virtual = h5py.VirtualLayout((rows.size, *source.shape[1:]), source.dtype)
         filled = 0
-        for first, last in runs(rows):
+        for first, last in hdf5.runs(rows):
             virtual[filled : filled + last - first] = h5py.VirtualSource(source)[first:last]
             filled += last - first
         dataset = group.create_virtual_dataset(name, virtual)

@@ -26,8 +26,6 @@ data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
 from __future__ import annotations
 
 import json
-import math
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -39,10 +37,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.version import version
-from beamline.monitor.checks import ALARMS, CHECKS
-from beamline.monitor.digest import FrameDigest, preview_shape
-from beamline.storage import hdf5
-from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark, write_legend
+from beamline.monitor.checks import CHECKS
+from beamline.monitor.digest import preview_shape
+from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, VALID, write_legend
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
@@ -118,7 +115,6 @@ RECORDED = (
     IMAGE_KEY, COUNT_TIME, ANGLE, KIND, TRIGGER, FRAMESTAMP, TIME, REPLACES,
 )  # fmt: skip
 """Metadata of a frame that never change: RECORD_CHECKSUM is over these columns, in this order."""
-_RECORD = np.dtype([(path, COLUMNS[path][0]) for path in RECORDED])  # 56 bytes, little-endian, without gaps
 
 Description = Mapping[str, str | int | float]
 
@@ -152,67 +148,6 @@ class ScanInfo:
     config: str = ""
     devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
     beam_unit: str | None = None
-
-
-@dataclass(frozen=True)
-class Record:
-    """Metadata of a frame in its row; units as in drivers.base.frame.Frame (radians, s)."""
-
-    kind: FrameKind
-    angle: float
-    exposure: float = np.nan
-    trigger: int = -1
-    framestamp: int = -1
-    time: float = np.nan
-    mark: Mark = UNMARKED
-    replaces: int = -1
-
-
-def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
-    """CRC-32 [row] of the RECORDED columns [row], by their paths.
-
-    The row of a repeated view becomes an invalid frame, but its checksum is still computed for a view.
-    """
-    table = np.empty(len(columns[KIND]), _RECORD)
-    for path in RECORDED:
-        table[path] = columns[path]
-    rows, size = table.tobytes(), _RECORD.itemsize
-    return np.array([zlib.crc32(rows[i : i + size]) for i in range(0, len(rows), size)], np.uint32)
-
-
-def rows_as_written(columns: Mapping[str, NDArray[Any]], checksums: NDArray[Any]) -> NDArray[np.bool_]:
-    """Rows [row] whose record, in columns as above, has the checksum that was written with it."""
-    good = np.asarray(record_checksums(columns) == checksums)
-    marked = ~good & ((columns[KIND] == FrameKind.INVALID) | (columns[IMAGE_KEY] == FrameKind.INVALID))
-    if marked.any():
-        views = {path: np.zeros_like(columns[path]) for path in (IMAGE_KEY, KIND)}  # FrameKind.PROJECTION
-        good[marked] = (record_checksums({**columns, **views}) == checksums)[marked]
-    return good
-
-
-def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
-    """Rows whose record differs from its checksum; they are counted from `first`, where the search begins.
-
-    Raises:
-        ValueError: a column is not as `create` made it.
-    """
-    columns = {}
-    for path in (*RECORDED, RECORD_CHECKSUM):
-        column = file[path]
-        if len(column) < end:  # a reader has some of them open already, see look_again
-            hdf5.look_again(column)
-        columns[path] = column[first:end]
-        if columns[path].shape != (end - first,) or column.dtype != COLUMNS[path][0]:
-            raise ValueError(f"{path} is {column.dtype} {column.shape}, expected {COLUMNS[path][0]} of {end} rows")
-    return np.flatnonzero(~rows_as_written(columns, columns[RECORD_CHECKSUM]))
-
-
-def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
-    """ValueError where a row [row] is said to replace one that does not come before it, as in a circle; -1: none."""
-    wrong = np.flatnonzero(replaces >= np.arange(replaces.size))
-    if wrong.size:
-        row = int(wrong[0])
-        raise ValueError(f"row {row} is said to replace row {replaces[row]}, and only one before it can be replaced")
 
 
 def iso_time(seconds: float) -> str:
@@ -319,85 +254,6 @@ def create(
     _rewritable_text(file, STATUS, "running", 16)
     _growing(file, MISSING, (), np.dtype("<i8"))
     file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
-
-
-class Rows:
-    """Writes rows into a file that create() made. It holds datasets, not the file: it cannot create or delete.
-
-    Pixels are written at once, metadata at `flush`: the columns of several rows cost as much as those of one row.
-    """
-
-    def __init__(self, file: h5py.File) -> None:
-        self._data: h5py.Dataset = file[DATA]
-        self._preview: h5py.Dataset = file[PREVIEW]
-        self._columns: dict[str, h5py.Dataset] = {path: file[path] for path in GROWING}
-        self._types = {path: column.dtype for path, column in self._columns.items()}
-        self._first, self._said = 0, list[dict[str, Any]]()
-
-    def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Write row `row`, an existing one or the next: pixels now, metadata at the next `flush`.
-
-        A view that it replaces becomes an invalid frame, so that no program takes both.
-        """
-        if row != self._first + len(self._said):
-            self.flush()
-            self._first = row
-        said = {
-            IMAGE_KEY: 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
-            KIND: int(record.kind),
-            COUNT_TIME: record.exposure,
-            ANGLE: math.degrees(record.angle),
-            TRIGGER: record.trigger,
-            FRAMESTAMP: record.framestamp,
-            TIME: record.time,
-            REPLACES: record.replaces,
-            FLAGS: record.mark.bits,
-            VALID: record.mark.valid,
-            SCORES: record.mark.scores,
-            REGIONS: record.mark.regions,
-            RECORD_CHECKSUM: 0,  # worked out where the rows are written
-        } | {f"/entry/digest/{name}": value for name, value in vars(digest).items()}
-        for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
-            self._grow(dataset, row + 1)
-            dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
-        self._said.append({path: said[path] for path in self._columns})
-        if record.replaces >= 0:
-            self.flush()
-            for path in (IMAGE_KEY, KIND):
-                self._columns[path][record.replaces] = int(FrameKind.INVALID)
-
-    def flush(self) -> None:
-        """Write the metadata of the rows since the last call. The file's own flush comes after it."""
-        if not self._said:
-            return
-        n, record = len(self._said), dict[str, NDArray[Any]]()
-        for path, column in self._columns.items():  # the checksum of the others is the last
-            if path == RECORD_CHECKSUM:
-                values = record_checksums(record)
-            else:
-                values = np.array([said[path] for said in self._said], self._types[path])
-            if path in RECORDED:
-                record[path] = values
-            self._grow(column, self._first + n)
-            place = column.id.get_space()  # a quarter of the time of h5py's own way, for twenty columns
-            place.select_hyperslab((self._first, *(0,) * (values.ndim - 1)), values.shape)
-            column.id.write(h5py.h5s.create_simple(values.shape), place, values)
-        self._first, self._said = self._first + n, []
-
-    def add_flags(self, rows: range, bits: int) -> None:
-        """Mark rows that exist: a check that has seen later frames found something in them."""
-        self.flush()
-        flags = self._columns[FLAGS][rows.start : rows.stop]
-        marked = flags | np.uint64(bits)
-        if (marked != flags).any():
-            self._columns[FLAGS][rows.start : rows.stop] = marked
-            self._columns[VALID][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
-
-    @staticmethod
-    def _grow(dataset: h5py.Dataset, n: int) -> None:
-        shape = dataset.id.shape
-        if shape[0] < n:  # never shrinks: a reader may hold the rows beyond
-            dataset.id.set_extent((n, *shape[1:]))
 
 
 def state_field_of_view(file: h5py.File) -> None:

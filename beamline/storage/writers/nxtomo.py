@@ -28,6 +28,7 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import with_exchange_view
 from beamline.storage.writers.layout import ScanInfo
+from beamline.storage.writers.rows import Record, Rows
 from beamline.storage.writers.to_disk import ToDisk
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame
@@ -64,7 +65,6 @@ class NXtomoWriter:
         """Create the file, ready to be followed.
 
         Args:
-            frame_shape: (rows, cols) of every frame.
             preview_bin: the bin that the digests' previews are made with.
             flush_every: frames between flushes; a crash loses at most the frames since the last one.
 
@@ -109,7 +109,7 @@ class NXtomoWriter:
                     f"{self.path} cannot be created ({hdf5.reason(error)}). Nothing is left of it."
                 ) from error
             raise
-        self._table = layout.Rows(self._file)
+        self._table = Rows(self._file)
         self._to_disk = ToDisk(self._file.id.get_vfd_handle())
         self._progress = self._file[layout.COMMITTED]
         # Open to the end: where the disk fails, to let go of a dataset would be to write it once more.
@@ -122,7 +122,7 @@ class NXtomoWriter:
         frame; the frames before stay readable, and nothing more can be appended.
         """
         self._check(frame, digest)
-        record = layout.Record(
+        record = Record(
             frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time, mark_of(flags),
             frame.replaces,
         )  # fmt: skip

@@ -37,10 +37,8 @@ class ReconRecord:
     """A volume and where it comes from.
 
     Attributes:
-        volume: attenuation [z, y, x].
         length_unit: "mm" where the pixel size is known, else "px"; the volume is in 1/length_unit.
         raw_file: name of the scan it was made from.
-        title, sample: for people.
         time: s since the Unix epoch when it was made.
         parameters: every setting used, by name; numbers, strings and arrays.
         metrics: figures of merit, by name.

@@ -29,7 +29,7 @@ from drivers.base.clock import Clock, SystemClock
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
 from recon.splatting.r2 import R2
-from tests.beamline.reconstruct.test_follow import INTERLACED, RHYTHM, SCAN, ScanClock, StandingClock
+from tests.beamline.reconstruct.growing_scan import INTERLACED, RHYTHM, SCAN, ScanClock, StandingClock
 from tests.beamline.scans import frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -29,6 +29,7 @@ from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
+from beamline.storage.writers.rows import Rows
 from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults
@@ -101,14 +102,14 @@ class Chain:
     def _full(self, at: int) -> None:
         """The disk takes no frame from one on; its file is never closed, as in a process that has ended since."""
 
-        def write(table: layout.Rows, row: int, *given: object) -> None:
+        def write(table: Rows, row: int, *given: object) -> None:
             if row == at:
                 raise OSError(errno.ENOSPC, "No space left on device")
             usual(table, row, *given)  # type: ignore[arg-type]
 
-        usual = layout.Rows.write
+        usual = Rows.write
         with self.patch.context() as patch:
-            patch.setattr(layout.Rows, "write", write)
+            patch.setattr(Rows, "write", write)
             with pytest.raises(DataError, match="No space left"):
                 self.take(FakeInstrument(), StopRequest())
         part = parts_of(self.run)[-1] / "scan.h5"

@@ -52,14 +52,11 @@ def test_a_scan_holds_name_bits_unit_and_meaning_of_every_check(path: Path) -> N
         np.testing.assert_array_equal(legend["alarm_bit"][()] - legend["bit"][()], ALARM_SHIFT)
 
 
-def test_info_counts_by_check_and_level_also_in_a_file_without_a_legend(path: Path) -> None:
+def test_info_counts_by_check_and_level(path: Path) -> None:
     expected = {"beam": {"warn": 1, "alarm": 1}, "mass": {"warn": 1}}
     facts = describe(path)
     assert (facts["flags"], facts["flagged_frames"], facts["alarmed_frames"]) == (expected, 2, 1)
     assert counted(facts["flags"]) == "beam 1 warn 1 alarm, mass 1 warn"
-    with h5py.File(path, "r+", libver=("v110", "v110")) as file:
-        del file[LEGEND]
-    assert describe(path)["flags"] == expected
 
 
 def test_the_legend_of_the_file_counts_and_not_the_checks_of_this_program(path: Path) -> None:

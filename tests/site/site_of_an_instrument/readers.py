@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.storage.readers.base import WHOLE, BaseSource, ScanFormat, frame_indices
+from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from drivers.base.frame import FrameKind
 
 
-class NpyStack(BaseSource):
+class NpyStack(ScanSource):
     """Frames of an .npy; the caller brings the angles."""
 
     format = "npy_stack"

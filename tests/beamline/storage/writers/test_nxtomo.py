@@ -1,21 +1,14 @@
-"""The writer: what it writes, what it refuses, and what is left when its process is killed."""
+"""The writer: what it writes, and what it refuses."""
 
 from __future__ import annotations
 
-import errno
-import gc
 import json
-import os
-import re
-import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -24,8 +17,9 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
-from beamline.storage.writers import layout, to_disk
+from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.writers.rows import Record, Rows
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO, SHAPE, StandingClock
 
@@ -263,233 +257,9 @@ def test_rows_only_grow(tmp_path: Path, frames: list[Frame]) -> None:
     """Writing an earlier row again keeps those after it."""
     with h5py.File(tmp_path / "s.h5", "x") as file:
         layout.create(file, INFO, SHAPE, np.dtype("<u2"), quantity="counts", preview_bin=4, start=None)
-        rows = layout.Rows(file)
+        rows = Rows(file)
         for row in (0, 1, 2, 0):
             counts = frames[row].counts
-            rows.write(row, counts, digest(counts), layout.Record(frames[row].kind, 0.0))
+            rows.write(row, counts, digest(counts), Record(frames[row].kind, 0.0))
         rows.flush()
         assert {file[path].shape[0] for path in (layout.DATA, layout.PREVIEW, *layout.COLUMNS)} == {3}
-
-
-def test_a_full_disk_is_named_and_earlier_rows_stay(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(writer._table, "write", full)
-        with pytest.raises(DataError, match=r"s\.h5 could not.*No space left.*are free.*first 1 frames are safe in it"):
-            writer.append(frames[1], digest(frames[1].counts))
-    with pytest.raises(DataError, match="earlier write failed"):
-        writer.append(frames[1], digest(frames[1].counts))
-    writer.close()
-    assert not writer.remarks
-    with open_scan(tmp_path / "s.h5") as source:
-        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
-
-
-def no_room(call: str = "take") -> RuntimeError:
-    """As h5py tells of a full disk where it has no number for it."""
-    return RuntimeError(
-        f"Can't {call} (file write failed: time = Fri Nov 20 06:31:51 2026\n, filename = 'scan.h5', "
-        "file descriptor = 5, errno = 28, error message = 'No space left on device', buf = 0x5, offset = 7)"
-    )
-
-
-def test_after_a_full_disk_nothing_is_closed_and_another_process_reads_what_was_committed(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """To close the file would be to write once more what the disk did not take, with a traceback for each id."""
-    path = tmp_path / "s.h5"
-    writer = NXtomoWriter(path, INFO, SHAPE, clock=clock)
-    for frame in frames[:2]:
-        writer.append(frame, digest(frame.counts))
-
-    def full(*_: object) -> None:
-        raise no_room()
-
-    with monkeypatch.context() as patch:
-        patch.setattr(writer._table, "write", full)
-        with pytest.raises(DataError, match=r"could not take the frame \(No space left on device\)"):
-            writer.append(frames[2], digest(frames[2].counts))
-        patch.setattr(h5py.File, "close", full)
-        patch.setattr(h5py.File, "flush", full)
-        writer.close()
-    gc.collect()  # what other tests left open must not be counted
-    opened = h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL)
-    del writer
-    gc.collect()
-    assert h5py.h5f.get_obj_count(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_ALL) == opened
-    code = (
-        "import sys; from beamline.storage.readers.open import open_scan\n"
-        "with open_scan(sys.argv[1]) as s: "
-        "print(s.image_key.size, s.finished, s.attributes['status'], s.read([1]).sum())"
-    )
-    said = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
-    assert said.split() == ["2", "True", "failed", str(frames[1].counts.sum())]
-
-
-def test_a_disk_that_is_full_when_the_scan_ends_is_named(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
-
-    def full(*_: object) -> None:
-        raise no_room()
-
-    with monkeypatch.context() as patch:
-        patch.setattr(h5py.File, "flush", full)
-        with pytest.raises(DataError, match=r"s\.h5 could not be finished \(No space.*first 1 frames are safe"):
-            writer.close()
-    writer.close()
-    with open_scan(tmp_path / "s.h5") as source:
-        assert (source.refresh(), source.finished, source.attributes["status"]) == (1, True, "failed")
-
-
-def test_no_view_is_begun_where_there_is_no_room_for_it(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    writer.append(frames[0], digest(frames[0].counts))
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=5_000))
-    writer.close()
-    assert len(writer.remarks) == 1
-    assert "no /exchange view: " in writer.remarks[0]
-    assert re.search(r"needs \S+ kB on its disk to be changed, 5 kB are free.*1 frames are safe", writer.remarks[0])
-    with h5py.File(tmp_path / "s.h5") as file:
-        assert list(file["exchange"]) == []
-        assert file[layout.STATUS][()] == b"complete"
-
-
-def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame]
-) -> None:
-    """The /exchange view comes to an ordinary file: but for the head and the group, it only makes it longer."""
-    before, changed = [b""], tmp_path / "s.h5"
-    writer = NXtomoWriter(changed, INFO, SHAPE, clock=clock)
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
-    put = writer._put_exchange_view
-
-    def look_first() -> None:
-        with h5py.File(changed) as file:  # closed, in order, for any program
-            assert len(file[layout.DATA]) == len(frames)
-        before[0] = changed.read_bytes()
-        put()
-
-    writer._put_exchange_view = look_first  # type: ignore[method-assign]
-    writer.close()
-    after = changed.read_bytes()
-    with h5py.File(changed) as file:
-        group = h5py.h5o.get_info(file["exchange"].id).addr
-    differ = [i for i, (old, new) in enumerate(zip(before[0], after, strict=False)) if old != new]
-    assert differ and all(i < 48 or group <= i < group + 160 for i in differ)
-
-
-def test_a_file_that_the_disk_has_no_room_for_is_not_left_half_made(
-    tmp_path: Path, clock: StandingClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise no_room()
-
-    monkeypatch.setattr(layout, "create", full)
-    with pytest.raises(DataError, match=r"s\.h5 cannot be created \(No space left on device\)"):
-        NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_was_flushed_is_brought_to_the_disk_and_at_the_end_all(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls, begun = [], threading.Event()
-
-    def fsync(handle: int) -> None:
-        calls.append((handle, writer.rows))
-        begun.set()
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
-    with NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock) as writer:
-        handle = writer._file.id.get_vfd_handle()
-        for frame in frames:
-            begun.clear()
-            writer.append(frame, digest(frame.counts))
-            assert begun.wait(5.0)
-    assert [rows for _, rows in calls[:14]] == list(range(1, 15))
-    assert (handle, 14) in calls[14:]  # before the file is closed; then come the /exchange view and its journal
-
-
-def test_a_disk_that_did_not_take_what_was_flushed_is_told(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
-
-    def fsync(handle: int) -> None:
-        calls.append(handle)
-        if len(calls) == 4:
-            raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    with pytest.raises(DataError, match=r"take the frame .*Input/output error.* The first 3 frames are safe"):
-        for frame in frames:
-            writer.append(frame, digest(frame.counts))
-            if (thread := writer._to_disk._thread) is not None:
-                thread.join()
-    assert (writer.committed, writer.safe) == (5, 3)  # of the other two nobody knows
-    writer.close("failed")
-
-
-def test_a_disk_that_hangs_does_not_hold_the_writer(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hangs = threading.Event()
-    calls: list[int] = []
-
-    def fsync(handle: int) -> None:
-        calls.append(handle)
-        hangs.wait(10.0)
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(to_disk, "SECONDS", 0.0)
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock)
-    for frame in frames:
-        writer.append(frame, digest(frame.counts))
-    assert (writer.committed, len(calls)) == (14, 1)
-    hangs.set()
-    writer.close()
-    assert len(calls) > 2
-
-
-def test_a_file_system_without_such_a_call_is_no_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fsync(handle: int) -> None:
-        raise OSError(errno.EINVAL, "Invalid argument")
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    to_disk.to_disk(0)
-
-
-def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
-    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    writer = NXtomoWriter(tmp_path / "s.h5", INFO, SHAPE, clock=clock, flush_every=9)
-    for frame in frames[:3]:
-        writer.append(frame, digest(frame.counts))
-    assert writer.committed == 0
-    monkeypatch.setattr(writer._table, "write", full)
-    with pytest.raises(DataError, match="first 3 frames are safe in it"):
-        writer.append(frames[3], digest(frames[3].counts))
-    writer.close("failed")
-    with open_scan(tmp_path / "s.h5") as source:
-        assert source.refresh() == 3
-        assert all((source.read([i])[0] == frames[i].counts).all() for i in range(3))
-        assert source.angles[:3] == pytest.approx([frame.angle for frame in frames[:3]], nan_ok=True)

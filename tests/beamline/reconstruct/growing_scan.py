@@ -1,0 +1,116 @@
+"""A scan that grows while it is followed: both share one clock of the test's, so that nothing waits for real."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Set
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.monitor.check import Flag, Level
+from beamline.monitor.checks import CHECKS
+from beamline.monitor.digest import digest
+from beamline.projections.selection import Selection
+from beamline.reconstruct.follow import FollowTiming
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.result import OutputPaths
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.frame import Frame
+from recon.splatting.r2 import R2
+from tests.beamline.scans import TwoCylinders
+
+EPOCH = 1.8e9
+TICK = 0.02  # s that pass with each look at the clock
+
+
+class ScanClock:
+    """Time passes when it is looked at; what is due by then happens."""
+
+    def __init__(self) -> None:
+        self.time = EPOCH
+        self.due: list[tuple[float, Callable[[], None]]] = []
+
+    def now(self) -> float:
+        self._pass(TICK)
+        return self.time
+
+    def sleep(self, seconds: float) -> None:
+        self._pass(seconds)
+
+    def _pass(self, seconds: float) -> None:
+        self.time += seconds
+        while self.due and self.due[0][0] <= self.time:
+            self.due.pop(0)[1]()
+
+
+class StandingClock:
+    def now(self) -> float:
+        return EPOCH
+
+    def sleep(self, seconds: float) -> None:
+        pytest.fail("nobody should wait for this clock")
+
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40), pixel_size_mm=0.5)
+INTERLACED = replace(SCAN, angles=np.concatenate([SCAN.angles[i::3] for i in (0, 2, 1)]))
+RHYTHM = FollowTiming(poll=0.1, slice=0.3, snapshot=0.6, patience=3.0)
+
+
+def schedule(
+    clock: ScanClock,
+    path: Path,
+    frames: list[Frame],
+    *,
+    begin: float = 0.5,
+    period: float = 0.1,
+    status: str | None = "complete",
+    axis_col: float | None = None,
+    pause: float = 0.0,
+    alarms: Set[int] = frozenset(),
+    plan: str = "",
+) -> None:
+    """The scan: its file appears after `begin` s, takes a frame every `period` s, and is finished `pause` s after the
+    last one; status None never finishes it."""
+    writers: list[NXtomoWriter] = []
+    info = ScanInfo(sample="two cylinders", pixel_size_mm=0.5, axis_col=axis_col, plan=plan)
+
+    def create() -> None:
+        writers.append(NXtomoWriter(path, info, frames[0].counts.shape, clock=StandingClock()))
+
+    def append(frame: Frame) -> Callable[[], None]:
+        flags = [Flag(CHECKS[0].name, Level.ALARM, frame.index, 1.0, 0.0, "")] if frame.index in alarms else []
+        return lambda: writers[0].append(frame, digest(frame.counts), flags)
+
+    start = clock.time + begin
+    clock.due.append((start, create))
+    clock.due += [(start + period * (i + 1), append(frame)) for i, frame in enumerate(frames)]
+    end = start + period * (len(frames) + 1) + pause
+    if status is not None:
+        clock.due.append((end, lambda: writers[0].close(status)))
+    else:
+        clock.due.append((end, lambda: writers[0]._lock.release()))  # its program is dead
+        # Hours later, so that the file is closed when the test is over.
+        clock.due.append((end + 1e5, lambda: writers[0].close("failed")))
+
+
+FIT = R2(seconds=2.0, gaussians=200)
+
+
+def options(tmp_path: Path, **changes: object) -> ReconOptions:
+    output = tmp_path / "recon.h5"
+    usual = ReconOptions(
+        source=SourceOptions(tmp_path / "scan.h5"),
+        target=OutputPaths(output, None),
+        selection=Selection(axis_col=SCAN.axis_col),
+        method=FIT,
+        command="beamline recon scan.h5 --follow",
+    )
+    return replace(usual, **changes)  # type: ignore[arg-type]
+
+
+def close(clock: ScanClock) -> None:
+    """Let the rest of the schedule happen."""
+    clock.sleep(1e6)

@@ -1,0 +1,73 @@
+"""The rotation axis of a scan that is followed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.events import Event
+from beamline.projections.selection import Selection
+from beamline.reconstruct import axis_search
+from beamline.reconstruct.follow import follow
+from beamline.storage.writers.recon_file import read_reconstruction
+from recon.prep.align import AxisEstimate
+from tests.beamline.reconstruct.growing_scan import FIT, INTERLACED, RHYTHM, SCAN, ScanClock, options, schedule
+from tests.beamline.scans import frames_of
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -> None:
+    clock = ScanClock()
+    schedule(clock, tmp_path / "scan.h5", frames_of(SCAN), begin=0.0, period=0.0, axis_col=20.25)
+    clock.sleep(1.0)
+    events: list[Event] = []
+    follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    assert events[-1].data["axis_col"] == 20.25
+
+
+def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    started = [event.data for event in events if event.event == "recon_started"]
+    assert started[0]["n_views"] < 30
+    assert events[-1].data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.3)
+
+
+def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def locate(source: object, corrector: object, frames: np.ndarray, warn: object) -> tuple[float, AxisEstimate]:
+        value = 18.0 if frames.size < 20 else 20.7
+        return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
+
+    monkeypatch.setattr(axis_search, "locate_axis", locate)
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    metrics = follow(
+        options(tmp_path, selection=Selection(), method=replace(FIT, seconds=4.0)), events.append, clock, RHYTHM
+    )
+    assert [e.data["axis_col"] for e in events if e.event == "recon_started"] == [18.0, 20.7]
+    assert events[-1].data["axis_col"] == 20.7
+    assert [e.data["again"] for e in events if e.event == "recon_started"] == [False, True]
+    history = read_reconstruction(tmp_path / "recon.h5").history
+    assert history["n_views"][-1] == 30
+    assert np.all(np.diff(history["seconds"]) > 0)  # one time, though the second fit began later
+    assert metrics["residual"] < 0.1
+
+
+def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "beamline.projections.axis.find_axis",
+        lambda data, angles: AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), False, "pair"),
+    )
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
+    follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
+    (started,) = [event.data for event in events if event.event == "recon_started"]
+    assert started["n_views"] == 30
+    assert any(e.event == "warning" and "not a clear optimum" in e.data["message"] for e in events)
