@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr, ssim3d
+from recon.base.arrays import F32
 from recon.base.choices import N_GAUSSIANS, SIDE
 from recon.base.geometry import Geometry
-from recon.base.method import Method, RunControl
+from recon.base.method import Clock, Method, RunControl
 from recon.base.volume import Grid
 from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view, view_table
 from recon.kernels.cpu.footprints import HU, HV
@@ -24,9 +24,6 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
-
-F32 = NDArray[np.float32]
-Clock = Callable[[], float]
 
 _FAINT, _SIGMAS = 1e-3, 3.5
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.plans import Speeds
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import RunControl
+from recon.base.method import Clock, RunControl
 from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
@@ -21,9 +21,6 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
 from recon.voxels.held_out_weight import choice_sweeps
-
-F32 = NDArray[np.float32]
-Clock = Callable[[], float]
 
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.assess.edges import edge_steepness
 from recon.assess.lost_mass import compare
+from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
@@ -20,9 +21,6 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.held_out_weight import LEAST_VIEWS, ONE_IN, busiest_rows, slab_of, split_views
 from recon.voxels.projector import Projector
 from recon.voxels.unexplained import LIMIT, unexplained
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numba.core import event
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method
 from recon.base.volume import Grid
-from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.engine import Active, Gradients, grid_layout
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
@@ -81,7 +81,7 @@ def warm_up_rest() -> None:
 
 @contextmanager
 def _counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
-    class Counter(event.Listener):  # type: ignore[misc]
+    class Counter(event.Listener):
         n = 0
 
         def on_start(self, compilation: Any) -> None:

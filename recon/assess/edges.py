@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 _SLICES = 8  # voxels that are looked at
 _SMOOTH = 1.0  # voxels, in plane: smoothing of the volume that shows the edges

@@ -8,10 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-F64 = NDArray[np.float64]
-
-FIXED_THRESHOLD = 0.143
-"""Correlation of half sets at which the whole set correlates to 0.5 with the truth (Rosenthal & Henderson 2003)."""
+from recon.base.arrays import F64
 
 _TAPERED_FROM = 8  # voxels; a shorter axis is too short for a soft edge
 
@@ -38,11 +35,6 @@ class ShellCorrelation:
         """[shell]: the correlation that leaves half a bit of information a voxel (van Heel & Schatz 2005, eq. 17)."""
         root = np.sqrt(self.independent)
         return (0.2071 + 1.9102 / root) / (1.2071 + 0.9102 / root)
-
-    @property
-    def fixed(self) -> F64:
-        """[shell]: 0.143 everywhere."""
-        return np.full(self.frequency.shape, FIXED_THRESHOLD)
 
     @property
     def resolution_mm(self) -> float:

@@ -27,9 +27,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon.base.arrays import F64
 from recon.base.picture import fan, html
-
-F64 = NDArray[np.float64]
 
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source

@@ -11,16 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
-import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
-F32 = NDArray[np.float32]
 Plain = str | int | float
+Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class RunControl:
     on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None
     checkpoint_every: float = 60.0
     resume: Mapping[str, NDArray[Any]] | None = None
-    now: Callable[[], float] = time.perf_counter
+    now: Clock = time.perf_counter
     decide: Decisions | None = None
     stop_trials: Callable[[], bool] | None = None
 

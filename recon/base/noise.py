@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter
 from scipy.signal import find_peaks
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 _MEDIAN = 0.6745  # median of |x| for a normal variable x with standard deviation 1
 _VIEWS = 16  # looked at

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon.base.arrays import F32
 from recon.post.clusters import k_means
 
-F32 = NDArray[np.float32]
 Box = tuple[slice, slice, slice]
 
 _SAMPLE = 4_000_000  # voxels from which percentiles are computed

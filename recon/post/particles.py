@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon.base.arrays import F32, Mask
 from recon.base.choices import NECK as NECK
 
-Mask = NDArray[np.bool_]
 Labels = NDArray[np.int32]
-F32 = NDArray[np.float32]
 
 _GRID = 0.5
 """Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra

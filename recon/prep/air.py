@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 _BANDS = 8  # of rows, at most

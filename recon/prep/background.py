@@ -10,14 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
+from recon.base.arrays import F32, F64, Mask
 from recon.base.noise import air_level
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HIGHEST = 3
 """Order of the polynomials in column and row, at most."""

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import config
-from numpy.typing import NDArray
 from scipy import fft
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""

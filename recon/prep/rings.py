@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from recon.base.arrays import F32
 from recon.base.choices import Rings
-
-F32 = NDArray[np.float32]
 
 _ROBUST = 1.4826  # median deviation to standard deviation, for normal values
 _FAR = 3.0  # standard deviations by which a column differs from its neighbours (Vo 2018: snr 3)

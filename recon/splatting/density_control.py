@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.kernels.cpu.activation import F32
+from recon.base.arrays import F32
 
 # Standard deviations, along the longest axis, by which each half of a split moves from the centre.
 _APART = 0.75

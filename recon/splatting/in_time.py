@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from recon.base.geometry import Geometry
+from recon.base.method import Clock
 from recon.base.volume import Grid, Volume
 from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
@@ -18,8 +18,6 @@ from recon.voxels.held_out_weight import MOST_SWEEPS, choice_sweeps, sweeps_choi
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.tv import TotalVariationProx, difference_weights
-
-Clock = Callable[[], float]
 
 FINISH_SHARE = 0.8
 """Largest share of the finish in the time after the first steps: it adds more than most steps before it."""

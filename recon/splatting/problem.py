@@ -8,13 +8,13 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.choices import Loss as Loss
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
-from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
 from recon.splatting.backend import Backend, ProjectionLoss
 

@@ -18,10 +18,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Progress
+from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu.activation import F32
 from recon.splatting import arrivals
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import HALF, WHILE_VIEWS_COME, average, averaged, fallen
@@ -36,8 +36,6 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-
-Clock = Callable[[], float]
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.plans import best_steps
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from

@@ -18,6 +18,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy import fft
 
+from recon.base.arrays import F32, F64
 from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -31,9 +32,6 @@ from recon.voxels.back_project import (
     ray_by_ray,
 )
 from recon.voxels.view_weights import ray_weights
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _VIEWS = 32  # filtered at a time
 

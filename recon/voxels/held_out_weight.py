@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -15,8 +16,6 @@ from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
-
-F32 = NDArray[np.float32]
 
 ONE_IN = 8  # views held out
 LEAST_VIEWS = 2 * ONE_IN

@@ -7,17 +7,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.noise import median_deviation
 from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
-
-F32 = NDArray[np.float32]
 
 LIMIT = 12.0
 """Limit, in usual differences (standard deviations): clean real scans stay below 9.4 (docs/notes/exploration.md)."""

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.volume import Grid
 from recon.kernels.cpu import tv as tv_cpu
-
-F32 = NDArray[np.float32]
 
 
 def difference_weights(grid: Grid) -> tuple[float, float, float]:

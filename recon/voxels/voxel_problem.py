@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -18,8 +19,6 @@ from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.sweeps import Sweeps
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

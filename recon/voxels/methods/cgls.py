@@ -9,8 +9,8 @@ from operator import truediv
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
@@ -19,8 +19,6 @@ from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

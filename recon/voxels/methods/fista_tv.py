@@ -6,9 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
@@ -23,8 +21,6 @@ from recon.voxels.voxel_problem import (
     iterative_memory,
     largest_eigenvalue,
 )
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

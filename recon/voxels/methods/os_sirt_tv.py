@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
@@ -19,8 +17,6 @@ from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iterative_memory
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

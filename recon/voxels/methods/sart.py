@@ -6,16 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
