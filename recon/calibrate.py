@@ -20,7 +20,7 @@ from recon.splatting.initialise import MATTER, default_count, density_unit, firs
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out_weight import choice_sweeps
+from recon.voxels.held_out_weight import busiest_rows, choice_sweeps
 
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60
@@ -37,9 +37,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
 
     Args:
         projections: [view, row, col], line integrals.
-        geometry: of the views.
         grid: of the requested volume.
-        now: a clock in s.
 
     Raises:
         ValueError: the scan holds no matter.
@@ -78,16 +76,10 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
 
 def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
     """A few views of the rows with most matter."""
-    rows = geometry.detector_shape[0]
-    height = min(_SLAB_ROWS, rows)
     views = _around(geometry, _SLAB_VIEWS)
-    weight = projections[views].sum(axis=(0, 2), dtype=np.float64)
-    sums = np.convolve(weight, np.ones(height), "valid")
-    first = int(np.argmax(sums))
-    return (
-        np.ascontiguousarray(projections[views, first : first + height]),
-        geometry.select(views).rows(first, first + height),
-    )
+    some = projections[views]
+    rows = busiest_rows(some, _SLAB_ROWS)
+    return np.ascontiguousarray(some[:, rows]), geometry.select(views).rows(rows.start, rows.stop)
 
 
 def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:

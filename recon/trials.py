@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from recon.assess.edges import edge_steepness
 from recon.assess.lost_mass import compare
 from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.noise import median_deviation
@@ -174,11 +176,12 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     """
     passed = {score.at: "loses weak matter" for score in scores if score.loses}
     scores = [score for score in scores if not score.loses] or scores
-    least = min(scores, key=lambda s: s.residual)
+    least, least_penalised = (min(scores, key=attrgetter(name)) for name in ("residual", "penalised"))
     level = [
         score
         for score in sorted(scores, key=lambda s: s.at)
-        if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
+        if score.residual <= _bound(least, least.residual)
+        or score.penalised <= _bound(least_penalised, least_penalised.penalised)
     ]
     for score in level if len(level) > 1 else ():
         if any(other.overfit <= score.overfit and score.steepness < _DULL * other.steepness for other in level):
@@ -190,17 +193,11 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     return least, passed
 
 
-def _penalised(score: Score) -> float:
-    return score.penalised
-
-
-def _is_level(score: Score, least: Score, value: Callable[[Score], float]) -> bool:
-    by_scatter = _ERRORS * _standard_error(least.residuals) / least.residual if least.residual > 0 else 0.0
-    return value(score) <= value(least) * (1 + min(by_scatter, _NEAR - 1))
-
-
-def _standard_error(values: F64) -> float:
-    return float(values.std(ddof=1)) / math.sqrt(values.size) if values.size > 1 else 0.0
+def _bound(least: Score, value: float) -> float:
+    """The largest value that is level with the least one, by the scatter of its residuals over the views."""
+    many = least.residuals.size > 1 and least.residual > 0
+    error = float(least.residuals.std(ddof=1)) / math.sqrt(least.residuals.size) if many else 0.0
+    return value * (1 + min(_ERRORS * error / least.residual if many else 0.0, _NEAR - 1))
 
 
 def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
@@ -218,11 +215,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
         if rows <= height:
             return problem, "all rows"
         slab = busiest_rows(masked(data[:: max(1, len(data) // 8)])[0], height)
-        views, grid = slab_of(geometry, problem.grid, slab.start, slab.stop)
-        use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, slab]))
-        cut = np.ascontiguousarray(data[:, slab])
-        where = f"rows {slab.start} to {slab.stop - 1}"
-        return replace(problem, projections=cut, geometry=views, grid=grid, use=use), where
+        return _of_rows(problem, slab, *slab_of(geometry, problem.grid, slab.start, slab.stop))
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"
     middle = _middle_rows(problem, height)
@@ -238,7 +231,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
 
 def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
     """So many rows in the middle of a cone and the box that holds their rays; None if they have little matter."""
-    geometry, grid, weights = problem.geometry, problem.grid, problem.use.weights
+    geometry, grid = problem.geometry, problem.grid
     first = round(geometry.axis_row - (height - 1) / 2)
     rows = slice(first, first + height)
     moved = np.abs(geometry.shifts[:, 1]).max() > 1
@@ -251,9 +244,14 @@ def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str]
     tall = (height + 1) * geometry.sample_pitch * (1 + geometry.reach / geometry.sod)  # at the far side of the field
     slices = math.ceil(tall / grid.spacing[0])
     box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
+    return _of_rows(problem, rows, views, box)
+
+
+def _of_rows(problem: ReconProblem, rows: slice, views: Geometry, grid: Grid) -> tuple[ReconProblem, str]:
+    weights = problem.use.weights
     use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, rows]))
     cut = np.ascontiguousarray(problem.projections[:, rows])
-    part = replace(problem, projections=cut, geometry=views, grid=box, use=use)
+    part = replace(problem, projections=cut, geometry=views, grid=grid, use=use)
     return part, f"rows {rows.start} to {rows.stop - 1}"
 
 

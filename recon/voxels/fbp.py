@@ -188,10 +188,7 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
-    """Views [view, len(rows), col] at fractional rows by linear interpolation; rows off the detector are zero.
-
-    `projections` holds the rows from `first` on of a detector of `height` rows.
-    """
+    """Views at fractional rows, linearly; rows off the detector are zero. They hold its rows from `first` on."""
     inside = (rows >= -0.5) & (rows <= height - 0.5)
     clamped = np.clip(rows, 0, height - 1)
     lower = np.floor(clamped).astype(np.intp)

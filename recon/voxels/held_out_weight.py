@@ -64,16 +64,17 @@ def busiest_rows(data: F32, height: int) -> slice:
 
 def choice_sweeps(geometry: Geometry) -> float:
     """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
-    if not _can_hold_out(geometry):
-        return 0.0
-    return 4 * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return _in_all_rows(4 * _SWEEPS, geometry)
 
 
 def sweeps_choice_cost(geometry: Geometry) -> float:
     """What `preferred_sweeps` and `bregman_weight` cost at most, in sweeps over all rows."""
-    if not _can_hold_out(geometry):
-        return 0.0
-    return (MOST_SWEEPS + _BREGMAN_TRIALS * _SWEEPS) * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return _in_all_rows(MOST_SWEEPS + _BREGMAN_TRIALS * _SWEEPS, geometry)
+
+
+def _in_all_rows(sweeps: int, geometry: Geometry) -> float:
+    share = min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return sweeps * share if _can_hold_out(geometry) else 0.0
 
 
 def _can_hold_out(geometry: Geometry) -> bool:

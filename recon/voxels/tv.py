@@ -23,7 +23,6 @@ class TotalVariationProx:
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
-        """For volumes of `shape` [y, x, z]; `steps` dual steps a call."""
         self._dual = np.zeros((3, *shape), np.float32)
         self._scratch = tv_cpu.dual_scratch(shape)
         self._weights, self._nonnegative, self._steps = weights, nonnegative, steps

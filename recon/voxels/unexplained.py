@@ -106,7 +106,6 @@ def unexplained_memory(geometry: Geometry) -> int:
 
 
 def _looked_at(geometry: Geometry) -> int:
-    """Rows."""
     rows, cols = geometry.detector_shape
     return min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
 

@@ -65,7 +65,6 @@ class VoxelProblem:
         return volume_lines(direct(images, geometry, self.projector.grid, filter))
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
-        """Sweeps over all views in these subsets."""
         return Sweeps(self.projector, self.data, self.weight, subsets)
 
     def single_views(self) -> Sweeps:

@@ -27,7 +27,7 @@ class AsdPocs:
 
     A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep. Steps
     shrink by `alpha_decay` if they undo more than `ratio` of the sweep and the residual is still above `goal`.
-     Memory: 5 volumes, 3 x the projections.
+    Memory: 5 volumes, 3 x the projections.
 
     Attributes:
         goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
@@ -54,7 +54,6 @@ class AsdPocs:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector, decide = problem.projector, problem.decide
         sweeps = problem.single_views()
         weights = difference_weights(projector.grid)

@@ -17,7 +17,6 @@ from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
-from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
 
 
@@ -43,14 +42,13 @@ class Cgls:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         # The directions would not be conjugate for other rays or weights.
         decide = problem.decide if problem.weight is None else Decisions()
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)
         replace_by_residual(problem.data, residual, None, root)
-        s = _weighed_adjoint(projector, residual, root)
+        s = projector.adjoint_lines(residual if root is None else residual * root)
         direction = s.copy()
         gamma, scale = dot(s, s), problem.scale
         for k in range(self.iterations):
@@ -62,7 +60,7 @@ class Cgls:
             step = decide("step", partial(truediv, gamma, dot(image, image)))
             combine(1.0, x, step, direction, x)
             combine(1.0, residual, -step, image, residual)
-            s = _weighed_adjoint(projector, residual, root, s)
+            s = projector.adjoint_lines(residual if root is None else residual * root, s)
             before, gamma = gamma, dot(s, s)
             combine(1.0, s, decide("turn", partial(truediv, gamma, before)), direction, direction)
             if not problem.go_on(k + 1, math.sqrt(dot(residual, residual)) / scale):
@@ -76,7 +74,3 @@ class Cgls:
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)
-
-
-def _weighed_adjoint(projector: Projector, rays: F32, weight: F32 | None, out: F32 | None = None) -> F32:
-    return projector.adjoint_lines(rays if weight is None else rays * weight, out)

@@ -57,7 +57,6 @@ class FistaTv:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         if not x.any():
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.

@@ -51,11 +51,9 @@ class OsSirtTv:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         sweeps = problem.sweeps(interleaved(projector, self.subsets))
-        weights = difference_weights(projector.grid)
-        prox = TotalVariationProx(x.shape, weights, problem.nonnegative, self.tv_steps)
+        prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, self.tv_steps)
         scale = problem.scale
         weight: NoiseBalance | float | None = None
         ahead = Momentum(x, problem.decide) if self.momentum else None
@@ -70,8 +68,7 @@ class OsSirtTv:
             else:
                 # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
-            go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
-            if not go_on or k + 1 == self.iterations:
+            if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == self.iterations:
                 break
             if ahead is not None:
                 ahead(x)

@@ -37,9 +37,7 @@ class Sart:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-        sweeps = problem.single_views()
-        scale = problem.scale
+        sweeps, scale = problem.single_views(), problem.scale
         for k in range(self.iterations):
             error = sweeps.run(x, self.relaxation * self.decay**k, problem.nonnegative, problem.rng)
             if not problem.go_on(k + 1, math.sqrt(error) / scale):

@@ -36,10 +36,7 @@ class Sirt:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-        everything = [np.arange(problem.projector.geometry.n_views)]
-        sweeps = problem.sweeps(everything)
-        scale = problem.scale
+        sweeps, scale = problem.sweeps([np.arange(problem.projector.geometry.n_views)]), problem.scale
         for k in range(self.iterations):
             error = sweeps.run(x, self.relaxation, problem.nonnegative, None)
             if not problem.go_on(k + 1, math.sqrt(error) / scale):
