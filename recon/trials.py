@@ -11,7 +11,6 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.edges import edge_steepness
 from recon.assess.lost_mass import compare
 from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
@@ -29,7 +28,6 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # share of the largest line integrals
 _ENOUGH = 0.5  # share of the matter in the fullest rows
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
-_DULL = 0.8  # share of the steepness of another volume that is otherwise as good
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +39,6 @@ class Score:
         method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
         residual_seen: the same of views that it was made from, their mean.
-        steepness: of its edges, over those of the steepest volume that was tried, see `edge_steepness`.
         loses: it lost weak matter that a direct method shows, see `lost_mass`.
         hides: tells whether it leaves structure in its own views, see `unexplained`; called only if others are level.
     """
@@ -50,7 +47,6 @@ class Score:
     method: Method
     residuals: F64
     residual_seen: float = math.inf
-    steepness: float = 1.0
     loses: bool = False
     hides: Callable[[], bool] = lambda: False
 
@@ -122,12 +118,8 @@ def predicts_best(
             control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
 
     def scores() -> list[Score]:
-        steep = edge_steepness([volume for _, volume in found])
         shown = next((volume for score, volume in found if score.method.traits.direct), None)
-        return [
-            replace(score, steepness=edges, loses=shown is not None and _loses(volume, shown))
-            for (score, volume), edges in zip(found, steep, strict=True)
-        ]
+        return [replace(score, loses=shown is not None and _loses(volume, shown)) for score, volume in found]
 
     regular = [at for at in order or range(len(methods)) if at != spare]
     for at in regular:
@@ -141,8 +133,8 @@ def predicts_best(
     judged = scores()
     best, passed = best_of(judged)
     listed = [
-        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views, "
-        f"edges {s.steepness:.2f}{', ' * (s.at in passed)}{passed.get(s.at, '')})"
+        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views"
+        f"{', ' * (s.at in passed)}{passed.get(s.at, '')})"
         for s in sorted(judged, key=lambda s: s.residual)
     ]
     late = [methods[at].name for at in regular[len(found) + len(refused) :]] if stopped() else []
@@ -163,11 +155,8 @@ def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | No
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
-    """The score to prefer: of those that are level the first that hides nothing and dulls no edges. What loses weak
-    matter is not asked, unless all do.
-
-    A volume has dull edges if another level one has steeper edges without following more noise. Noise makes a volume
-    steeper where edges are soft. Returns it, and for each level one that is passed over the reason, by its number.
+    """The score to prefer: of those that are level the first that hides nothing. What loses weak matter is not asked,
+    unless all do. Returns it, and for each one that is passed over the reason, by its number.
 
     A residual is level with the smallest one if it lies within two of its standard errors (by its scatter over the
     views) and 4 %. The same holds for the penalised residual. The residual alone prefers a volume that lost some noise,
@@ -184,12 +173,9 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
         or score.penalised <= _bound(least_penalised, least_penalised.penalised)
     ]
     for score in level if len(level) > 1 else ():
-        if any(other.overfit <= score.overfit and score.steepness < _DULL * other.steepness for other in level):
-            passed[score.at] = "dulls edges"
-        elif score.hides():
-            passed[score.at] = "hides structure"
-        else:
+        if not score.hides():
             return score, passed
+        passed[score.at] = "hides structure"
     return least, passed
 
 
