@@ -33,7 +33,6 @@ class Timing:
     """The time that a call takes.
 
     Attributes:
-        name: of the timed call.
         ms: median of the repeats.
         spread_ms: between their quartiles.
         pairs: Gaussian-pixel pairs that it computes; 0 without such pairs.

@@ -35,10 +35,6 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     runs on whole views, with the number of Gaussians that a fit would start from, spread over the matter in a coarse
     first volume: the time of a step depends on how much they overlap.
 
-    Args:
-        projections: [view, row, col], line integrals.
-        grid: of the requested volume.
-
     Raises:
         ValueError: the scan holds no matter.
     """

@@ -44,7 +44,6 @@ class Extent:
     """The size of a reconstruction.
 
     Attributes:
-        views, cols: of the scan.
         heights: slices of each slab, with its halo.
         decided: another slab has already made the decisions that follow from the data.
     """

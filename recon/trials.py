@@ -36,7 +36,6 @@ class Score:
 
     Attributes:
         at: number of its method.
-        method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
         residual_seen: the same of views that it was made from, their mean.
         loses: it lost weak matter that a direct method shows, see `lost_mass`.

@@ -46,7 +46,6 @@ def warm_up(
     Args:
         method: with the settings of the run to come; None: `R2` with its defaults.
         geometry: of the run to come; None: a parallel beam, straight.
-        device: that it will compute on.
         weighted: its rays have weights, or values that are not finite.
         on_kernel: called with the number of functions compiled so far, after each; never if all are cached.
 

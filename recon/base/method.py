@@ -72,9 +72,7 @@ class RunControl:
             methods do not ask.
         on_progress: called about ten times a second, after each iteration, or each sixteen slices of FBP.
         on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
-        checkpoint_every: s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.
-        now: a clock in s.
         decide: keeps the method's decisions by its data, and may follow another run; None: the run decides alone.
         stop_trials: asked after each sweep of the trials by which a method on voxels chooses its weight; True ends
             these alone. None: as `should_stop`.
@@ -96,11 +94,6 @@ class ReconProblem:
 
     Attributes:
         projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
-        geometry: of these views.
-        grid: of the volume.
-        use: weights and views held out.
-        seed: of every random choice.
-        device: to compute on.
     """
 
     projections: F32

@@ -81,8 +81,6 @@ def enhanced(
     A gamma other than 1 moves edges, since half of the grey value is then not half of the attenuation.
 
     Args:
-        volume: [z, y, x].
-        percentiles: see `rescaled`.
         gamma: above 0.
         sigma: of the Gaussian, voxels; 0: none.
 

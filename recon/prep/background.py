@@ -39,9 +39,7 @@ class Background:
     """A polynomial of column and row for each view.
 
     Attributes:
-        order: of the polynomials.
         coefficients: float64 [view, term], of `powers`.
-        shape: (rows, cols) of the detector.
         size: root mean square of the surfaces.
         lowest, highest: of the mean surface over the views.
         before, after: root mean square of binned air, in blocks that the surface was not fitted on.
@@ -71,11 +69,7 @@ class Background:
         return self.level > 0
 
     def remove(self, views: F32, factor: int = 1) -> None:
-        """Subtract the surfaces from views [view, row, col], in place.
-
-        Args:
-            factor: by which their pixels are binned.
-        """
+        """Subtract the surfaces from views [view, row, col], whose pixels are binned by a factor, in place."""
         for view, terms in zip(views, self.coefficients, strict=True):
             view -= surface(terms, self.shape, factor)
 

@@ -113,7 +113,6 @@ class Correction:
 
         Args:
             references: darks and flats of the detector area of the views.
-            settings: None: the defaults.
             masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
             photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`;
                 None: the line integrals are logarithms.
@@ -332,14 +331,7 @@ def correct(
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, by a `Correction` fed at once.
 
     All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
-    Memory beyond the result: a few frames.
-
-    Args:
-        counts, positions, view_ids: of the views in the order they were taken, see `Correction.transmission`.
-        references, settings, masked: see `Correction`.
-
-    Raises:
-        ValueError: as `Correction` and its methods.
+    Memory beyond the result: a few frames. Arguments and errors are those of `Correction` and of its `transmission`.
     """
     correction = Correction(references, settings, masked)
     views = correction.transmission(counts, positions, view_ids)

@@ -103,7 +103,6 @@ def find_dynamic_flats(
 
     Args:
         flats: returns the flats, float32 [row, col] without the dark, one after another; called three times.
-        rng: for parallel analysis.
         masked: bool [row, col], pixels that are not used; None: all are used.
 
     Raises:

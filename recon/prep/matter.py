@@ -84,7 +84,6 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
     """The light of an X-ray tube: the bremsstrahlung of a thick target (Kramers, Phil. Mag. 46, 836, 1923).
 
     Args:
-        kv: voltage.
         filters: mm of each known material before the sample.
 
     Returns:

@@ -53,11 +53,9 @@ class StreamingFit:
     Args:
         template: geometry of all future views, with their shift, roll and tilt; its angles are ignored.
         grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
-        seed: of every random choice.
         gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
         settings: of the fit; `coarse` is for fits whose views are all there.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
-        now: a clock in s.
 
     Raises:
         ValueError: for no Gaussians, settings with `coarse`, or a template whose views differ in shift, roll or tilt.

@@ -60,7 +60,6 @@ def filter_projections(
 
     Args:
         projections: float32 [..., col], line integrals.
-        pixel_pitch: mm.
         filter: the window on the ramp, 1 at zero frequency: none (ram-lak), sinc (shepp-logan), raised cosine (hann).
 
     Returns:
@@ -225,7 +224,6 @@ def fbp(
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
-        geometry: where the views' rays run.
         grid: of the volume; None: one voxel a pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.

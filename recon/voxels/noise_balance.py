@@ -55,7 +55,6 @@ class NoiseBalance:
         noise: of a ray, with which the residual is compared: `noise_level` of the data. For many views it is up to 1.3
             times that (π / 2 times the columns determine a slice). Then little of the noise fits into a volume.
         counted: what no volume explains was known before, and is in the first weight.
-        value: the weight now.
     """
 
     first: float

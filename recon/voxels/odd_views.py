@@ -53,7 +53,6 @@ def odd_views(
     projections: F32,
     geometry: Geometry,
     weights: F32 | RayWeights | None = None,
-    limit: float = LIMIT,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[OddView, ...]:
     """Views in which something crossed the beam or the sample was displaced, found in the differences p - A x.
@@ -65,9 +64,7 @@ def odd_views(
     crack parallel to the rays is sharp in few views only [our own].
 
     Args:
-        projections: [view, row, col].
         weights: of the rays [view, row, col]; those of weight 0 were not measured.
-        limit: score from which a view is odd.
         progress: how many of how many views were compared, of bands of rows by their share.
 
     Returns:
@@ -88,8 +85,8 @@ def odd_views(
         score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD) + edges[place] ** 2, 1))
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
-        if abs(peak) > limit:
-            parts, _ = label(score * math.copysign(1, peak) > _EXTENT * limit)
+        if abs(peak) > LIMIT:
+            parts, _ = label(score * math.copysign(1, peak) > _EXTENT * LIMIT)
             there = np.nonzero(parts == parts[worst])
             spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in there]
             found.append(OddView(int(order[place]), peak, spans[0], spans[1]))

@@ -59,7 +59,6 @@ def unexplained(
 
     Args:
         volume: on the slices of the detector rows, 1/mm.
-        projections: [view, row, col].
         weights: of the rays; rays of weight 0 were not measured, and are not used.
 
     Returns:

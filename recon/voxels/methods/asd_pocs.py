@@ -33,7 +33,6 @@ class AsdPocs:
         goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
         cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. It has about the same
         residual: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "asd-pocs"

@@ -26,9 +26,6 @@ class Cgls:
 
     Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations. From
     there on the residual lags one iteration behind. Memory: 3 volumes, 3 x the projections.
-
-    Attributes:
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "cgls"

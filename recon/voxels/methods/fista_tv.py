@@ -34,7 +34,6 @@ class FistaTv:
             threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
         subsets: of the views, a step each; 1 is FISTA without subsets, which needs about ten times the iterations.
         tv_steps: dual steps of total variation in each step.
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "fista-tv"

@@ -29,7 +29,6 @@ class OsSirtTv:
         momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
             167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
             -0.1 and -1.0 dB: noise comes in sooner, too.
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "os-sirt-tv"

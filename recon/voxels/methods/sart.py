@@ -19,9 +19,6 @@ class Sart:
     """Simultaneous algebraic reconstruction, one view a step in random order (Andersen & Kak 1984).
 
     The relaxation shrinks by `decay` a sweep. Memory: 3 volumes, 3 x the projections.
-
-    Attributes:
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "sart"

@@ -18,11 +18,7 @@ from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
 
 @dataclass(frozen=True)
 class Sirt:
-    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections.
-
-    Attributes:
-        allow_negative: voxels below zero are kept.
-    """
+    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections."""
 
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
