@@ -91,17 +91,12 @@ def kernel_timings(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: 
     slope = np.random.default_rng(1).normal(size=image.shape).astype(np.float32)
     into, centres = Gradients.zeros(n), np.empty((n, 2), np.float32)
     seen = render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch)
-    return [
-        timed("footprints", lambda: view_table(active, view, 0, _FAINT, _SIGMAS), now, repeats, pairs),
-        timed(
-            "forward",
-            lambda: render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch),
-            now,
-            repeats,
-            pairs,
-        ),
-        timed("backward", lambda: seen.backward(slope, into, centres), now, repeats, pairs),
-    ]
+    calls: dict[str, Callable[[], object]] = {
+        "footprints": lambda: view_table(active, view, 0, _FAINT, _SIGMAS),
+        "forward": lambda: render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch),
+        "backward": lambda: seen.backward(slope, into, centres),
+    }
+    return [timed(name, call, now, repeats, pairs) for name, call in calls.items()]
 
 
 def step_timing(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: int = 5, steps: int = 20) -> Timing:

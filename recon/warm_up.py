@@ -112,11 +112,6 @@ def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
     width = 2 * views.sample_pitch
-    blob = Gaussians.from_physical(
-        np.zeros((1, 3)),
-        np.array([width]),
-        np.array([0.2 / width]),
-        density_unit=0.2 / width,
-        kernel=FitSettings().kernel,
-    )
+    size, density = np.array([width]), np.array([0.2 / width])
+    blob = Gaussians.from_physical(np.zeros((1, 3)), size, density, kernel=FitSettings().kernel)
     return project(blob, views).numpy(), views

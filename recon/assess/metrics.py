@@ -12,7 +12,7 @@ from scipy.cluster.vq import kmeans2
 _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _SLAB = 32  # slices at a time
-_MOST = 2**24  # voxels by which regions and their noise are judged
+_MOST = 2**24  # voxels at most that regions and their noise are computed from
 _PART = 2**22  # values whose errors are summed at a time
 
 Array = NDArray[np.floating]

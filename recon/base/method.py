@@ -74,7 +74,7 @@ class RunControl:
         on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.
         decide: keeps the method's decisions by its data, and may follow another run; None: the run decides alone.
-        stop_trials: asked after each sweep of the trials by which a method on voxels chooses its weight; True ends
+        stop_trials: asked after each sweep of the trials that choose a weight of total variation; True ends
             these alone. None: as `should_stop`.
     """
 

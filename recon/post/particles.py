@@ -15,7 +15,7 @@ from recon.base.choices import NECK as NECK
 Labels = NDArray[np.int32]
 
 _GRID = 0.5
-"""Voxels by which the grid makes distances uncertain. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
+"""Error of a distance on the grid, in voxels. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
 are split in error, with it 1. With it 38 of 40 pairs of touching balls are separated, without it 40."""
 
 

@@ -21,7 +21,7 @@ HIGHEST = 3
 LEAST_SIZE = 0.005
 """Root mean square of the surfaces, in line integrals, from which on they are removed by default."""
 
-_SMOOTH = 1.5  # voxels of smoothing, by which weak matter stands out of the noise
+_SMOOTH = 1.5  # voxels; smoothing raises weak matter above the noise
 _SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around matter that count as matter
 _MAD, _CLIPPED = 1.4826, 4.0  # normal standard deviation over median deviation; such deviations
 _BLOCK = 8  # pixels a side: every other block of air is predicted from those between
@@ -105,7 +105,7 @@ def matter(volume: F32, inside: Mask) -> Mask:
 
 
 class AirSums:
-    """Sums of views over their air, by which polynomials of any order are fitted to any number of views."""
+    """Sums of views over their air. They suffice to fit polynomials of any order to any number of views."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
         """For views of a detector (rows, cols), binned by a factor."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.base.kernel import Kernel
+
+_PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +40,8 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        shapes = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw_densities": (n,)}
-        for name, expected in shapes.items():
+        for name, width in _PARAMETERS.items():
+            expected = (n, *width)
             if (found := tuple(getattr(self, name).shape)) != expected:
                 raise ValueError(f"{name} has shape {found}, expected {expected}")
         if not 0 < self.density_unit < float("inf"):
@@ -72,14 +75,8 @@ class Gaussians:
         unit = float(densities.max()) if density_unit is None else density_unit
         if quaternions is None:
             quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-        return cls(
-            _tensor(means),
-            _tensor(np.log(scales)),
-            _tensor(quaternions),
-            _tensor(inverse_softplus(densities / unit)),
-            unit,
-            kernel,
-        )
+        raw = inverse_softplus(densities / unit)
+        return cls(_tensor(means), _tensor(np.log(scales)), _tensor(quaternions), _tensor(raw), unit, kernel)
 
     @property
     def n(self) -> int:
@@ -97,19 +94,12 @@ class Gaussians:
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (a mask or positions), as copies."""
-        return Gaussians(
-            self.means[index],
-            self.log_scales[index],
-            self.quaternions[index],
-            self.raw_densities[index],
-            self.density_unit,
-            self.kernel,
-        )
+        some: dict[str, Any] = {name: getattr(self, name)[index] for name in _PARAMETERS}
+        return replace(self, **some)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The raw parameters as numpy arrays by name."""
-        names = ("means", "log_scales", "quaternions", "raw_densities")
-        return {name: getattr(self, name).detach().cpu().numpy() for name in names}
+        return {name: getattr(self, name).detach().cpu().numpy() for name in _PARAMETERS}
 
     def physical(self) -> dict[str, NDArray[np.float32]]:
         """Centres [n, 3] (x, y, z) and widths [n, 3] in mm, unit quaternions [n, 4] (w, x, y, z), densities [n] 1/mm.

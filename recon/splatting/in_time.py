@@ -26,7 +26,7 @@ _GROWTH = 1.5  # a fit may end with so many times the Gaussians, and filling the
 _SLAB = 16  # slices that are filled to measure it
 _DRAWN = 8  # slices that Gaussians are drawn from to measure it
 _SWEPT_VIEWS = 8
-_COLS = 96  # binned pixels by which the time of a start is estimated
+_COLS = 96  # binned pixels of the views that time a start
 # Work before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a subset,
 # projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3

@@ -27,7 +27,7 @@ _AT_A_TIME = 8  # views of a cone that are projected together
 _BROAD = 3  # cells a side, over which a difference is averaged
 _AROUND, _BESIDE = 12, 3  # views on either side that define the usual difference; nearest ones left out
 _OUTLIER = 3.0  # times their median: largest contribution of one view
-_SHARP = 0.1  # share of the change by a blur of one pixel, by which any volume may miss an edge
+_SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
 _EXTENT = 0.5  # share of the limit above which a cell belongs to the region
 _LEAST_VIEWS = 2 * _AROUND + 1
 
