@@ -35,8 +35,8 @@ class Auto:
     resolution. One of eight views is held out. There is no trial with fewer than 16 views, or with rolled or tilted
     ones: the first candidate takes them. A sample wider than the field, which only a fit models, is not tried either. A
     volume that is too smooth misses the edges of unseen views, one that follows the noise misses them by its noise; so
-    neither is preferred. Where methods are level, the first one is taken that leaves no structure in its own views and
-    does not dull edges (docs/notes/exploration.md).
+    neither is preferred. Where methods are level, the first one is taken that leaves no structure in its own views.
+    docs/choosing.md has all rules and their reasons.
 
     Attributes:
         candidates: the methods, by preference.

@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr, ssim3d
+from recon.base.arrays import F32
 from recon.base.choices import N_GAUSSIANS, SIDE
 from recon.base.geometry import Geometry
-from recon.base.method import Method, RunControl
+from recon.base.method import Clock, Method, RunControl
 from recon.base.volume import Grid
 from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view, view_table
 from recon.kernels.cpu.footprints import HU, HV
@@ -25,9 +25,6 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 
-F32 = NDArray[np.float32]
-Clock = Callable[[], float]
-
 _FAINT, _SIGMAS = 1e-3, 3.5
 
 
@@ -36,7 +33,6 @@ class Timing:
     """The time that a call takes.
 
     Attributes:
-        name: of the timed call.
         ms: median of the repeats.
         spread_ms: between their quartiles.
         pairs: Gaussian-pixel pairs that it computes; 0 without such pairs.
@@ -95,17 +91,12 @@ def kernel_timings(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: 
     slope = np.random.default_rng(1).normal(size=image.shape).astype(np.float32)
     into, centres = Gradients.zeros(n), np.empty((n, 2), np.float32)
     seen = render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch)
-    return [
-        timed("footprints", lambda: view_table(active, view, 0, _FAINT, _SIGMAS), now, repeats, pairs),
-        timed(
-            "forward",
-            lambda: render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch),
-            now,
-            repeats,
-            pairs,
-        ),
-        timed("backward", lambda: seen.backward(slope, into, centres), now, repeats, pairs),
-    ]
+    calls: dict[str, Callable[[], object]] = {
+        "footprints": lambda: view_table(active, view, 0, _FAINT, _SIGMAS),
+        "forward": lambda: render_view(active, view, 0, _FAINT, _SIGMAS, image=image, scratch=scratch),
+        "backward": lambda: seen.backward(slope, into, centres),
+    }
+    return [timed(name, call, now, repeats, pairs) for name, call in calls.items()]
 
 
 def step_timing(now: Clock, n: int = N_GAUSSIANS, side: int = SIDE, repeats: int = 5, steps: int = 20) -> Timing:

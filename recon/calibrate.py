@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.plans import Speeds
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.base.method import RunControl
+from recon.base.method import Clock, RunControl
 from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
@@ -20,10 +20,7 @@ from recon.splatting.initialise import MATTER, default_count, density_unit, firs
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
-from recon.voxels.held_out_weight import choice_sweeps
-
-F32 = NDArray[np.float32]
-Clock = Callable[[], float]
+from recon.voxels.held_out_weight import busiest_rows, choice_sweeps
 
 _SLAB_ROWS, _SLAB_VIEWS = 16, 16
 _COARSE_COLS, _COARSE_VIEWS = 64, 60
@@ -37,12 +34,6 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     The first volume (FBP, or its replacement, see `first_volume`), placing and filling run on a slab of rows. The step
     runs on whole views, with the number of Gaussians that a fit would start from, spread over the matter in a coarse
     first volume: the time of a step depends on how much they overlap.
-
-    Args:
-        projections: [view, row, col], line integrals.
-        geometry: of the views.
-        grid: of the requested volume.
-        now: a clock in s.
 
     Raises:
         ValueError: the scan holds no matter.
@@ -81,16 +72,10 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
 
 def _slab(projections: F32, geometry: Geometry) -> tuple[F32, Geometry]:
     """A few views of the rows with most matter."""
-    rows = geometry.detector_shape[0]
-    height = min(_SLAB_ROWS, rows)
     views = _around(geometry, _SLAB_VIEWS)
-    weight = projections[views].sum(axis=(0, 2), dtype=np.float64)
-    sums = np.convolve(weight, np.ones(height), "valid")
-    first = int(np.argmax(sums))
-    return (
-        np.ascontiguousarray(projections[views, first : first + height]),
-        geometry.select(views).rows(first, first + height),
-    )
+    some = projections[views]
+    rows = busiest_rows(some, _SLAB_ROWS)
+    return np.ascontiguousarray(some[:, rows]), geometry.select(views).rows(rows.start, rows.stop)
 
 
 def _spread_out(projections: F32, geometry: Geometry, count: int) -> Gaussians:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Method, RunControl, candidates_of
+from recon.base.method import Clock, Method, RunControl, candidates_of
 from recon.base.volume import Grid
 from recon.methods import with_settings
 from recon.reconstruction import reconstruct
@@ -25,8 +25,6 @@ from recon.voxels.iterative import IterativeMethod
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
-Clock = Callable[[], float]
-F32 = NDArray[np.float32]
 Decided = Mapping[str, Sequence[Any]]
 
 # Of small runs, at most: with fewer columns the time is not that of voxels and views. Two numbers of views tell what a
@@ -46,7 +44,6 @@ class Extent:
     """The size of a reconstruction.
 
     Attributes:
-        views, cols: of the scan.
         heights: slices of each slab, with its halo.
         decided: another slab has already made the decisions that follow from the data.
     """

@@ -6,13 +6,15 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.assess.edges import edge_steepness
 from recon.assess.lost_mass import compare
+from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.noise import median_deviation
@@ -21,15 +23,11 @@ from recon.voxels.held_out_weight import LEAST_VIEWS, ONE_IN, busiest_rows, slab
 from recon.voxels.projector import Projector
 from recon.voxels.unexplained import LIMIT, unexplained
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # share of the largest line integrals
 _ENOUGH = 0.5  # share of the matter in the fullest rows
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
-_DULL = 0.8  # share of the steepness of another volume that is otherwise as good
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +36,8 @@ class Score:
 
     Attributes:
         at: number of its method.
-        method: that made it.
         residuals: [view], median deviation of each view held out from that of the volume, on rays with matter.
         residual_seen: the same of views that it was made from, their mean.
-        steepness: of its edges, over those of the steepest volume that was tried, see `edge_steepness`.
         loses: it lost weak matter that a direct method shows, see `lost_mass`.
         hides: tells whether it leaves structure in its own views, see `unexplained`; called only if others are level.
     """
@@ -50,7 +46,6 @@ class Score:
     method: Method
     residuals: F64
     residual_seen: float = math.inf
-    steepness: float = 1.0
     loses: bool = False
     hides: Callable[[], bool] = lambda: False
 
@@ -122,12 +117,8 @@ def predicts_best(
             control.on_progress(Progress(done, len(methods), seconds, last, last, 0, n, unit="methods tried"))
 
     def scores() -> list[Score]:
-        steep = edge_steepness([volume for _, volume in found])
         shown = next((volume for score, volume in found if score.method.traits.direct), None)
-        return [
-            replace(score, steepness=edges, loses=shown is not None and _loses(volume, shown))
-            for (score, volume), edges in zip(found, steep, strict=True)
-        ]
+        return [replace(score, loses=shown is not None and _loses(volume, shown)) for score, volume in found]
 
     regular = [at for at in order or range(len(methods)) if at != spare]
     for at in regular:
@@ -141,8 +132,8 @@ def predicts_best(
     judged = scores()
     best, passed = best_of(judged)
     listed = [
-        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views, "
-        f"edges {s.steepness:.2f}{', ' * (s.at in passed)}{passed.get(s.at, '')})"
+        f"{s.method.name}{' with more sweeps' * (s.at == spare)} {s.residual:.4g} ({s.overfit:.2f} of seen views"
+        f"{', ' * (s.at in passed)}{passed.get(s.at, '')})"
         for s in sorted(judged, key=lambda s: s.residual)
     ]
     late = [methods[at].name for at in regular[len(found) + len(refused) :]] if stopped() else []
@@ -163,11 +154,8 @@ def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | No
 
 
 def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
-    """The score to prefer: of those that are level the first that hides nothing and dulls no edges. What loses weak
-    matter is not asked, unless all do.
-
-    A volume has dull edges if another level one has steeper edges without following more noise. Noise makes a volume
-    steeper where edges are soft. Returns it, and for each level one that is passed over the reason, by its number.
+    """The score to prefer: of those that are level the first that hides nothing. What loses weak matter is not asked,
+    unless all do. Returns it, and for each one that is passed over the reason, by its number.
 
     A residual is level with the smallest one if it lies within two of its standard errors (by its scatter over the
     views) and 4 %. The same holds for the penalised residual. The residual alone prefers a volume that lost some noise,
@@ -176,33 +164,25 @@ def best_of(scores: Sequence[Score]) -> tuple[Score, dict[int, str]]:
     """
     passed = {score.at: "loses weak matter" for score in scores if score.loses}
     scores = [score for score in scores if not score.loses] or scores
-    least = min(scores, key=lambda s: s.residual)
+    least, least_penalised = (min(scores, key=attrgetter(name)) for name in ("residual", "penalised"))
     level = [
         score
         for score in sorted(scores, key=lambda s: s.at)
-        if _is_level(score, least, lambda s: s.residual) or _is_level(score, min(scores, key=_penalised), _penalised)
+        if score.residual <= _bound(least, least.residual)
+        or score.penalised <= _bound(least_penalised, least_penalised.penalised)
     ]
     for score in level if len(level) > 1 else ():
-        if any(other.overfit <= score.overfit and score.steepness < _DULL * other.steepness for other in level):
-            passed[score.at] = "dulls edges"
-        elif score.hides():
-            passed[score.at] = "hides structure"
-        else:
+        if not score.hides():
             return score, passed
+        passed[score.at] = "hides structure"
     return least, passed
 
 
-def _penalised(score: Score) -> float:
-    return score.penalised
-
-
-def _is_level(score: Score, least: Score, value: Callable[[Score], float]) -> bool:
-    by_scatter = _ERRORS * _standard_error(least.residuals) / least.residual if least.residual > 0 else 0.0
-    return value(score) <= value(least) * (1 + min(by_scatter, _NEAR - 1))
-
-
-def _standard_error(values: F64) -> float:
-    return float(values.std(ddof=1)) / math.sqrt(values.size) if values.size > 1 else 0.0
+def _bound(least: Score, value: float) -> float:
+    """The largest value that is level with the least one, by the scatter of its residuals over the views."""
+    many = least.residuals.size > 1 and least.residual > 0
+    error = float(least.residuals.std(ddof=1)) / math.sqrt(least.residuals.size) if many else 0.0
+    return value * (1 + min(_ERRORS * error / least.residual if many else 0.0, _NEAR - 1))
 
 
 def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | None, str]:
@@ -220,11 +200,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
         if rows <= height:
             return problem, "all rows"
         slab = busiest_rows(masked(data[:: max(1, len(data) // 8)])[0], height)
-        views, grid = slab_of(geometry, problem.grid, slab.start, slab.stop)
-        use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, slab]))
-        cut = np.ascontiguousarray(data[:, slab])
-        where = f"rows {slab.start} to {slab.stop - 1}"
-        return replace(problem, projections=cut, geometry=views, grid=grid, use=use), where
+        return _of_rows(problem, slab, *slab_of(geometry, problem.grid, slab.start, slab.stop))
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"
     middle = _middle_rows(problem, height)
@@ -240,7 +216,7 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
 
 def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
     """So many rows in the middle of a cone and the box that holds their rays; None if they have little matter."""
-    geometry, grid, weights = problem.geometry, problem.grid, problem.use.weights
+    geometry, grid = problem.geometry, problem.grid
     first = round(geometry.axis_row - (height - 1) / 2)
     rows = slice(first, first + height)
     moved = np.abs(geometry.shifts[:, 1]).max() > 1
@@ -253,9 +229,14 @@ def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str]
     tall = (height + 1) * geometry.sample_pitch * (1 + geometry.reach / geometry.sod)  # at the far side of the field
     slices = math.ceil(tall / grid.spacing[0])
     box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
+    return _of_rows(problem, rows, views, box)
+
+
+def _of_rows(problem: ReconProblem, rows: slice, views: Geometry, grid: Grid) -> tuple[ReconProblem, str]:
+    weights = problem.use.weights
     use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, rows]))
     cut = np.ascontiguousarray(problem.projections[:, rows])
-    part = replace(problem, projections=cut, geometry=views, grid=box, use=use)
+    part = replace(problem, projections=cut, geometry=views, grid=grid, use=use)
     return part, f"rows {rows.start} to {rows.stop - 1}"
 
 

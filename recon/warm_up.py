@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numba.core import event
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method
 from recon.base.volume import Grid
-from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.engine import Active, Gradients, grid_layout
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
@@ -46,7 +46,6 @@ def warm_up(
     Args:
         method: with the settings of the run to come; None: `R2` with its defaults.
         geometry: of the run to come; None: a parallel beam, straight.
-        device: that it will compute on.
         weighted: its rays have weights, or values that are not finite.
         on_kernel: called with the number of functions compiled so far, after each; never if all are cached.
 
@@ -81,7 +80,7 @@ def warm_up_rest() -> None:
 
 @contextmanager
 def _counted(on_kernel: Callable[[int], None]) -> Iterator[None]:
-    class Counter(event.Listener):  # type: ignore[misc]
+    class Counter(event.Listener):
         n = 0
 
         def on_start(self, compilation: Any) -> None:
@@ -113,11 +112,6 @@ def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
     width = 2 * views.sample_pitch
-    blob = Gaussians.from_physical(
-        np.zeros((1, 3)),
-        np.array([width]),
-        np.array([0.2 / width]),
-        density_unit=0.2 / width,
-        kernel=FitSettings().kernel,
-    )
+    size, density = np.array([width]), np.array([0.2 / width])
+    blob = Gaussians.from_physical(np.zeros((1, 3)), size, density, kernel=FitSettings().kernel)
     return project(blob, views).numpy(), views

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.steps.air import Surface
+from recon.base.arrays import Mask
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
-from recon.prep.background import AirSums, Background, Mask, matter
+from recon.prep.background import AirSums, Background, matter
 from recon.splatting.initialise import first_volume
 from recon.voxels.projector import Projector
 

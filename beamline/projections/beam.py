@@ -6,7 +6,8 @@ import re
 
 import numpy as np
 
-from recon.prep.matter import F64, mass_attenuation, tube_spectrum
+from recon.base.arrays import F64
+from recon.prep.matter import mass_attenuation, tube_spectrum
 
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 

@@ -33,7 +33,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
 from drivers.base.frame import FrameKind
-from recon.base.masks import Mask
+from recon.base.arrays import Mask
 from recon.prep.correct import Correction, CorrectionSettings, Projections, References, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
 from recon.prep.defects import SHADOW_REACH, shadowed

@@ -7,11 +7,12 @@ import math
 import numpy as np
 
 from beamline.projections.steps.hardening import Hardening
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import k_means
-from recon.prep.hardening import F32, Curve, NoCurveError, curve_of_paths, curve_of_spectrum
+from recon.prep.hardening import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
 from recon.reconstruction import reconstruct
 from recon.voxels.projector import project
 

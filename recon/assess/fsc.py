@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-F64 = NDArray[np.float64]
+from recon.base.arrays import F64
 
-FIXED_THRESHOLD = 0.143
-"""Correlation of half sets at which the whole set correlates to 0.5 with the truth (Rosenthal & Henderson 2003)."""
-
+_EDGE = 0.2  # of the half axis
 _TAPERED_FROM = 8  # voxels; a shorter axis is too short for a soft edge
 
 
@@ -40,11 +38,6 @@ class ShellCorrelation:
         return (0.2071 + 1.9102 / root) / (1.2071 + 0.9102 / root)
 
     @property
-    def fixed(self) -> F64:
-        """[shell]: 0.143 everywhere."""
-        return np.full(self.frequency.shape, FIXED_THRESHOLD)
-
-    @property
     def resolution_mm(self) -> float:
         """Full period, in mm, at the half-bit criterion; see `crossing`."""
         return self.crossing(self.half_bit)
@@ -67,24 +60,16 @@ class ShellCorrelation:
         return 1 / float(self.frequency[first - 1] + share * (self.frequency[first] - self.frequency[first - 1]))
 
 
-def soft_cylinder(shape: tuple[int, int, int], edge: float = 0.2) -> NDArray[np.float32]:
+def soft_cylinder(shape: tuple[int, int, int]) -> NDArray[np.float32]:
     """A mask [z, y, x]: 1 inside the cylinder that every view sees, with a raised-cosine edge to 0.
 
-    Without a soft edge the outline of the field, which both volumes share, correlates at every frequency.
-
-    Args:
-        shape: shape of the volume.
-        edge: width of the edge as a fraction of the half axis, along the radius and along z; 0 leaves a hard cylinder.
-
-    Raises:
-        ValueError: for an edge outside 0..1.
+    The edge takes a fifth of the half axis, along the radius and along z. Without it the outline of the field, which
+    both volumes share, correlates at every frequency.
     """
-    if not 0 <= edge <= 1:
-        raise ValueError(f"the edge is a fraction of the half axis, 0 to 1, got {edge}")
     nz, ny, nx = shape
     along = np.abs(_centred(nz)) if nz >= _TAPERED_FROM else np.zeros(nz)
     radius = np.hypot(_centred(ny)[:, None] * ny, _centred(nx)[None, :] * nx) / min(ny, nx)
-    return (_fall(along, edge)[:, None, None] * _fall(radius, edge)[None]).astype(np.float32)
+    return (_fall(along)[:, None, None] * _fall(radius)[None]).astype(np.float32)
 
 
 def _centred(n: int) -> F64:
@@ -92,11 +77,9 @@ def _centred(n: int) -> F64:
     return (2 * np.arange(n) + 1 - n) / n
 
 
-def _fall(distance: F64, edge: float) -> F64:
+def _fall(distance: F64) -> F64:
     """1 inside, 0 beyond a distance of 1, half a period of a cosine between."""
-    if edge == 0:
-        return (distance <= 1).astype(np.float64)
-    return 0.5 + 0.5 * np.cos(np.pi * np.clip((distance - 1 + edge) / edge, 0, 1))
+    return 0.5 + 0.5 * np.cos(np.pi * np.clip((distance - 1 + _EDGE) / _EDGE, 0, 1))
 
 
 def fourier_shell_correlation(

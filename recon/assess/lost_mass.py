@@ -6,12 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening, find_objects, gaussian_filter, label
 
+from recon.base.arrays import F32
 from recon.base.noise import air_level
-
-F32 = NDArray[np.float32]
 
 _BLOCKS = 96  # blocks of a volume along its longest side, at most
 _SMOOTH, _SIGMAS = 1.5, 5.0  # blocks; of air

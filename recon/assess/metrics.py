@@ -12,7 +12,7 @@ from scipy.cluster.vq import kmeans2
 _WINDOW, _SIGMA = 11, 1.5
 _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _SLAB = 32  # slices at a time
-_MOST = 2**24  # voxels by which regions and their noise are judged
+_MOST = 2**24  # voxels at most that regions and their noise are computed from
 _PART = 2**22  # values whose errors are summed at a time
 
 Array = NDArray[np.floating]
@@ -153,14 +153,13 @@ def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[
     )
 
 
-def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np.int8]:
+def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     """Dense and empty regions by k-means with k = 2 on the voxel values, within the inscribed cuboid.
 
     Args:
         volume: [z, y, x], with enough contrast to separate the two regions. The mask also serves for other volumes of
         the same sample.
         seed: of the sample and of the k-means++ start.
-        margin: see `inscribed_cuboid`.
 
     Returns:
         int8 [z, y, x]: 1 dense, 0 empty, -1 outside the cuboid (not used).
@@ -168,7 +167,7 @@ def kmeans_mask(volume: Array, seed: int = 0, margin: float = 0.1) -> NDArray[np
     Raises:
         ValueError: where all voxels have the same value or some are not finite.
     """
-    box = inscribed_cuboid(volume.shape, margin)
+    box = inscribed_cuboid(volume.shape)
     values = volume[box]
     if not all(np.isfinite(image).all() for image in values):
         raise ValueError("the volume holds NaN or infinite values")

@@ -82,7 +82,6 @@ class Preset:
     """Settings of a fit for one of the quality levels.
 
     Attributes:
-        steps: number of steps of the fit.
         share: Gaussians at the start, relative to the default number for the volume.
     """
 
@@ -163,8 +162,6 @@ def plans(budget: float, speeds: Speeds, largest_binning: int, methods: Collecti
 
     Args:
         budget: s for everything: FBP, placing, steps, finish and filling the volume.
-        speeds: times of this machine and scan.
-        largest_binning: largest binning that the detector allows.
         methods: names of the methods to consider; None: all with a measured curve.
 
     Raises:

@@ -16,7 +16,6 @@ class Decisions:
     that `made` does not hold are then made.
 
     Attributes:
-        seed: of every random choice.
         made: so far, by name; plain numbers and lists of them.
     """
 

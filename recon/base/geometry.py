@@ -23,14 +23,15 @@ import math
 import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon.base.arrays import F64
 from recon.base.picture import fan, html
 
-F64 = NDArray[np.float64]
-
+_OF_VIEWS = "angles", "shifts", "roll", "tilt"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
 _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width do not reach the source
 
@@ -47,7 +48,7 @@ class Geometry:
         axis_col, axis_row: where the rotation axis and the height z = 0 fall on the detector (a cone: its central ray).
             In pixels from 0 at the centre of the first column, row.
         sod, sdd: mm from the source to the rotation axis and to the detector; both infinite for a parallel beam.
-        shifts: float64 [view, 2], pixels (col, row) by which each view is displaced.
+        shifts: float64 [view, 2], displacement of each view in pixels (col, row).
         roll: float64 [view], radians; the detector turned about the beam: its columns run along u cos + v sin.
         tilt: float64 [view], radians; the rotation axis leaning along the beam: rows then run along v cos + d sin.
     """
@@ -205,14 +206,11 @@ class Geometry:
         Raises:
             ValueError: for no views.
         """
-        theta = np.atleast_1d(self.angles[views])
-        if theta.size == 0:
+        chosen = np.atleast_1d(np.arange(self.n_views)[views])
+        if chosen.size == 0:
             raise ValueError("no views are selected")
-        shifts = np.atleast_2d(self.shifts[views])
-        roll, tilt = np.atleast_1d(self.roll[views]), np.atleast_1d(self.tilt[views])
-        return replace(
-            self, angles=_frozen(theta), shifts=_frozen(shifts), roll=_frozen(roll), tilt=_frozen(tilt)
-        )  # fmt: skip
+        some: dict[str, Any] = {name: _frozen(getattr(self, name)[chosen]) for name in _OF_VIEWS}
+        return replace(self, **some)
 
     def at(self, angles: ArrayLike) -> Geometry:
         """The same set-up at other angles (radians), with the shift, roll and tilt common to all views.
@@ -235,14 +233,10 @@ class Geometry:
 
     def followed_by(self, other: Geometry) -> Geometry:
         """The views of this geometry, then those of another one of the same set-up."""
-
-        def both(mine: F64, others: F64) -> F64:
-            return _frozen(np.concatenate((mine, others)))
-
-        return replace(
-            self, angles=both(self.angles, other.angles), shifts=both(self.shifts, other.shifts),
-            roll=both(self.roll, other.roll), tilt=both(self.tilt, other.tilt),
-        )  # fmt: skip
+        both: dict[str, Any] = {
+            name: _frozen(np.concatenate((getattr(self, name), getattr(other, name)))) for name in _OF_VIEWS
+        }
+        return replace(self, **both)
 
     def straightened(self) -> Geometry:
         """The same views without roll and tilt."""

@@ -11,16 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
-import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 
-F32 = NDArray[np.float32]
 Plain = str | int | float
+Clock = Callable[[], float]
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,9 @@ class RunControl:
             methods do not ask.
         on_progress: called about ten times a second, after each iteration, or each sixteen slices of FBP.
         on_checkpoint: gets the checkpoint of a fit every `checkpoint_every` s.
-        checkpoint_every: s.
         resume: the checkpoint of a fit with the same data and settings, which is continued.
-        now: a clock in s.
         decide: keeps the method's decisions by its data, and may follow another run; None: the run decides alone.
-        stop_trials: asked after each sweep of the trials by which a method on voxels chooses its weight; True ends
+        stop_trials: asked after each sweep of the trials that choose a weight of total variation; True ends
             these alone. None: as `should_stop`.
     """
 
@@ -85,7 +83,7 @@ class RunControl:
     on_checkpoint: Callable[[Mapping[str, NDArray[Any]]], None] | None = None
     checkpoint_every: float = 60.0
     resume: Mapping[str, NDArray[Any]] | None = None
-    now: Callable[[], float] = time.perf_counter
+    now: Clock = time.perf_counter
     decide: Decisions | None = None
     stop_trials: Callable[[], bool] | None = None
 
@@ -96,11 +94,6 @@ class ReconProblem:
 
     Attributes:
         projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
-        geometry: of these views.
-        grid: of the volume.
-        use: weights and views held out.
-        seed: of every random choice.
-        device: to compute on.
     """
 
     projections: F32

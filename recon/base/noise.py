@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter
 from scipy.signal import find_peaks
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 _MEDIAN = 0.6745  # median of |x| for a normal variable x with standard deviation 1
 _VIEWS = 16  # looked at
@@ -42,7 +42,7 @@ def noise_level(images: F32) -> float:
     Returns:
         The standard deviation; 0 if both axes are too short.
     """
-    some, axes = _sample(images), len(_long_axes(images))
+    some, axes = images[:: max(1, len(images) // _VIEWS)][:_VIEWS], len(_long_axes(images))
     low, high = _differences(some, _LOW), _differences(some, _HIGH)
     if low == 0:
         return 0.0
@@ -104,10 +104,6 @@ def air_level(values: F32) -> tuple[float, float]:
         level = float(np.median(near))
         noise = min(median_deviation(near - level), _GROWTH * first)
     return level, noise
-
-
-def _sample(images: F32) -> F32:
-    return images[:: max(1, len(images) // _VIEWS)][:_VIEWS]
 
 
 def _long_axes(images: F32) -> list[int]:

@@ -48,13 +48,9 @@ def slabs_of(slices: int, height: int, halo: int) -> list[Slab]:
 
 
 def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geometry, Grid]:
-    """The detector rows that show these slices in any view, the geometry of these rows, and the slices' grid in it.
+    """The detector rows that show these slices of the whole volume, their geometry, and the slices' grid in it.
 
-    Views shifted along the axis also see slices outside this grid at the edges of the rows.
-
-    Args:
-        geometry: a parallel beam, straight.
-        grid: of the whole volume.
+    For a parallel beam, straight. Shifted views also see slices outside this grid at the edges of the rows.
     """
     z = grid.coordinates()[0][slices] / geometry.pixel_pitch + geometry.axis_row
     shifts, last = geometry.shifts[:, 1], geometry.detector_shape[0] - 1

@@ -27,7 +27,6 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
     - `every:K`: one of K views, in the order taken.
 
     Args:
-        spec: the selection.
         angles: [view], radians, in the order taken.
         seed: for `random:N` without a seed in the text.
         period: radians after which views see the same rays, see `Geometry.period`; by default those of a parallel beam

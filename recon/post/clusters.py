@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import ClusterError, kmeans2
 
-F64 = NDArray[np.float64]
+from recon.base.arrays import F64
 
 _SAMPLE = 20_000  # values from which centres are computed
 _STARTS = 8

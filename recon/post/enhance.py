@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from recon.base.arrays import F32
 from recon.post.clusters import k_means
 
-F32 = NDArray[np.float32]
 Box = tuple[slice, slice, slice]
 
 _SAMPLE = 4_000_000  # voxels from which percentiles are computed
@@ -82,8 +81,6 @@ def enhanced(
     A gamma other than 1 moves edges, since half of the grey value is then not half of the attenuation.
 
     Args:
-        volume: [z, y, x].
-        percentiles: see `rescaled`.
         gamma: above 0.
         sigma: of the Gaussian, voxels; 0: none.
 

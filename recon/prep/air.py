@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 _BANDS = 8  # of rows, at most
 
 
 def edge_profiles(transmission: F32) -> F32:
-    """Input of `air_columns` from each view: medians [view, side, band of rows, column from the edge].
-
-    Args:
-        transmission: float32 [view, row, col].
-    """
+    """Input of `air_columns`, by transmissions [view, row, col]: medians [view, side, band of rows, col from edge]."""
     _, rows, cols = transmission.shape
     bands = [b for b in np.array_split(np.arange(rows), min(rows, _BANDS)) if b.size]
     widest = max(cols // 8, 1)
@@ -33,11 +28,7 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
     Air columns are nowhere darker than the outermost ones by more than the tolerance (or the noise, if larger). This
     holds in every view, over the whole height. A sample that fills the view is thinnest at the edge, so a trend towards
     darker is sample; a slow trend towards brighter is the beam. A side of fewer than 4 % of the columns, or darker than
-    the other side by more than 10 %, counts as 0.
-
-    Args:
-        profiles: of all views, see `edge_profiles`.
-        cols: of the detector.
+    the other side by more than 10 %, counts as 0. For the `edge_profiles` of all views.
     """
     least = max(3, cols // 25)
     counts, levels = [], []

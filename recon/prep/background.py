@@ -10,14 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter
 
+from recon.base.arrays import F32, F64, Mask
 from recon.base.noise import air_level
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HIGHEST = 3
 """Order of the polynomials in column and row, at most."""
@@ -25,7 +21,7 @@ HIGHEST = 3
 LEAST_SIZE = 0.005
 """Root mean square of the surfaces, in line integrals, from which on they are removed by default."""
 
-_SMOOTH = 1.5  # voxels of smoothing, by which weak matter stands out of the noise
+_SMOOTH = 1.5  # voxels; smoothing raises weak matter above the noise
 _SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around matter that count as matter
 _MAD, _CLIPPED = 1.4826, 4.0  # normal standard deviation over median deviation; such deviations
 _BLOCK = 8  # pixels a side: every other block of air is predicted from those between
@@ -43,9 +39,7 @@ class Background:
     """A polynomial of column and row for each view.
 
     Attributes:
-        order: of the polynomials.
         coefficients: float64 [view, term], of `powers`.
-        shape: (rows, cols) of the detector.
         size: root mean square of the surfaces.
         lowest, highest: of the mean surface over the views.
         before, after: root mean square of binned air, in blocks that the surface was not fitted on.
@@ -75,11 +69,7 @@ class Background:
         return self.level > 0
 
     def remove(self, views: F32, factor: int = 1) -> None:
-        """Subtract the surfaces from views [view, row, col], in place.
-
-        Args:
-            factor: by which their pixels are binned.
-        """
+        """Subtract the surfaces from views [view, row, col], whose pixels are binned by a factor, in place."""
         for view, terms in zip(views, self.coefficients, strict=True):
             view -= surface(terms, self.shape, factor)
 
@@ -115,7 +105,7 @@ def matter(volume: F32, inside: Mask) -> Mask:
 
 
 class AirSums:
-    """Sums of views over their air, by which polynomials of any order are fitted to any number of views."""
+    """Sums of views over their air. They suffice to fit polynomials of any order to any number of views."""
 
     def __init__(self, shape: tuple[int, int], factor: int) -> None:
         """For views of a detector (rows, cols), binned by a factor."""

@@ -2,64 +2,24 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.masks import Image, Mask, fill, plan_fill
+from recon.base.arrays import Mask
+from recon.base.masks import Image, fill, plan_fill
 from recon.prep.air import air_columns, air_light, edge_profiles
 from recon.prep.counts import Photons, of_view
 from recon.prep.defects import dead_pixels, zingers
-from recon.prep.dynamic_flats import DynamicFlats
+from recon.prep.references import References as References
+from recon.prep.references import check, flat_at
 
 
 class UnlitViewsError(ValueError):
     """The air columns of some views are dark."""
-
-
-@dataclass(frozen=True, eq=False)
-class References:
-    """Darks and flats: the images without beam, and with beam but without a sample.
-
-    A stack of frames [frame, row, col], any real type, is replaced by its mean.
-
-    Attributes:
-        dark: float32 [row, col], mean or median of the darks; or all darks, as a stack.
-        flats: (position, float32 [row, col]) of each group of flats, or (position, stack); the position counts frames
-            of the scan.
-        dynamic: how flats differ from one another; None: a view's flat is interpolated between groups.
-        part_starts: ascending, the first frame of each part of the scan. A view's flat comes from the flats of its own
-        part, or from the nearest group if its part has no flats.
-    """
-
-    dark: Image
-    flats: tuple[tuple[float, Image], ...]
-    dynamic: DynamicFlats | None = None
-    part_starts: tuple[int, ...] = (0,)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "dark", _mean(self.dark, "darks"))
-        flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
-        object.__setattr__(self, "flats", flats)
-
-    def rows(self, rows: slice) -> References:
-        """The same of some detector rows."""
-        flats = tuple((position, flat[rows]) for position, flat in self.flats)
-        dynamic = None if self.dynamic is None else self.dynamic.rows(rows)
-        return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
-
-
-def _mean(frames: Image, what: str) -> Image:
-    """The mean of a stack; an image is returned as it is."""
-    if np.ndim(frames) != 3:
-        return frames
-    if not len(frames):
-        raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
-    return np.asarray(np.mean(frames, axis=0, dtype=np.float64), np.float32)
 
 
 @dataclass(frozen=True)
@@ -117,19 +77,6 @@ class Projections:
     weights: NDArray[np.float32] | None = None
 
 
-def _flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
-    """Net flat at a frame's position: interpolated between groups of its part; beyond them, the nearest group."""
-    part = bisect_right(part_starts, position)
-    own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
-    groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
-    at = [p for p, _ in groups]
-    upper = int(np.searchsorted(at, position))
-    if upper == 0 or upper == len(groups):
-        return groups[min(upper, len(groups) - 1)][1]
-    weight = np.float32((position - at[upper - 1]) / (at[upper] - at[upper - 1]))
-    return groups[upper - 1][1] * (1 - weight) + groups[upper][1] * weight
-
-
 @dataclass(frozen=True, eq=False)
 class Transmission:
     """Views divided by the flat, before the correction of air and zingers.
@@ -166,7 +113,6 @@ class Correction:
 
         Args:
             references: darks and flats of the detector area of the views.
-            settings: None: the defaults.
             masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
             photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`;
                 None: the line integrals are logarithms.
@@ -175,8 +121,11 @@ class Correction:
             ValueError: for shapes that do not fit, no flats, or no beam in the flats.
         """
         self._settings = CorrectionSettings() if settings is None else settings
-        _check(references, self._settings)
+        check(references)
         self._dark = np.asarray(references.dark, np.float32)
+        air, cols = self._settings.air, self._dark.shape[1]
+        if isinstance(air, tuple) and not (min(air) >= 0 and 0 < sum(air) <= cols):
+            raise ValueError(f"air columns (left, right) {air} do not fit {cols} columns")
         if masked is not None and np.shape(masked) != self._dark.shape:
             raise ValueError(f"masked must have shape {self._dark.shape}, got {np.shape(masked)}")
         if masked is None:
@@ -261,7 +210,7 @@ class Correction:
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
-        between = _flat_at(position, self._flats, self._part_starts)
+        between = flat_at(position, self._flats, self._part_starts)
         if self._dynamic is None:
             return between
         live = ~self.masked
@@ -382,14 +331,7 @@ def correct(
     """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, by a `Correction` fed at once.
 
     All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
-    Memory beyond the result: a few frames.
-
-    Args:
-        counts, positions, view_ids: of the views in the order they were taken, see `Correction.transmission`.
-        references, settings, masked: see `Correction`.
-
-    Raises:
-        ValueError: as `Correction` and its methods.
+    Memory beyond the result: a few frames. Arguments and errors are those of `Correction` and of its `transmission`.
     """
     correction = Correction(references, settings, masked)
     views = correction.transmission(counts, positions, view_ids)
@@ -414,17 +356,3 @@ def merge_and_empty(parts: list[Projections]) -> Projections:
         data[at : at + len(part)] = part
         at += len(part)
     return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)
-
-
-def _check(references: References, settings: CorrectionSettings) -> None:
-    if not references.flats:
-        raise ValueError("there is no flat: without one, counts cannot be converted to line integrals")
-    shape = np.shape(references.dark)
-    for position, flat in references.flats:
-        if np.shape(flat) != shape or len(shape) != 2:
-            raise ValueError(f"the dark has shape {shape}, the flat at {position:g} {np.shape(flat)}")
-    at = sorted(p for p, _ in references.flats)
-    if len(set(at)) < len(at) or not np.isfinite(at).all():
-        raise ValueError(f"each group of flats needs a position of its own, got {at}; average the flats taken together")
-    if isinstance(settings.air, tuple) and not (min(settings.air) >= 0 and 0 < sum(settings.air) <= shape[1]):
-        raise ValueError(f"air columns (left, right) {settings.air} do not fit {shape[1]} columns")

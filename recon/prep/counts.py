@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from recon.base.arrays import F32, F64
 
 # Smoothing of the counts around which the likelihood is expanded, in pixels. Chosen from 1, 1.5, 2 and 3 by the error
 # of the expansion on three samples at 10 to 10 000 photons (docs/notes/exploration.md). So are the other two.

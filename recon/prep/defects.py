@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.masks import NEIGHBOURS, Image, Mask
+from recon.base.arrays import Mask
+from recon.base.masks import NEIGHBOURS, Image
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median

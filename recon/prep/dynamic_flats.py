@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from recon.base.arrays import F32, F64
 
 _FEWEST = 4  # flats
 _MOST = 10  # components
@@ -104,7 +103,6 @@ def find_dynamic_flats(
 
     Args:
         flats: returns the flats, float32 [row, col] without the dark, one after another; called three times.
-        rng: for parallel analysis.
         masked: bool [row, col], pixels that are not used; None: all are used.
 
     Raises:

@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from recon.base.arrays import F32, F64
 
 _NODES = 2048
 _FEWEST_RAYS, _MOST_RAYS = 100, 5000

@@ -14,11 +14,10 @@ from types import MappingProxyType
 
 import numpy as np
 import xraylib
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from recon.base.arrays import F64
 from recon.prep.phase import HC
-
-F64 = NDArray[np.float64]
 
 _LEAST_KEV, _MOST_KEV = 0.1, 800.0
 _DECREMENT = 0.0004151791  # keV² cm³/mol: classical electron radius x (hc)² x Avogadro's number / 2 pi
@@ -85,7 +84,6 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
     """The light of an X-ray tube: the bremsstrahlung of a thick target (Kramers, Phil. Mag. 46, 836, 1923).
 
     Args:
-        kv: voltage.
         filters: mm of each known material before the sample.
 
     Returns:

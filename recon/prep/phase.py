@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import config
-from numpy.typing import NDArray
 from scipy import fft
 
-F32 = NDArray[np.float32]
+from recon.base.arrays import F32
 
 HC = 1.239841984e-6
 """keV mm: wavelength in mm times photon energy (CODATA 2018)."""
@@ -46,11 +45,7 @@ class Paganin:
         return math.ceil(_REACH * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
 
     def retrieve(self, views: F32, floor: float) -> None:
-        """Replace measured line integrals [view, row, col] by those of the sample, in place.
-
-        Args:
-            floor: lowest transmission that counts.
-        """
+        """Replace measured line integrals [view, row, col] by those of the sample, in place; `floor`: least light."""
         along = [(np.arange(n) / (2 * n)) ** 2 for n in views.shape[1:]]  # of the cosines of a mirrored frame
         f2 = along[0][:, None] + along[1]
         gain = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)

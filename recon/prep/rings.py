@@ -16,15 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from recon.base.arrays import F32
 from recon.base.choices import Rings
 
-F32 = NDArray[np.float32]
-
 _ROBUST = 1.4826  # median deviation to standard deviation, for normal values
-_FAR = 3.0  # standard deviations by which a column differs from its neighbours (Vo 2018: snr 3)
+_FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
 _FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more than they remove
 _MOST = 0.1  # of the columns
-_EVEN = 0.4  # share of a shift by which it may differ from view to view (standard deviation)
+_EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
 _SEEN = 4.5  # `stripe_score` from which on there are stripes: 1.4 to 3.6 without, 5 to 10 in two real scans
 _LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
 

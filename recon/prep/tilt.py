@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from recon.prep.align import opposite_curves, wedge_curves
-
-F64 = NDArray[np.float64]
+from recon.base.arrays import F64
+from recon.prep.align import opposite_curves
+from recon.prep.axis_wedge import wedge_curves
 
 STEEPEST = math.radians(5)
 """Largest tilt of the search, radians."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from recon.kernels.cpu.activation import F32
+from recon.base.arrays import F32
 
 _NEWEST = 0.2  # this share of the views counts as the newest
 

@@ -12,12 +12,12 @@ from typing import Any, Protocol, SupportsFloat, TypeVar
 
 import numpy as np
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid
 from recon.kernels.cpu import losses as losses_cpu
-from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.adam import adam_all, add_lengths
 from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, grid_layout, render_view
 from recon.kernels.cpu.losses import ABSOLUTE, DataTerm
@@ -136,6 +136,8 @@ def backend_for(device: str) -> Backend[Any]:
 class Cpu:
     """The numba kernels on numpy arrays."""
 
+    adam, add_lengths = staticmethod(adam_all), staticmethod(add_lengths)
+
     def __init__(self) -> None:
         self._scratch: tuple[tuple[int, tuple[int, int]], Scratch] | None = None
 
@@ -168,21 +170,6 @@ class Cpu:
     def total_variation(self, volume: F32, weight: float) -> tuple[float, F32]:
         gradient = np.empty_like(volume)
         return losses_cpu.total_variation(volume, gradient, weight), gradient
-
-    def add_lengths(self, vectors: F32, factor: float, sums: F32) -> None:
-        add_lengths(vectors, factor, sums)
-
-    def adam(
-        self,
-        parameters: Sequence[F32],
-        gradients: Sequence[F32],
-        first: Sequence[F32],
-        second: Sequence[F32],
-        rates: Sequence[float],
-        step: int,
-        bounds: Sequence[tuple[float, float] | None],
-    ) -> None:
-        adam_all(parameters, gradients, first, second, rates, step, bounds)
 
 
 class CpuPass:

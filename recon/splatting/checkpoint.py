@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -46,22 +45,26 @@ def arrays_of(state: FitState, backend: Backend[Any] | None = None) -> dict[str,
 def state_from(arrays: Mapping[str, NDArray[Any]], backend: Backend[Any] | None = None) -> FitState:
     """The inverse of `arrays_of`: the fit continues as if it had not been interrupted.
 
-    Without `kernel_exponent` the kernel is Gaussian.
-
     Raises:
         ValueError: arrays are missing, disagree in length, or hold values that are not finite.
     """
-    device, arrays = backend or Cpu(), {"kernel_exponent": np.array(math.inf), **arrays}
+    device = backend or Cpu()
     groups = ("parameters", "first", "second")
     wanted = [f"{group}.{name}" for group in groups for name in NAMES]
-    missing = [k for k in (*wanted, "statistic", "counts", "scalars", "drawn", "generator") if k not in arrays]
+    others = ("statistic", "counts", "scalars", "kernel_exponent", "drawn", "generator")
+    missing = [key for key in (*wanted, *others) if key not in arrays]
     if missing:
         raise ValueError(f"this is not a checkpoint of a fit: {missing} are missing")
     n = len(arrays["parameters.raw"])
     widths = {"means": (n, 3), "log_scales": (n, 3), "quaternions": (n, 4), "raw": (n,)}
     shapes: dict[str, tuple[int, ...]] = {key: widths[key.split(".")[1]] for key in wanted}
-    shapes |= {"statistic": (n,), "counts": (len(_COUNTS),), "scalars": (len(_SCALARS),), "generator": (_WORDS + 2,)}
-    shapes["kernel_exponent"] = ()
+    shapes |= {
+        "statistic": (n,),
+        "counts": (len(_COUNTS),),
+        "scalars": (len(_SCALARS),),
+        "generator": (_WORDS + 2,),
+        "kernel_exponent": (),
+    }
     for key, shape in shapes.items():
         if np.shape(arrays[key]) != shape:
             raise ValueError(f"{key} of the checkpoint has shape {np.shape(arrays[key])}, expected {shape}")

@@ -8,16 +8,16 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.kernels.cpu.activation import F32
+from recon.base.arrays import F32
 
-# Standard deviations, along the longest axis, by which each half of a split moves from the centre.
+# Each half of a split moves this far from the centre, in standard deviations along the longest axis.
 _APART = 0.75
 
 # Standard deviations (of the longest axis) outside the box beyond which a Gaussian is removed. The tail of a nearer one
 # is part of the views: without it, matter at the border is lost (0.05 to 0.16 dB, measured).
 _LOST = 3.0
 
-_PUBLISHED_SHRINK = 1.6  # by which the published split makes both halves narrower
+_PUBLISHED_SHRINK = 1.6  # the published split divides the widths of both halves by this
 
 Rule = Literal["mass", "published"]
 

@@ -6,10 +6,10 @@ from typing import Protocol, runtime_checkable
 
 from recon.base.choices import Start
 from recon.base.geometry import Geometry
-from recon.base.method import Method
+from recon.base.method import Clock, Method
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
-from recon.splatting.stream import Clock, StreamingFit
+from recon.splatting.stream import StreamingFit
 
 
 @runtime_checkable

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.base.kernel import Kernel
+
+_PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +40,10 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]
-        shapes = {
-            "means": (self.means.shape, (n, 3)),
-            "log_scales": (self.log_scales.shape, (n, 3)),
-            "quaternions": (self.quaternions.shape, (n, 4)),
-            "raw_densities": (self.raw_densities.shape, (n,)),
-        }
-        for name, (found, expected) in shapes.items():
-            if tuple(found) != expected:
-                raise ValueError(f"{name} has shape {tuple(found)}, expected {expected}")
+        for name, width in _PARAMETERS.items():
+            expected = (n, *width)
+            if (found := tuple(getattr(self, name).shape)) != expected:
+                raise ValueError(f"{name} has shape {found}, expected {expected}")
         if not 0 < self.density_unit < float("inf"):
             raise ValueError(f"density_unit must be positive and finite, got {self.density_unit}")
 
@@ -79,14 +75,8 @@ class Gaussians:
         unit = float(densities.max()) if density_unit is None else density_unit
         if quaternions is None:
             quaternions = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-        return cls(
-            _tensor(means),
-            _tensor(np.log(scales)),
-            _tensor(quaternions),
-            _tensor(inverse_softplus(densities / unit)),
-            unit,
-            kernel,
-        )
+        raw = inverse_softplus(densities / unit)
+        return cls(_tensor(means), _tensor(np.log(scales)), _tensor(quaternions), _tensor(raw), unit, kernel)
 
     @property
     def n(self) -> int:
@@ -104,25 +94,12 @@ class Gaussians:
 
     def select(self, index: Tensor) -> Gaussians:
         """The Gaussians at `index` (a mask or positions), as copies."""
-        return Gaussians(
-            self.means[index],
-            self.log_scales[index],
-            self.quaternions[index],
-            self.raw_densities[index],
-            self.density_unit,
-            self.kernel,
-        )
+        some: dict[str, Any] = {name: getattr(self, name)[index] for name in _PARAMETERS}
+        return replace(self, **some)
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """The parameters as numpy arrays by name, for a checkpoint; `from_arrays` is the inverse."""
-        return {
-            "means": self.means.detach().cpu().numpy(),
-            "log_scales": self.log_scales.detach().cpu().numpy(),
-            "quaternions": self.quaternions.detach().cpu().numpy(),
-            "raw_densities": self.raw_densities.detach().cpu().numpy(),
-            "density_unit": np.asarray(self.density_unit),
-            "kernel_exponent": np.asarray(self.kernel.exponent),
-        }
+        """The raw parameters as numpy arrays by name."""
+        return {name: getattr(self, name).detach().cpu().numpy() for name in _PARAMETERS}
 
     def physical(self) -> dict[str, NDArray[np.float32]]:
         """Centres [n, 3] (x, y, z) and widths [n, 3] in mm, unit quaternions [n, 4] (w, x, y, z), densities [n] 1/mm.
@@ -132,17 +109,6 @@ class Gaussians:
         turned = torch.nn.functional.normalize(self.quaternions, dim=1)
         values = {"centres": self.means, "widths": self.scales, "rotations": turned, "densities": self.densities}
         return {name: value.detach().cpu().numpy() for name, value in values.items()}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[np.floating]]) -> Gaussians:
-        """The inverse of `arrays`; without `kernel_exponent`, as in older files, they are true Gaussians."""
-        names = ("means", "log_scales", "quaternions", "raw_densities")
-        missing = [name for name in (*names, "density_unit") if name not in arrays]
-        if missing:
-            raise ValueError(f"a checkpoint of Gaussians needs {names} and density_unit; {missing} are missing")
-        means, log_scales, quaternions, raw = (_tensor(np.asarray(arrays[name])) for name in names)
-        kernel = Kernel.of_exponent(float(arrays.get("kernel_exponent", math.inf)))
-        return cls(means, log_scales, quaternions, raw, float(arrays["density_unit"]), kernel)
 
 
 def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from recon.base.geometry import Geometry
+from recon.base.method import Clock
 from recon.base.volume import Grid, Volume
 from recon.splatting.finish import SUBSETS, SWEEPS, TV_STEPS
 from recon.splatting.gaussians import Gaussians
@@ -19,8 +19,6 @@ from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.tv import TotalVariationProx, difference_weights
 
-Clock = Callable[[], float]
-
 FINISH_SHARE = 0.8
 """Largest share of the finish in the time after the first steps: it adds more than most steps before it."""
 
@@ -28,7 +26,7 @@ _GROWTH = 1.5  # a fit may end with so many times the Gaussians, and filling the
 _SLAB = 16  # slices that are filled to measure it
 _DRAWN = 8  # slices that Gaussians are drawn from to measure it
 _SWEPT_VIEWS = 8
-_COLS = 96  # binned pixels by which the time of a start is estimated
+_COLS = 96  # binned pixels of the views that time a start
 # Work before the sweeps of a finish, beside the choice of its weight, in sweeps: the largest eigenvalue of a subset,
 # projections and an FBP.
 _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3

@@ -47,6 +47,7 @@ _WILD, _WILD_VIEWS = 10.0, 0.1
 # are empty: the air of a measured walnut has 0.07.
 _FARTHEST, _EMPTY = 0.95, 0.15
 
+_SCALED_BY = 12  # views
 _SWEEP_WEIGHT = 0.004  # density units
 _SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
 
@@ -82,8 +83,6 @@ def place(
             corners, outside the circle that all views see, stay empty unless the sample leaves the field.
         count: number of Gaussians; None: `default_count` of the field.
         start: kind of first volume, see `first_volume`.
-        rays: ray model of the fit.
-        kernel: of the Gaussians.
         factor: binning of the views for the first volume.
 
     Raises:
@@ -187,7 +186,6 @@ def sample_gaussians(
         n: number of Gaussians; fewer if fewer voxels hold matter.
         field_radius: mm around the rotation axis; no Gaussian is placed outside.
         smooth: standard deviation of the smoothing, in voxels.
-        kernel: of the Gaussians.
 
     Raises:
         ValueError: where the volume holds no matter inside the field.
@@ -258,7 +256,6 @@ def scale_to_data(
     gaussians: Gaussians,
     projections: NDArray[np.float32],
     geometry: Geometry,
-    views: int = 12,
     rays: RayModel | None = None,
 ) -> Gaussians:
     """The same Gaussians with all densities times k, k = <Aρ, P> / <Aρ, Aρ> over a few views.
@@ -266,7 +263,7 @@ def scale_to_data(
     Projection is linear in density, so this is the exact least-squares factor. It replaces the published constant 0.15
     and makes the start independent of units and of the number of Gaussians.
     """
-    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(views, geometry.n_views)).round().astype(int))
+    chosen = np.unique(np.linspace(0, geometry.n_views - 1, min(_SCALED_BY, geometry.n_views)).round().astype(int))
     rendered = project(gaussians, geometry, chosen.tolist(), model=rays).numpy()
     measured = np.asarray(projections[chosen], np.float64)
     power = float((rendered.astype(np.float64) ** 2).sum())

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.engine import Active
 from recon.splatting.backend import Backend, Cpu, Pass
 from recon.splatting.density_control import DensityPolicy, control

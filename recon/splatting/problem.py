@@ -8,13 +8,13 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.choices import Loss as Loss
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
-from recon.kernels.cpu.activation import F32
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
 from recon.splatting.backend import Backend, ProjectionLoss
 
@@ -35,12 +35,10 @@ class FitProblem:
         images: one [row, col] each view, projections / (half_field * unit).
         target_maps: each view blurred for SSIM.
         weights: of each view's pixels [row, col]; None where all weigh one.
-        geometry: of the views.
         grid: the box that Gaussians live in; it should hold all that the views see, whatever volume is wanted later.
         half_field: mm.
         unit: 1/mm.
         noise: standard deviation of a pixel's noise, in units of `images`.
-        loss: the projection loss.
         backend: the device's operations, and the owner of all these arrays.
     """
 
@@ -105,9 +103,7 @@ def make_problem(
     return replace(_with_views(empty, filled, known), geometry=geometry)
 
 
-def extend(
-    problem: FitProblem, projections: F32, angles: NDArray[np.float64], weights: F32 | None = None
-) -> FitProblem:
+def extend(problem: FitProblem, projections: F32, angles: NDArray[np.float64]) -> FitProblem:
     """The problem with more views [view, row, col]; those it has are not copied.
 
     Large values are accepted up to the limit of the loss: if the first views were empty, the density unit is wrong.
@@ -119,7 +115,7 @@ def extend(
     """
     geometry = problem.geometry.at(np.concatenate((problem.geometry.angles, angles)))
     largest = _LARGEST_LATER * problem.half_field * problem.unit
-    return replace(_with_views(problem, *masked(projections, weights, largest)), geometry=geometry)
+    return replace(_with_views(problem, *masked(projections, None, largest)), geometry=geometry)
 
 
 def with_projections(problem: FitProblem, projections: F32) -> FitProblem:

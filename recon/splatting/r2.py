@@ -11,9 +11,10 @@ from typing import ClassVar, Self, get_args
 import numpy as np
 
 from recon.assess.plans import PRESETS, best_steps
+from recon.base.arrays import F32
 from recon.base.choices import Quality
 from recon.base.geometry import Geometry
-from recon.base.method import F32, MethodResult, Plain, ReconProblem, RunControl, Traits
+from recon.base.method import Clock, MethodResult, Plain, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
 from recon.splatting.density_control import DensityPolicy
@@ -22,7 +23,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
 from recon.splatting.schedule import DEFAULT_STEPS
 from recon.splatting.settings import FitSettings, growth
-from recon.splatting.stream import Clock, StreamingFit
+from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.voxels.voxel_problem import iterative_memory
 
@@ -81,13 +82,6 @@ class R2:
             raise ValueError(f"finish must be 0 sweeps or more, got {self.finish}")
         if self.seconds is not None and not (math.isfinite(self.seconds) and self.seconds >= 0):
             raise ValueError(f"seconds must be a time of 0 or more, got {self.seconds}")
-
-    @staticmethod
-    def published() -> R2:
-        """The fit with the published settings, the method `r2-published`."""
-        from recon.splatting.published import R2Published  # here: it is an R2
-
-        return R2Published()
 
     @property
     def planned_steps(self) -> int | None:

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,64 +18,67 @@ from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.kernels import reference
-from recon.kernels.cpu.activation import F32
-from recon.kernels.cpu.engine import Active, Gradients, Scratch, grid_layout, render_view
-from recon.kernels.cpu.footprints import footprint_table
+from recon.splatting.backend import Backend, Cpu, Pass
 from recon.splatting.gaussians import Gaussians
 
 Implementation = Literal["auto", "cpu", "gpu", "reference"]
 
 
-class _Project(torch.autograd.Function):
+class Project(torch.autograd.Function):
+    """Views of raw parameters on a backend. The backward pass renders each view again, and keeps no table of it."""
+
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, geometry: Geometry, faint: float, cut: float, model: RayModel, kernel: Kernel,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
+        backend: Backend[Any], geometry: Geometry, faint: float, cut: float, model: RayModel,
     ) -> Tensor:  # fmt: skip
-        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit, kernel)
-        images = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
-        shared, views = Scratch.of(len(active.densities), geometry.detector_shape), []
-        differentiable = any(ctx.needs_input_grad)
+        ctx.save_for_backward(means, log_scales, quaternions, raw)
+        ctx.given = (unit, kernel, backend), geometry, (faint, cut, model)
+        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
+        images = torch.empty((geometry.n_views, *geometry.detector_shape), device=means.device)
         for view, image in enumerate(images):
-            # Each view needs its own table until its backward pass, if there will be one.
-            scratch = replace(shared, table=footprint_table(len(active.densities))) if differentiable else shared
-            rendered = render_view(active, geometry, view, faint, cut, model, image=image, scratch=scratch)
-            if differentiable:
-                views.append(rendered)
-        ctx.state = (_array(quaternions), _array(raw), unit, views)
-        return torch.from_numpy(images)
+            image.copy_(torch.as_tensor(run.view(geometry, view, faint, cut, model).image))
+        return images
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        quaternions, raw, unit, views = ctx.state
-        into = Gradients.zeros(len(raw))
-        centres = np.empty((len(raw), 2), np.float32)
-        for view, image in zip(views, gradient.contiguous().numpy(), strict=True):
-            view.backward(image, into, centres)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None, None)
+        on, geometry, how = ctx.given
+        run = _begin(ctx.saved_tensors, *on)
+        for view, slope in enumerate(gradient):
+            run.view(geometry, view, *how).backward(_native(slope, on[-1]))
+        return (*map(torch.as_tensor, run.gradients()), *[None] * 7)
 
 
-class _Voxelize(torch.autograd.Function):
+class Voxelize(torch.autograd.Function):
+    """Voxels of raw parameters on a backend."""
+
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor,
-        unit: float, grid: Grid, faint: float, cut: float, kernel: Kernel,
+        ctx: Any, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float, kernel: Kernel,
+        backend: Backend[Any], grid: Grid, faint: float, cut: float,
     ) -> Tensor:  # fmt: skip
-        active = Active.of(_array(means), _array(log_scales), _array(quaternions), _array(raw), unit, kernel)
-        layout = grid_layout(active, grid, faint, cut)
-        ctx.state = (_array(quaternions), _array(raw), layout, unit)
-        return torch.from_numpy(np.ascontiguousarray(layout.fill()))
+        ctx.save_for_backward(means, log_scales, quaternions, raw)
+        ctx.given = (unit, kernel, backend), (grid, faint, cut)
+        run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
+        return torch.as_tensor(run.box(grid, faint, cut).density)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        quaternions, raw, layout, unit = ctx.state
-        into = Gradients.zeros(len(raw))
-        layout.backward(gradient.contiguous().numpy(), into.means, into.log_scales, into.rotations, into.densities)
-        return (*(torch.from_numpy(a) for a in into.to_raw(quaternions, raw, unit)), None, None, None, None, None)
+        on, where = ctx.given
+        run = _begin(ctx.saved_tensors, *on)
+        run.box(*where).backward(_native(gradient, on[-1]))
+        return (*map(torch.as_tensor, run.gradients()), *[None] * 6)
 
 
-def _array(tensor: Tensor) -> F32:
-    return tensor.detach().contiguous().numpy()
+def _begin(parameters: Sequence[Tensor], unit: float, kernel: Kernel, backend: Backend[Any]) -> Pass[Any]:
+    means, log_scales, quaternions, raw = (_native(tensor, backend) for tensor in parameters)
+    return backend.begin(means, log_scales, quaternions, raw, unit, kernel)
+
+
+def _native(tensor: Tensor, backend: Backend[Any]) -> Any:
+    """The values as an array of the backend, without a copy where they are contiguous."""
+    values = tensor.detach().contiguous()
+    return values.numpy() if isinstance(backend, Cpu) else values
 
 
 def project(
@@ -113,12 +114,8 @@ def project(
                 reference.project_view(*parameters, chosen, view, exact=exact, length=length, kernel=g.kernel)
             )
         return torch.stack(images)
-    cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
-    if which == "gpu":
-        from recon.kernels.gpu import autograd  # loads triton, so only if a GPU is used
-
-        return autograd.project(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays, g.kernel)
-    return _Project.apply(*raw, g.density_unit, chosen, _faint(cut, g, chosen), cut.sigmas, rays, g.kernel)
+    cut = truncation or Truncation()
+    return Project.apply(*_raw(g, which), chosen, _faint(cut, g, chosen), cut.sigmas, rays)
 
 
 def voxelize(
@@ -129,13 +126,19 @@ def voxelize(
     if which == "reference":
         z, y, x = (torch.from_numpy(axis).to(g.means.dtype) for axis in grid.coordinates())
         return reference.voxelize(g.means, g.scales, g.quaternions, g.densities, (z, y, x), g.kernel)
-    cut, raw = truncation or Truncation(), (g.means, g.log_scales, g.quaternions, g.raw_densities)
-    faint = cut.faint * g.density_unit
-    if which == "gpu":
-        from recon.kernels.gpu import autograd
+    cut = truncation or Truncation()
+    return Voxelize.apply(*_raw(g, which), grid, cut.faint * g.density_unit, cut.sigmas)
 
-        return autograd.voxelize(*raw, g.density_unit, grid, faint, cut.sigmas, g.kernel)
-    return _Voxelize.apply(*raw, g.density_unit, grid, faint, cut.sigmas, g.kernel)
+
+def _raw(g: Gaussians, implementation: Implementation) -> tuple[Any, ...]:
+    """The first arguments of `Project` and `Voxelize`."""
+    if implementation == "gpu":
+        from recon.kernels.gpu.engine import Gpu  # loads triton, so only if a GPU is used
+
+        backend: Backend[Any] = Gpu(g.means.device)
+    else:
+        backend = Cpu()
+    return g.means, g.log_scales, g.quaternions, g.raw_densities, g.density_unit, g.kernel, backend
 
 
 def _faint(truncation: Truncation, gaussians: Gaussians, geometry: Geometry) -> float:

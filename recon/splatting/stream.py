@@ -18,10 +18,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Progress
+from recon.base.method import Clock, Progress
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu.activation import F32
 from recon.splatting import arrivals
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import HALF, WHILE_VIEWS_COME, average, averaged, fallen
@@ -36,8 +36,6 @@ from recon.splatting.initialise import (
 )
 from recon.splatting.problem import FitProblem, extend, with_projections
 from recon.splatting.settings import FitSettings, growth
-
-Clock = Callable[[], float]
 
 _GROWTH = 1.5  # a new round begins when the views have multiplied by this
 _YOUNG = 16  # a round that begins with fewer views, after HALF steps, places all Gaussians anew
@@ -55,11 +53,9 @@ class StreamingFit:
     Args:
         template: geometry of all future views, with their shift, roll and tilt; its angles are ignored.
         grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
-        seed: of every random choice.
         gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
         settings: of the fit; `coarse` is for fits whose views are all there.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
-        now: a clock in s.
 
     Raises:
         ValueError: for no Gaussians, settings with `coarse`, or a template whose views differ in shift, roll or tilt.

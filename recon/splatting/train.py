@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.assess.plans import best_steps
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.kernels.cpu.activation import F32
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
@@ -112,10 +112,10 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
         factor = 1 if method.seconds is None else _factor_in_time(method, seen, field_grid, now, end)
-        state, n_start, unit = _first_state(data[used], seen, field_grid, method, problem.seed, backend, factor)
+        state = _first_state(data[used], seen, field_grid, method, problem.seed, backend, factor)
     else:
         state = _resumed(control.resume, geometry.n_views, backend)
-        n_start, unit = state.n, state.unit
+    n_start, unit = state.n, state.unit
     fine = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
     rough = fine
     if settings.coarse > 1:
@@ -275,15 +275,8 @@ def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[N
 
 
 def _first_state(
-    data: F32,
-    geometry: Geometry,
-    field_grid: Grid,
-    method: FitMethod,
-    seed: int,
-    backend: Backend[Any],
-    factor: int = 1,
-) -> tuple[FitState, int, float]:
-    """The state of a fresh fit, how many Gaussians it starts from, and their density unit."""
+    data: F32, geometry: Geometry, field_grid: Grid, method: FitMethod, seed: int, backend: Backend[Any], factor: int
+) -> FitState:
     start = method.gaussians
     if not isinstance(start, Gaussians):
         rng = np.random.default_rng(seed)
@@ -291,7 +284,7 @@ def _first_state(
             data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays, kernel=method.fit.kernel,
             factor=factor,
         )  # fmt: skip
-    return fit.init(start, seed, growth(method.fit), backend), start.n, start.density_unit
+    return fit.init(start, seed, growth(method.fit), backend)
 
 
 def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Backend[Any]) -> FitState:

@@ -7,9 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Self, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import MethodResult, Progress, ReconProblem, RunControl, Traits
@@ -17,8 +15,6 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import Filter, fbp, fbp_memory
 from recon.voxels.fdk import fdk
 from recon.voxels.view_weights import covers_the_circle
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp
@@ -22,8 +23,6 @@ from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
-
-F32 = NDArray[np.float32]
 
 _SWEEPS, _SUBSETS, _TV_STEPS = 8, 9, 3
 _ROWS, _PIXELS = (2, 8), 2**17  # fewest and most rows of the slab, and approximate pixels of all its slices

@@ -18,6 +18,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy import fft
 
+from recon.base.arrays import F32, F64
 from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -31,9 +32,6 @@ from recon.voxels.back_project import (
     ray_by_ray,
 )
 from recon.voxels.view_weights import ray_weights
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _VIEWS = 32  # filtered at a time
 
@@ -62,7 +60,6 @@ def filter_projections(
 
     Args:
         projections: float32 [..., col], line integrals.
-        pixel_pitch: mm.
         filter: the window on the ramp, 1 at zero frequency: none (ram-lak), sinc (shepp-logan), raised cosine (hann).
 
     Returns:
@@ -190,10 +187,7 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
-    """Views [view, len(rows), col] at fractional rows by linear interpolation; rows off the detector are zero.
-
-    `projections` holds the rows from `first` on of a detector of `height` rows.
-    """
+    """Views at fractional rows, linearly; rows off the detector are zero. They hold its rows from `first` on."""
     inside = (rows >= -0.5) & (rows <= height - 0.5)
     clamped = np.clip(rows, 0, height - 1)
     lower = np.floor(clamped).astype(np.intp)
@@ -230,7 +224,6 @@ def fbp(
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
-        geometry: where the views' rays run.
         grid: of the volume; None: one voxel a pixel, `Grid.matching(geometry)`.
         filter: "ram-lak", "shepp-logan" or "hann".
         on_block: told after each block of slices how many of how many slices are there.

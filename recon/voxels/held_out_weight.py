@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -15,8 +16,6 @@ from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
-
-F32 = NDArray[np.float32]
 
 ONE_IN = 8  # views held out
 LEAST_VIEWS = 2 * ONE_IN
@@ -65,16 +64,17 @@ def busiest_rows(data: F32, height: int) -> slice:
 
 def choice_sweeps(geometry: Geometry) -> float:
     """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
-    if not _can_hold_out(geometry):
-        return 0.0
-    return 4 * _SWEEPS * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return _in_all_rows(4 * _SWEEPS, geometry)
 
 
 def sweeps_choice_cost(geometry: Geometry) -> float:
     """What `preferred_sweeps` and `bregman_weight` cost at most, in sweeps over all rows."""
-    if not _can_hold_out(geometry):
-        return 0.0
-    return (MOST_SWEEPS + _BREGMAN_TRIALS * _SWEEPS) * min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return _in_all_rows(MOST_SWEEPS + _BREGMAN_TRIALS * _SWEEPS, geometry)
+
+
+def _in_all_rows(sweeps: int, geometry: Geometry) -> float:
+    share = min(1.0, _ROWS / geometry.detector_shape[0]) * (1 - 1 / ONE_IN)
+    return sweeps * share if _can_hold_out(geometry) else 0.0
 
 
 def _can_hold_out(geometry: Geometry) -> bool:

@@ -16,16 +16,14 @@ from dataclasses import fields, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
 from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.voxel_problem import VoxelProblem
-
-F32 = NDArray[np.float32]
 
 
 @runtime_checkable

@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.noise import median_deviation, noise_level
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.sweeps import whitened
 from recon.voxels.tv import difference_weights
 from recon.voxels.voxel_problem import VoxelProblem, density_unit
-
-F32 = NDArray[np.float32]
 
 MATTER = 0.05  # of the density unit: voxels above it count
 EXPLAINED = 1.05
@@ -57,7 +55,6 @@ class NoiseBalance:
         noise: of a ray, with which the residual is compared: `noise_level` of the data. For many views it is up to 1.3
             times that (π / 2 times the columns determine a slice). Then little of the noise fits into a volume.
         counted: what no volume explains was known before, and is in the first weight.
-        value: the weight now.
     """
 
     first: float

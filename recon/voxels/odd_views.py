@@ -7,17 +7,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.noise import median_deviation
 from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
-
-F32 = NDArray[np.float32]
 
 LIMIT = 12.0
 """Limit, in usual differences (standard deviations): clean real scans stay below 9.4 (docs/notes/exploration.md)."""
@@ -29,7 +27,7 @@ _AT_A_TIME = 8  # views of a cone that are projected together
 _BROAD = 3  # cells a side, over which a difference is averaged
 _AROUND, _BESIDE = 12, 3  # views on either side that define the usual difference; nearest ones left out
 _OUTLIER = 3.0  # times their median: largest contribution of one view
-_SHARP = 0.1  # share of the change by a blur of one pixel, by which any volume may miss an edge
+_SHARP = 0.1  # a volume may miss an edge by this share of what a blur of one pixel changes
 _EXTENT = 0.5  # share of the limit above which a cell belongs to the region
 _LEAST_VIEWS = 2 * _AROUND + 1
 
@@ -55,7 +53,6 @@ def odd_views(
     projections: F32,
     geometry: Geometry,
     weights: F32 | RayWeights | None = None,
-    limit: float = LIMIT,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> tuple[OddView, ...]:
     """Views in which something crossed the beam or the sample was displaced, found in the differences p - A x.
@@ -67,9 +64,7 @@ def odd_views(
     crack parallel to the rays is sharp in few views only [our own].
 
     Args:
-        projections: [view, row, col].
         weights: of the rays [view, row, col]; those of weight 0 were not measured.
-        limit: score from which a view is odd.
         progress: how many of how many views were compared, of bands of rows by their share.
 
     Returns:
@@ -90,8 +85,8 @@ def odd_views(
         score = differences[place] / np.sqrt(np.maximum(uniform_filter(usual, _BROAD) + edges[place] ** 2, 1))
         worst = np.unravel_index(np.abs(score).argmax(), score.shape)
         peak = float(score[worst])
-        if abs(peak) > limit:
-            parts, _ = label(score * math.copysign(1, peak) > _EXTENT * limit)
+        if abs(peak) > LIMIT:
+            parts, _ = label(score * math.copysign(1, peak) > _EXTENT * LIMIT)
             there = np.nonzero(parts == parts[worst])
             spans = [(int(cells.min()) * side, (int(cells.max()) + 1) * side) for cells in there]
             found.append(OddView(int(order[place]), peak, spans[0], spans[1]))

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.kernels.cpu.vectors import combine, replace_by_residual
 from recon.voxels.noise_balance import NoiseBalance
@@ -17,8 +18,6 @@ from recon.voxels.projector import Projector
 from recon.voxels.sweeps import interleaved, whitened
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, largest_eigenvalue
-
-F32 = NDArray[np.float32]
 
 _LOOKED_AT = 9  # views of a sweep whose residual is looked at
 _LEAST_VIEWS = 12  # least views of a subset: fewer have other eigenvectors than all views, and the steps disagree

@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 
-F32 = NDArray[np.float32]
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 
@@ -68,23 +68,19 @@ class Projector:
         """The same for some views only, in that order."""
         return Projector(self.geometry.select(views), self.grid)
 
-    def forward(self, volume: F32, out: F32 | None = None) -> F32:
+    def forward(self, volume: F32) -> F32:
         """A x: volume [z, y, x] to projections [view, row, col]."""
-        return projection_images(self.forward_lines(volume_lines(_fitting(volume, self.grid.shape, "volume"))), out)
+        return projection_images(self.forward_lines(volume_lines(_fitting(volume, self.grid.shape, "volume"))))
 
-    def adjoint(self, projections: F32, out: F32 | None = None) -> F32:
+    def adjoint(self, projections: F32) -> F32:
         """Aᵀ p: projections [view, row, col] to a volume [z, y, x]."""
         lines = projection_lines(_fitting(projections, self.projection_shape, "projections"))
-        return volume_slices(self.adjoint_lines(lines), out)
+        return volume_slices(self.adjoint_lines(lines))
 
-    def __call__(self, volume: F32) -> F32:
-        """A x, as `forward`."""
-        return self.forward(volume)
-
-    def forward_lines(self, volume: F32, out: F32 | None = None) -> F32:
+    def forward_lines(self, volume: F32) -> F32:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape
-        result = np.empty((views, cols, rows), np.float32) if out is None else out
+        result = np.empty((views, cols, rows), np.float32)
         if self.geometry.is_cone:
             cone_cpu.forward(volume, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
         elif self._on_rows():
@@ -137,12 +133,12 @@ def volume_lines(volume: F32) -> F32:
     return out
 
 
-def volume_slices(lines: F32, out: F32 | None = None) -> F32:
-    """[y, x, z] to a new [z, y, x], or into `out`."""
+def volume_slices(lines: F32) -> F32:
+    """[y, x, z] to a new [z, y, x]."""
     ny, nx, nz = lines.shape
-    result = _target(out, (nz, ny, nx))
-    swap_last(lines.reshape(1, ny * nx, nz), result.reshape(1, nz, ny * nx))
-    return result
+    out = np.empty((nz, ny, nx), np.float32)
+    swap_last(lines.reshape(1, ny * nx, nz), out.reshape(1, nz, ny * nx))
+    return out
 
 
 def projection_lines(projections: F32) -> F32:
@@ -153,12 +149,12 @@ def projection_lines(projections: F32) -> F32:
     return out
 
 
-def projection_images(lines: F32, out: F32 | None = None) -> F32:
-    """[view, col, row] to a new [view, row, col], or into `out`."""
+def projection_images(lines: F32) -> F32:
+    """[view, col, row] to a new [view, row, col]."""
     views, cols, rows = lines.shape
-    result = _target(out, (views, rows, cols))
-    swap_last(lines, result)
-    return result
+    out = np.empty((views, rows, cols), np.float32)
+    swap_last(lines, out)
+    return out
 
 
 def project(volume: Volume, geometry: Geometry) -> F32:
@@ -210,11 +206,3 @@ def _fitting(array: F32, shape: tuple[int, ...], name: str) -> F32:
     if array.shape != shape:
         raise ValueError(f"the {name} has shape {array.shape}, the projector expects {shape}")
     return array
-
-
-def _target(out: F32 | None, shape: tuple[int, ...]) -> F32:
-    if out is None:
-        return np.empty(shape, np.float32)
-    if out.shape != shape or out.dtype != np.float32 or not out.flags.c_contiguous:
-        raise ValueError(f"out must be float32 {shape} in C order, got {out.dtype} {out.shape}")
-    return out

@@ -13,10 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.kernels.cpu.vectors import add_product, replace_by_residual
 from recon.voxels.projector import Projector
-
-F32 = NDArray[np.float32]
 
 # Rays shorter than this share of the longest ray, and voxels with a column sum below this share of the largest, are
 # left out: their corrections would be divided by almost zero.

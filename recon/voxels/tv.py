@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.volume import Grid
 from recon.kernels.cpu import tv as tv_cpu
-
-F32 = NDArray[np.float32]
 
 
 def difference_weights(grid: Grid) -> tuple[float, float, float]:
@@ -25,7 +23,6 @@ class TotalVariationProx:
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
-        """For volumes of `shape` [y, x, z]; `steps` dual steps a call."""
         self._dual = np.zeros((3, *shape), np.float32)
         self._scratch = tv_cpu.dual_scratch(shape)
         self._weights, self._nonnegative, self._steps = weights, nonnegative, steps

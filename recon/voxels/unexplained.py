@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, gaussian_filter
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
-
-F32 = NDArray[np.float32]
 
 LIMIT = 0.007
 """Share of the matter above which a volume hides structure: 0.01 to 0.05 in seven fits that fill cracks and round
@@ -61,7 +59,6 @@ def unexplained(
 
     Args:
         volume: on the slices of the detector rows, 1/mm.
-        projections: [view, row, col].
         weights: of the rays; rays of weight 0 were not measured, and are not used.
 
     Returns:
@@ -108,7 +105,6 @@ def unexplained_memory(geometry: Geometry) -> int:
 
 
 def _looked_at(geometry: Geometry) -> int:
-    """Rows."""
     rows, cols = geometry.detector_shape
     return min(rows, max(1, round(_ROWS * (_COLS / cols) ** 2)))
 

@@ -7,9 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from recon.base.arrays import F64
 from recon.base.geometry import Geometry
-
-F64 = NDArray[np.float64]
 
 _GAP_LIMIT = 8.0  # an angular gap this many times the median may be missing data, not coarse sampling
 _SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -19,7 +20,7 @@ from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.sweeps import Sweeps
 
-F32 = NDArray[np.float32]
+_ROUNDS = 6  # of power iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,6 @@ class VoxelProblem:
         return volume_lines(direct(images, geometry, self.projector.grid, filter))
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
-        """Sweeps over all views in these subsets."""
         return Sweeps(self.projector, self.data, self.weight, subsets)
 
     def single_views(self) -> Sweeps:
@@ -105,7 +105,7 @@ class Momentum:
         self._from, self._t = change, after
 
 
-def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6) -> float:
+def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     """An upper bound of the largest eigenvalue of Aᵀ W A, within a few per cent, by power iteration.
 
     For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
@@ -114,7 +114,7 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None, rounds: int = 6
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)
     bound = math.inf
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         image = projector.forward_lines(x)
         if weight is not None:
             image *= weight

@@ -18,24 +18,6 @@ from recon.voxels.projector import Projector
 F32 = NDArray[np.float32]
 
 
-@pytest.mark.parametrize(
-    ("edges", "seen", "best"),
-    [
-        ((1.0, 0.9), (1.0, 1.0), 0),
-        ((0.81, 1.0), (1.0, 1.0), 0),
-        ((0.79, 1.0), (1.0, 1.0), 1),
-        ((0.5, 1.0), (1.0, 0.97), 0),  # the steeper one follows noise more
-    ],
-)
-def test_of_level_residuals_none_that_dulls_edges(
-    edges: tuple[float, float], seen: tuple[float, float], best: int
-) -> None:
-    pairs = enumerate(zip(edges, seen, strict=True))
-    scores = [Score(i, Fbp(), np.ones(9), residual_seen=own, steepness=steep) for i, (steep, own) in pairs]
-    taken, passed = best_of(scores)
-    assert (taken.at, bool(passed)) == (best, best == 1)
-
-
 @pytest.mark.parametrize(("residuals", "hiding", "best"), [
     ([1.02, 1.00, 1.01], (), 0),  # level: the first
     ([1.02, 1.00, 1.01], (0,), 1),

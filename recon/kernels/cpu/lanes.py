@@ -12,6 +12,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.types.misc import unliteral
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -34,7 +35,7 @@ LANES = LanesType()
 
 
 @register_model(LanesType)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, fe_type: Any) -> None:
         super().__init__(manager, fe_type, _VF)
 
@@ -65,9 +66,9 @@ def _register(symbol: Callable[..., Any], instruction: str) -> None:
     """Typed and lowered by hand: of an `overload` the compiler copies a function into each place that adds."""
 
     @infer_global(symbol)
-    class Operation(AbstractTemplate):  # type: ignore[misc]
+    class Operation(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
-            kinds = [types.unliteral(kind) for kind in args]  # type: ignore[attr-defined]
+            kinds = [unliteral(kind) for kind in args]
             if LANES in kinds and all(isinstance(kind, LanesType | types.Number) for kind in kinds):
                 return LANES(*kinds)
             return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -44,20 +43,12 @@ class GpuPass:
         self.into = _zeros(self.active)
 
     def view(self, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> GpuView:
-        """Render one view; footprints end below `faint` (units of the image) and at the latest after `cut` σ."""
         return GpuView(self, geometry, view, faint, cut, model)
 
     def box(self, grid: Grid, faint: float, cut: float) -> GpuBox:
-        """Voxelise on a grid; `faint` is a density."""
         return GpuBox(self, grid, faint, cut)
 
-    def clear(self) -> None:
-        """Set the gradients to zero."""
-        for array in self.into:
-            array.zero_()
-
     def gradients(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Gradients on means, log scales, quaternions and raw densities."""
         d_means, d_log_scales, d_rotations, d_densities = self.into
         return d_means, d_log_scales, *activation_backward(*self._raw, self._unit, d_rotations, d_densities)
 
@@ -81,7 +72,6 @@ class GpuView:
                 self._rays = (exact, rays)
 
     def backward(self, gradient: Tensor) -> Tensor:
-        """Back-propagate an image gradient [row, col]; returns the gradient on centres [n, 2] in 1/px."""
         run, found = self._run, self.footprints
         centres = found.table.new_empty((found.table.shape[0], 2))
         footprints_backward(
@@ -106,36 +96,33 @@ class GpuBox:
         self.density = fill(self.placed)
 
     def backward(self, gradient: Tensor, *, means_too: bool = True) -> None:
-        """Back-propagate a gradient [z, y, x]; `means_too=False` leaves positions out."""
         fill_backward(self.placed, gradient, *self._run.active[1:], *self._run.into, means_too=means_too)
 
 
 class Gpu:
     """The Triton kernels on one device."""
 
+    adam, total_variation = staticmethod(adam), staticmethod(losses.total_variation)
+
     def __init__(self, device: str | torch.device) -> None:
         """Raises as `require`."""
         self.device = require(device)
 
     def array(self, values: F32) -> Tensor:
-        """A copy on the device."""
         return torch.from_numpy(np.array(values, np.float32)).to(self.device)
 
     def numpy(self, array: Tensor) -> F32:
-        """A copy as a numpy array."""
         return array.detach().cpu().numpy().copy()
 
     def begin(
         self, means: Tensor, log_scales: Tensor, quaternions: Tensor, raw: Tensor, unit: float,
         kernel: Kernel = Kernel.GAUSSIAN,
     ) -> GpuPass:  # fmt: skip
-        """A pass over raw parameters; densities are unit * softplus(raw)."""
         return GpuPass(means, log_scales, quaternions, raw, unit, kernel)
 
     def projection_loss(
         self, shape: tuple[int, int], ssim_weight: float, term: DataTerm = ABSOLUTE
     ) -> losses.GpuProjectionLoss:
-        """The loss on images of one shape."""
         return losses.GpuProjectionLoss(shape, ssim_weight, self.device, term)
 
     def misfit(self, image: Tensor, target: Tensor, weights: Tensor | None) -> Tensor:
@@ -146,23 +133,5 @@ class Gpu:
         squares, power = (off * off).sum(dtype=torch.float64), (seen * seen).sum(dtype=torch.float64)
         return torch.where(power > 0, torch.sqrt(squares / power), 0.0)
 
-    def total_variation(self, volume: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-        """weight * mean |difference of neighbours| of [z, y, x], and its gradient."""
-        return losses.total_variation(volume, weight)
-
     def add_lengths(self, vectors: Tensor, factor: float, sums: Tensor) -> None:
-        """sums [n] += factor |vectors [n, 2]|."""
         sums.add_(torch.linalg.vector_norm(vectors, dim=1), alpha=factor)
-
-    def adam(
-        self,
-        parameters: Sequence[Tensor],
-        gradients: Sequence[Tensor],
-        first: Sequence[Tensor],
-        second: Sequence[Tensor],
-        rates: Sequence[float],
-        step: int,
-        bounds: Sequence[tuple[float, float] | None],
-    ) -> None:
-        """Update the four parameter arrays and their moments in place and keep them within bounds; steps from 1."""
-        adam(parameters, gradients, first, second, rates, step, bounds)

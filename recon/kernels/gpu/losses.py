@@ -13,6 +13,7 @@ _BLOCK = 256
 _R = tl.constexpr(RADIUS)
 _L1, _L2 = tl.constexpr(L1), tl.constexpr(L2)
 _LARGEST = tl.constexpr(1.0e38)
+_C = 0.01**2, 0.03**2  # of SSIM, for images of values of about 1
 
 
 @triton.jit
@@ -130,11 +131,9 @@ class GpuProjectionLoss:
     """mean w (D(x, y) + λ (1 - SSIM(x, y))) and its gradient, see `cpu.losses.CpuProjectionLoss`."""
 
     def __init__(
-        self, shape: tuple[int, int], ssim_weight: float, device: torch.device, term: DataTerm = ABSOLUTE,
-        c1: float = 0.01**2, c2: float = 0.03**2,
-    ) -> None:  # fmt: skip
-        self.shape, self.pixels, self.ssim_weight, self.c1, self.c2 = shape, shape[0] * shape[1], ssim_weight, c1, c2
-        self.term = term
+        self, shape: tuple[int, int], ssim_weight: float, device: torch.device, term: DataTerm = ABSOLUTE
+    ) -> None:
+        self.shape, self.pixels, self.ssim_weight, self.term = shape, shape[0] * shape[1], ssim_weight, term
         self.window = torch.from_numpy(gaussian_window()).to(device)
         self._blocks = triton.cdiv(self.pixels, _BLOCK)
         self._half = torch.empty((3, *shape), device=device)
@@ -170,7 +169,7 @@ class GpuProjectionLoss:
             image, target, w, self._half, self.window, cols, pixels, WEIGHTED=weighted, BLOCK=_BLOCK
         )  # fmt: skip
         _ssim_terms[grid](
-            self._half, target_maps, w, self._partials, unlike, self.window, rows, cols, pixels, self.c1, self.c2,
+            self._half, target_maps, w, self._partials, unlike, self.window, rows, cols, pixels, *_C,
             WEIGHTED=weighted, BLOCK=_BLOCK,
         )  # fmt: skip
         _blur[(self._blocks, 3)](self._partials, self._half, self.window, rows, cols, pixels, ACROSS=True, BLOCK=_BLOCK)

@@ -8,8 +8,8 @@ from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
@@ -20,8 +20,6 @@ from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import difference_weights
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory
 
-F32 = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class AsdPocs:
@@ -29,13 +27,12 @@ class AsdPocs:
 
     A sweep of SART, then `tv_steps` steps down the gradient of TV, each `alpha` times as long as the first sweep. Steps
     shrink by `alpha_decay` if they undo more than `ratio` of the sweep and the residual is still above `goal`.
-     Memory: 5 volumes, 3 x the projections.
+    Memory: 5 volumes, 3 x the projections.
 
     Attributes:
         goal: ||A x - p|| / ||p|| to be reached. None takes 0.15 of that of filtered back-projection (FBP or FDK). A
         cone's short scan, which FDK does not take, uses a sweep of ordered-subset SIRT instead. It has about the same
         residual: 0.085 to 0.12 where FDK has 0.075 to 0.11 (a box in a box, 20 to 180 views, 0 and 2 % noise).
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "asd-pocs"
@@ -56,7 +53,6 @@ class AsdPocs:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector, decide = problem.projector, problem.decide
         sweeps = problem.single_views()
         weights = difference_weights(projector.grid)

@@ -9,18 +9,15 @@ from operator import truediv
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import run_iterative
-from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -29,9 +26,6 @@ class Cgls:
 
     Negative values are clipped at the end. In float32 directions stop being conjugate after some eight iterations. From
     there on the residual lags one iteration behind. Memory: 3 volumes, 3 x the projections.
-
-    Attributes:
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "cgls"
@@ -45,14 +39,13 @@ class Cgls:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         # The directions would not be conjugate for other rays or weights.
         decide = problem.decide if problem.weight is None else Decisions()
         root = None if problem.weight is None else np.sqrt(problem.weight)
         residual = projector.forward_lines(x)
         replace_by_residual(problem.data, residual, None, root)
-        s = _weighed_adjoint(projector, residual, root)
+        s = projector.adjoint_lines(residual if root is None else residual * root)
         direction = s.copy()
         gamma, scale = dot(s, s), problem.scale
         for k in range(self.iterations):
@@ -64,7 +57,7 @@ class Cgls:
             step = decide("step", partial(truediv, gamma, dot(image, image)))
             combine(1.0, x, step, direction, x)
             combine(1.0, residual, -step, image, residual)
-            s = _weighed_adjoint(projector, residual, root, s)
+            s = projector.adjoint_lines(residual if root is None else residual * root, s)
             before, gamma = gamma, dot(s, s)
             combine(1.0, s, decide("turn", partial(truediv, gamma, before)), direction, direction)
             if not problem.go_on(k + 1, math.sqrt(dot(residual, residual)) / scale):
@@ -78,7 +71,3 @@ class Cgls:
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return iterative_memory(geometry, grid, 3.1, 4.5, 4.1 * weighted)
-
-
-def _weighed_adjoint(projector: Projector, rays: F32, weight: F32 | None, out: F32 | None = None) -> F32:
-    return projector.adjoint_lines(rays if weight is None else rays * weight, out)

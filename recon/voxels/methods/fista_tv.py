@@ -6,9 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
@@ -24,8 +22,6 @@ from recon.voxels.voxel_problem import (
     largest_eigenvalue,
 )
 
-F32 = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class FistaTv:
@@ -38,7 +34,6 @@ class FistaTv:
             threshold of one step of FISTA in density units: μ = tv_weight x density unit x ||A||².
         subsets: of the views, a step each; 1 is FISTA without subsets, which needs about ten times the iterations.
         tv_steps: dual steps of total variation in each step.
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "fista-tv"
@@ -61,7 +56,6 @@ class FistaTv:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         if not x.any():
             # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.

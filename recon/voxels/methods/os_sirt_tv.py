@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
@@ -19,8 +17,6 @@ from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iterative_memory
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,6 @@ class OsSirtTv:
         momentum: carry sweeps on along their last change (Kim, Ramani & Fessler 2015, IEEE Trans. Med. Imaging 34,
             167), for two volumes more: a quick volume. After 10 sweeps +4.2 dB (battery) and +2.1 dB (walnut), after 40
             -0.1 and -1.0 dB: noise comes in sooner, too.
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "os-sirt-tv"
@@ -55,11 +50,9 @@ class OsSirtTv:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
         projector = problem.projector
         sweeps = problem.sweeps(interleaved(projector, self.subsets))
-        weights = difference_weights(projector.grid)
-        prox = TotalVariationProx(x.shape, weights, problem.nonnegative, self.tv_steps)
+        prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, self.tv_steps)
         scale = problem.scale
         weight: NoiseBalance | float | None = None
         ahead = Momentum(x, problem.decide) if self.momentum else None
@@ -74,8 +67,7 @@ class OsSirtTv:
             else:
                 # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
-            go_on = problem.go_on(k + 1, math.sqrt(error) / scale)
-            if not go_on or k + 1 == self.iterations:
+            if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == self.iterations:
                 break
             if ahead is not None:
                 ahead(x)

@@ -6,16 +6,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -23,9 +19,6 @@ class Sart:
     """Simultaneous algebraic reconstruction, one view a step in random order (Andersen & Kak 1984).
 
     The relaxation shrinks by `decay` a sweep. Memory: 3 volumes, 3 x the projections.
-
-    Attributes:
-        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str] = "sart"
@@ -41,9 +34,7 @@ class Sart:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-        sweeps = problem.single_views()
-        scale = problem.scale
+        sweeps, scale = problem.single_views(), problem.scale
         for k in range(self.iterations):
             error = sweeps.run(x, self.relaxation * self.decay**k, problem.nonnegative, problem.rng)
             if not problem.go_on(k + 1, math.sqrt(error) / scale):

@@ -7,24 +7,18 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Grid
 from recon.voxels.iterative import run_iterative
 from recon.voxels.voxel_problem import VoxelProblem, iterative_memory
 
-F32 = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class Sirt:
-    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections.
-
-    Attributes:
-        allow_negative: voxels below zero are kept.
-    """
+    """Simultaneous iterative reconstruction (Gilbert 1972). Memory: 3 volumes, 3 x the projections."""
 
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
@@ -38,10 +32,7 @@ class Sirt:
         return run_iterative(self, problem, control)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-        everything = [np.arange(problem.projector.geometry.n_views)]
-        sweeps = problem.sweeps(everything)
-        scale = problem.scale
+        sweeps, scale = problem.sweeps([np.arange(problem.projector.geometry.n_views)]), problem.scale
         for k in range(self.iterations):
             error = sweeps.run(x, self.relaxation, problem.nonnegative, None)
             if not problem.go_on(k + 1, math.sqrt(error) / scale):

@@ -46,11 +46,9 @@ def test_a_fit_taken_up_again_is_the_fit_that_was_not_left(random_gaussians: Mak
 
 
 @pytest.mark.parametrize("kernel", Kernel)
-def test_the_kernel_is_kept_and_an_older_checkpoint_is_of_gaussians(random_gaussians: Make, kernel: Kernel) -> None:
+def test_the_kernel_is_kept(random_gaussians: Make, kernel: Kernel) -> None:
     arrays = arrays_of(fit.init(random_gaussians(5, kernel=kernel), 0))
     assert fit.gaussians_of(state_from(arrays)).kernel is kernel
-    del arrays["kernel_exponent"]
-    assert state_from(arrays).kernel is Kernel.GAUSSIAN
 
 
 def test_what_is_no_checkpoint_is_refused(random_gaussians: Make) -> None:

@@ -76,8 +76,8 @@ def test_the_start_is_even_over_matter_at_0_15_of_its_density(rng: np.random.Gen
 
 
 def test_the_settings_are_those_of_the_paper_and_its_code() -> None:
-    method, fit = recon.R2.published(), published_fit()
-    assert isinstance(method, R2Published) and method.fit == fit
+    method, fit = recon.R2Published(), published_fit()
+    assert method.fit == fit
     assert (method.steps, method.gaussians, method.finish, method.start) == (30_000, 50_000, 0, "published")
     assert (fit.loss, fit.ssim_weight, fit.tv_weight, fit.tv_size, fit.views_per_step) == ("l1", 0.25, 0.05, 32, 1)
     assert (fit.kernel, fit.rates, fit.pace, fit.decay) == (Kernel.GAUSSIAN, (2e-4, 5e-3, 1e-3, 1e-2), 1.0, 0.1)

@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from recon.base.geometry import Geometry
+from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel
 from recon.kernels import reference
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.splat import Project, Voxelize
 from tests.recon.helpers import as_leaves, gradients
 
 if not torch.cuda.is_available():
@@ -54,6 +56,21 @@ def leaned() -> Geometry:
 
 def cone(shape: tuple[int, int] = SHAPE) -> Geometry:
     return Geometry.cone([0.4], shape, 1.1, 22.0, 45.0, shape[1] / 2 - 1.1, shifts=[[-0.6, 0.4]], roll=-0.1, tilt=0.2)
+
+
+def project_raw(*arguments: Any) -> Tensor:
+    """The views of raw parameters and their unit: what `recon.project` calls on a GPU."""
+    *raw, unit, geometry, faint, cut, model = arguments
+    return Project.apply(*raw, unit, Kernel.GAUSSIAN, _gpu(), geometry, faint, cut, model)
+
+
+def voxelize_raw(*arguments: Any) -> Tensor:
+    *raw, unit, grid, faint, cut = arguments
+    return Voxelize.apply(*raw, unit, Kernel.GAUSSIAN, _gpu(), grid, faint, cut)
+
+
+def _gpu() -> Any:
+    return importlib.import_module("recon.kernels.gpu.engine").Gpu("cuda")
 
 
 def raw_of(g: Gaussians, device: torch.device) -> tuple[Tensor, ...]:

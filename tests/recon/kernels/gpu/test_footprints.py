@@ -28,11 +28,12 @@ from tests.recon.kernels.gpu.on_gpu import (
     cone,
     leaned,
     parallel,
+    project_raw,
     raw_of,
     reference_view,
+    voxelize_raw,
 )
 
-autograd = importlib.import_module("recon.kernels.gpu.autograd")
 engine = importlib.import_module("recon.kernels.gpu.engine")
 
 
@@ -41,7 +42,7 @@ def test_images_and_gradients_equal_the_reference(make: object, random_gaussians
     geometry = make()  # type: ignore[operator]
     g = random_gaussians(18, 9.0)
     raw, double = raw_of(g, DEVICE), in_double(g)
-    found = autograd.project(*raw, UNIT, geometry, *WHOLE, AFFINE)
+    found = project_raw(*raw, UNIT, geometry, *WHOLE, AFFINE)
     expected = torch.stack([reference_view(double, geometry, view) for view in range(geometry.n_views)])
     peak = float(expected.detach().max())
     assert float((found.detach().cpu() - expected.detach()).abs().max()) < 3e-6 * peak
@@ -57,7 +58,7 @@ def test_the_uncorrected_factor_equals_the_references(make: object, random_gauss
     g = random_gaussians(10, 9.0)
     raw, double = raw_of(g, DEVICE), in_double(g)
     plain = RayModel(rectified=False)
-    found = autograd.project(*raw, UNIT, geometry, *WHOLE, plain)[0]
+    found = project_raw(*raw, UNIT, geometry, *WHOLE, plain)[0]
     physical = (double.means, double.scales, double.quaternions, double.densities)
     expected = reference.project_view(*physical, geometry, 0, length=plain.length(geometry))
     assert float((found.cpu() - expected).detach().abs().max()) < 3e-6 * float(expected.detach().max())
@@ -106,7 +107,7 @@ def test_the_backward_pass_is_the_adjoint_where_footprints_are_cut(
     g = random_gaussians(25, 14.0)
     raw = raw_of(g, DEVICE)
     y = torch.from_numpy(rng.normal(size=(2, *SHAPE)).astype(np.float32)).to(DEVICE)
-    image = autograd.project(*raw, UNIT, parallel(), 1e-3, 2.0, AFFINE)
+    image = project_raw(*raw, UNIT, parallel(), 1e-3, 2.0, AFFINE)
     (image * y).sum().backward()
     assert raw[3].grad is not None
     back = raw[3].grad.cpu().double() / (UNIT * torch.sigmoid(g.raw_densities.double()))
@@ -116,7 +117,7 @@ def test_the_backward_pass_is_the_adjoint_where_footprints_are_cut(
     raw = raw_of(g, DEVICE)
     grid = Grid((9, 11, 10), 0.9)
     y = torch.from_numpy(rng.normal(size=grid.shape).astype(np.float32)).to(DEVICE)
-    volume = autograd.voxelize(*raw, UNIT, grid, 1e-3, 2.0)
+    volume = voxelize_raw(*raw, UNIT, grid, 1e-3, 2.0)
     (volume * y).sum().backward()
     assert raw[3].grad is not None
     back = raw[3].grad.cpu().double() / (UNIT * torch.sigmoid(g.raw_densities.double()))
@@ -127,7 +128,7 @@ def test_the_backward_pass_is_the_adjoint_where_footprints_are_cut(
 def test_what_misses_the_image_or_is_too_faint_has_no_gradient() -> None:
     g = Gaussians.from_physical([[0.0, 0, 0], [500.0, 0, 0], [0, 0, 1e30]], [1.0, 1.0, 1.0], [1e-9, 1.0, 1.0])
     raw = raw_of(g, DEVICE)
-    image = autograd.project(*raw, 1.0, Geometry.parallel([0.0], (5, 6)), 1e-6, 3.5, AFFINE)
+    image = project_raw(*raw, 1.0, Geometry.parallel([0.0], (5, 6)), 1e-6, 3.5, AFFINE)
     assert not image.any()
     image.sum().backward()
     assert all(tensor.grad is not None and not tensor.grad.any() for tensor in raw)
@@ -139,7 +140,7 @@ def test_a_needle_keeps_its_digits(aspect: float) -> None:
     g = Gaussians.from_physical([[0.1, 0.2, -0.3]], [[0.03 * aspect, 0.03, 0.03]], [1.0], [[0.9, 0.1, 0.35, 0.2]])
     geometry = Geometry.parallel([0.3], (24, 24), 0.05)
     raw, double = raw_of(g, DEVICE), in_double(g)
-    found = autograd.project(*raw, g.density_unit, geometry, *WHOLE, AFFINE)
+    found = project_raw(*raw, g.density_unit, geometry, *WHOLE, AFFINE)
     expected = reference_view(double, geometry, 0)
     assert float((found[0].cpu() - expected).detach().abs().max()) < 1e-5 * float(expected.detach().max())
     found.sum().backward()
@@ -152,8 +153,8 @@ def test_none_one_and_those_that_cover_everything(n: int) -> None:
     g = Gaussians.from_physical(np.full((n, 3), 0.2), np.full((n, 3), 40.0), np.ones(n), density_unit=1.0)
     raw, double = raw_of(g, DEVICE), in_double(g)
     geometry, grid = Geometry.parallel([1.0], (9, 17)), Grid((3, 9, 9))
-    image = autograd.project(*raw, 1.0, geometry, *WHOLE, AFFINE)
-    volume = autograd.voxelize(*raw, 1.0, grid, *WHOLE)
+    image = project_raw(*raw, 1.0, geometry, *WHOLE, AFFINE)
+    volume = voxelize_raw(*raw, 1.0, grid, *WHOLE)
     image.sum().backward()
     volume.sum().backward()
     if n == 0:
@@ -181,10 +182,10 @@ def test_extreme_gaussians_stay_finite() -> None:
     )
     with np.errstate(all="ignore"):  # the interpreter is numpy, which warns of an infinity that a GPU just makes
         for call, where, *model in (
-            (autograd.project, parallel(), AFFINE),
-            (autograd.project, cone(), AFFINE),
-            (autograd.project, cone(), EXACT),
-            (autograd.voxelize, Grid((4, 5, 6))),
+            (project_raw, parallel(), AFFINE),
+            (project_raw, cone(), AFFINE),
+            (project_raw, cone(), EXACT),
+            (voxelize_raw, Grid((4, 5, 6))),
         ):
             raw = raw_of(g, DEVICE)
             out = call(*raw, 1.0, where, 1e-5, 3.5, *model)

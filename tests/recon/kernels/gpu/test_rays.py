@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-
 import numpy as np
 import pytest
 import torch
@@ -13,9 +11,17 @@ from recon.kernels import reference
 from recon.splatting.splat import project
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, in_double
-from tests.recon.kernels.gpu.on_gpu import DEVICE, EXACT, SHAPE, UNIT, WHOLE, assert_gradients, cone, raw_of
-
-autograd = importlib.import_module("recon.kernels.gpu.autograd")
+from tests.recon.kernels.gpu.on_gpu import (
+    DEVICE,
+    EXACT,
+    SHAPE,
+    UNIT,
+    WHOLE,
+    assert_gradients,
+    cone,
+    project_raw,
+    raw_of,
+)
 
 
 def test_exact_rays_and_gradients_equal_the_reference(random_gaussians: Make) -> None:
@@ -24,7 +30,7 @@ def test_exact_rays_and_gradients_equal_the_reference(random_gaussians: Make) ->
     errors = reference.affine_error(double.means, double.scales, double.quaternions, geometry, 0)
     for worst in (0.0, float(errors.median())):
         raw, double = raw_of(g, DEVICE), in_double(g)
-        found = autograd.project(*raw, UNIT, geometry, *WHOLE, RayModel(exact_above=worst))[0]
+        found = project_raw(*raw, UNIT, geometry, *WHOLE, RayModel(exact_above=worst))[0]
         physical = (double.means, double.scales, double.quaternions, double.densities)
         expected = reference.project_view(*physical, geometry, 0, exact=errors > worst)
         assert float((found.detach().cpu() - expected.detach()).abs().max()) < 5e-6 * float(expected.detach().max())
@@ -39,7 +45,7 @@ def test_exact_rays_end_where_the_cpus_end(cut: float, random_gaussians: Make) -
     # To the pixel; and forward and backward agree on where.
     g, geometry = random_gaussians(12, 9.0), cone()
     raw, ours = raw_of(g, DEVICE), as_leaves(g)
-    found = autograd.project(*raw, g.density_unit, geometry, 1e-4, cut, EXACT)[0]
+    found = project_raw(*raw, g.density_unit, geometry, 1e-4, cut, EXACT)[0]
     faint = 1e-4 / (g.density_unit * geometry.sample_pitch * SHAPE[1])
     expected = project(ours, geometry, truncation=Truncation(cut, faint), model=EXACT)[0]
     np.testing.assert_allclose(found.detach().cpu(), expected.detach(), atol=1e-5 * float(expected.detach().max()))

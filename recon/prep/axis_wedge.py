@@ -1,0 +1,200 @@
+"""axis_from_sinogram: the rotation axis from all views, by the double wedge or by their centre of mass."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import fft
+
+from recon.prep.axis_search import (
+    AGREE,
+    AxisError,
+    AxisEstimate,
+    Floats,
+    Search,
+    axis_error,
+    few_rows,
+    lowest,
+    optimum,
+    within,
+)
+
+_MOST_VIEWS, _MOST_COLS = 256, 1024  # enough for 0.1 px
+_STEP = 0.25  # px between candidates
+_WIDEST_GAP = np.deg2rad(20)  # share of a half turn; with a wider gap the double wedge does not determine the axis
+
+
+def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats, search: Search = None) -> AxisEstimate:
+    """Axis from all views, without a pair: for uneven, sparse and noisy scans, sectors and full turns.
+
+    About half a turn or more: the double wedge. The Fourier transform of a sinogram along the columns holds, at
+    frequency ω, only the angular harmonics |n| <= ω r of a sample of radius r. (Edholm, Lewitt & Lindholm 1986; used
+    for the axis by Vo et al. 2014, Opt. Express 22, 19078). About the right axis the view at θ + π is the mirrored view
+    at θ. So the real part has even harmonics only and the imaginary part odd ones. The curve is the residual of a
+    least-squares fit of these harmonics to the views. It takes angles in any spacing and is a sum of cosines of the
+    axis, so nothing is interpolated.
+
+    Less than half a turn, or a wedge that is not confident: the centre of mass of the views, fitted by
+    axis + a cos θ + b sin θ (the first of the Helgason-Ludwig conditions).
+
+    Args:
+        sinogram: float32 [view, col] or [view, row, col], line integrals; a few rows are enough.
+        angles: [view], radians, any order and range.
+        search: (lowest, highest) column; None: the whole detector.
+
+    Raises:
+        ValueError: for shapes that do not fit, fewer than 4 views, or values that are not finite.
+        AxisError: where the best axis lies at the edge of the search range or outside it.
+    """
+    theta = np.asarray(angles, np.float64)
+    if sinogram.ndim not in (2, 3) or theta.shape != sinogram.shape[:1]:
+        raise ValueError(f"sinogram {sinogram.shape} must be [view, col] or [view, row, col] for angles {theta.shape}")
+    data = few_rows(sinogram[:, None] if sinogram.ndim == 2 else sinogram)
+    if len(theta) < 4 or data.shape[2] < 8:
+        raise ValueError(
+            f"{len(theta)} views of {data.shape[2]} columns are too few to find an axis; 4 of 8 are needed"
+        )
+    if not (np.isfinite(data).all() and np.isfinite(theta).all()):
+        raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")
+    if not _covers_half_a_turn(theta):
+        return _axis_from_mass(data, theta, search)
+    wedge = _axis_from_wedge(data, theta, search)
+    if wedge.confident:
+        return wedge
+    with suppress(AxisError):
+        mass = _axis_from_mass(data, theta, search)
+        return mass if mass.confident and abs(mass.value - wedge.value) < AGREE else wedge
+    return wedge
+
+
+def _axis_from_mass(data: Floats, theta: Floats, search: Search) -> AxisEstimate:
+    cols = data.shape[2]
+    order = np.argsort(theta)
+    theta, profile = theta[order], data[order].mean(axis=1)
+    mass = profile.sum(axis=1)
+    if not (mass > 0).all():
+        raise AxisError("some views hold no mass to find an axis from; check the dark and flat correction")
+    basis = np.stack([np.ones_like(theta), np.cos(theta), np.sin(theta)], axis=1)
+    centre = profile @ np.arange(cols) / mass
+    covariance = np.linalg.pinv(basis.T @ basis)
+    solution = covariance @ (basis.T @ centre)
+    residual = centre - basis @ solution
+    value, left_over = float(solution[0]), float(residual @ residual)
+    # An error of the axis adds this much a px² to the sum of squares; the curve is in units of a quarter of the field.
+    rise = 1 / covariance[0, 0]
+    candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
+    curve = (left_over + rise * (candidates - value) ** 2) / (rise * (cols / 4) ** 2)
+    low, high = (candidates[0], candidates[-1]) if search is None else search
+    if not low < value < high:
+        raise axis_error(value, search, candidates, "outside it")
+    # Correlated neighbouring residuals are not independent; air that is not at zero biases the axis without scatter.
+    correlation = float(np.clip(residual[1:] @ residual[:-1] / max(left_over, 1e-30), 0, 0.99))
+    error = np.sqrt(left_over / max(len(theta) - 3, 1) / rise * (1 + correlation) / (1 - correlation))
+    edge = max(2, cols // 40)
+    left, right = float(profile[:, :edge].mean()), float(profile[:, -edge:].mean())
+    bias = abs(left - right) / 2 * cols**2 / 6 + abs(left + right) / 2 * cols * abs(value - (cols - 1) / 2)
+    whole = max(abs(left), abs(right)) < 0.05 * profile.max() and mass.std() < 0.03 * mass.mean()
+    confident = whole and 2 * error + bias / mass.mean() < AGREE
+    return AxisEstimate(value, *within(search, candidates, curve), bool(confident), "centre of mass")
+
+
+def wedge_curves(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
+    """Candidates [n] for the axis, and the mismatch [row, n] of each row of [view, row, col] by the double wedge.
+
+    Raises:
+        ValueError: the views leave a gap in the half turn.
+    """
+    if not _covers_half_a_turn(theta):
+        raise ValueError("the views do not go round half a turn evenly")
+    part, theta, bin_ = _for_wedge(data, theta)
+    omega, fits = _wedge_residuals(part, theta)
+    candidates = np.arange(0, part.shape[2] - 1 + _STEP / 2, _STEP)
+    phase = 2 * np.outer(candidates, omega)
+    fits = fits * omega ** _power(part)
+    curves = fits[0].sum(axis=1)[:, None] + fits[1] @ np.cos(phase).T + fits[2] @ np.sin(phase).T
+    return candidates * bin_ + (bin_ - 1) / 2, curves / np.maximum(fits[0].sum(axis=1), 1e-30)[:, None]
+
+
+def _covers_half_a_turn(theta: Floats) -> bool:
+    half_turn = np.sort(np.mod(theta, np.pi))
+    gap = np.diff(half_turn, append=half_turn[0] + np.pi).max()
+    return bool(gap <= max(_WIDEST_GAP, 4 * np.pi / len(theta)))
+
+
+def _for_wedge(data: Floats, theta: Floats) -> tuple[Floats, Floats, int]:
+    """The necessary views and columns, their angles, and the number of columns that were averaged."""
+    views = np.argsort(np.mod(theta, np.pi), kind="stable")[:: -(-len(theta) // _MOST_VIEWS)]
+    bin_ = -(-data.shape[2] // _MOST_COLS)
+    cols = data.shape[2] // bin_
+    part = data[views, :, : cols * bin_].reshape(len(views), -1, cols, bin_).mean(axis=3)
+    return part, theta[views], bin_
+
+
+def _power(part: Floats) -> int:
+    """Exponent of the frequency that weighs residuals: 2 if the rim is not air (bad low frequencies), otherwise 1."""
+    rim = np.abs(part[:, :, [0, 1, -2, -1]].mean(axis=(0, 1))).max()
+    return 2 if rim > 0.05 * part.mean(axis=(0, 1)).max() else 1
+
+
+def _axis_from_wedge(data: Floats, theta: Floats, search: Search) -> AxisEstimate:
+    part, theta, bin_ = _for_wedge(data, theta)
+    cols = part.shape[2]
+    omega, fits = _wedge_residuals(part, theta)
+    fit = fits.sum(axis=1)
+    candidates = np.arange(0, cols - 1 + _STEP / 2, _STEP)
+    phase = 2 * np.outer(candidates, omega)
+    basis = np.stack([np.ones_like(phase), np.cos(phase), np.sin(phase)])
+
+    def curve_for(power: int) -> Floats:
+        weighted = fit * omega**power
+        return np.einsum("knw,kw->n", basis, weighted) / max(float(weighted[0].sum()), 1e-30)
+
+    power = _power(part)  # one harmonic more and one less must give the same axis
+    curve = curve_for(power)
+    full = candidates * bin_ + (bin_ - 1) / 2
+    value, depth = optimum(full, curve, search)
+    bands = abs(lowest(full, curve_for(power - 1))[0] - lowest(full, curve_for(power + 1))[0])
+    return AxisEstimate(value, *within(search, full, curve), depth > 0.5 and bands < AGREE * bin_, "double wedge")
+
+
+def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
+    """Frequencies ω [k], coefficients [3, row, k] of each row's residual α + β cos 2ωa + γ sin 2ωa about an axis a."""
+    views, rows, cols = data.shape
+    # Subtract air that is not at zero: it is a box fixed to the detector, symmetric about its middle.
+    edge = max(2, cols // 40)
+    left, right = (np.median(part, axis=2)[..., None] for part in (data[:, :, :edge], data[:, :, -edge:]))
+    data = data - (left + (right - left) * np.linspace(0, 1, cols))
+    n = fft.next_fast_len(2 * cols, real=True)
+    radius = cols / 2
+    highest = min(np.pi / 2, 0.7 * views / radius)  # so that there are more views than harmonics
+    k = np.arange(1, max(3, int(highest * n / (2 * np.pi))) + 1)
+    omega = 2 * np.pi * k / n
+    harmonics = np.ceil(omega * radius + 2)
+    spectrum = fft.rfft(data, n, axis=2)[:, :, k].reshape(views, -1)
+    re, im = spectrum.real.copy(), spectrum.imag.copy()
+
+    def residual_power(first: int) -> list[Floats]:
+        """[row, k] re·re, im·im and re·im after the fit of harmonics first, first + 2 ... up to a frequency's limit."""
+        order = np.repeat(np.arange(first, harmonics[-1] + 1, 2), 2)
+        columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
+        if first == 0:  # sin 0
+            columns, order = np.delete(columns, 1, 1), np.delete(order, 1)
+        # Nested: the first m columns of q span the first m harmonics. With torch: NumPy's threads
+        # spin, which takes seconds where other processes use the cores.
+        q, r = (part.numpy() for part in torch.linalg.qr(torch.from_numpy(columns)))
+        independent = np.abs(np.diag(r)) > 0.05 * np.sqrt(views)
+        q, order = torch.from_numpy(q[:, independent]), order[: len(independent)][independent]
+        allowed = order[:, None] <= harmonics
+        in_re, in_im = ((q.T @ torch.from_numpy(part)).numpy().reshape(-1, rows, k.size) for part in (re, im))
+        return [
+            (x * y).reshape(views, rows, -1).sum(axis=0) - (u * v * allowed[:, None]).sum(axis=0)
+            for x, y, u, v in ((re, re, in_re, in_re), (im, im, in_im, in_im), (re, im, in_re, in_im))
+        ]
+
+    # About an axis a the transform is (re + i im) e^{iωa}: even harmonics in its real part, odd in its imaginary part.
+    even, odd = residual_power(0), residual_power(1)
+    cosine2, sine2, mixed = even[0] + odd[1], even[1] + odd[0], odd[2] - even[2]
+    return omega, np.stack([(cosine2 + sine2) / 2, (cosine2 - sine2) / 2, mixed])
