@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.phases import Phases
+from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
-from beamline.projections.correction import ScanCorrection, Warn
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.flag_regions import Regions
 from beamline.projections.flags import UsableViews, usable_views
 from beamline.projections.jumps import find_jumps

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import ScanCorrection, Warn
+from beamline.core.sinks import Warn
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.selection import Selection, cone_of
 from beamline.projections.steps.counts import CountModel
 from beamline.projections.steps.phase import Phase

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import recon
-from beamline.projections.correction import Warn
+from beamline.core.sinks import Warn
 from beamline.projections.held_out import with_held_out
 from beamline.projections.prepare import PreparedProjections
 from recon.assess.plans import Choice, Speeds, plans

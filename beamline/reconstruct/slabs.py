@@ -14,8 +14,8 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Counted, Sink, StateEntered
 from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
+from beamline.core.sinks import Warn
 from beamline.core.text import size
-from beamline.projections.correction import Warn
 from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
 from beamline.projections.selection import choose_views, cone_of, rows_of
 from beamline.projections.steps.resampling import TiltAndLens
