@@ -14,7 +14,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.projections.filters import ViewFilters
 from beamline.projections.open_beam import OpenBeam, count_references
-from beamline.projections.read import current_scale, read_binned, tell_damaged, use_current
+from beamline.projections.read import current_scale, read_binned, reading_memory, tell_damaged, use_current
 from beamline.projections.selection import Selection
 from beamline.projections.steps.counts import CountModel
 from beamline.projections.steps.flags import Flags
@@ -25,6 +25,7 @@ from recon.base.masks import Mask
 from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
 
+_COPIES = 3  # float32 copies of the views that are corrected at once
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
 
 
@@ -272,6 +273,17 @@ class ScanCorrection:
 
     def _refusal(self, error: ValueError) -> DataError:
         return DataError(f"{self._source.path} cannot be corrected: {error}")
+
+
+def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: slice | None = None) -> int:
+    """Bytes that correcting so many frames at once takes, with the line integrals; `rows` as in `at_once`.
+
+    Raises:
+        ConfigError: the selection does not fit the scan.
+    """
+    read = ViewFilters.of(source, selection).read(rows)
+    pixels = frames * (read.stop - read.start) * source.shape[1] // selection.binning**2
+    return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels
 
 
 def _joined(parts: list[Projections], data: NDArray[np.float32]) -> Projections:

@@ -52,6 +52,15 @@ def read_binned(
     return out
 
 
+def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -> int:
+    """Bytes that `read_binned` takes, with what it returns."""
+    pixels, itemsize = (rows.stop - rows.start) * source.shape[1], source.dtype.itemsize
+    at_once = min(frames, max(1, _BATCH_BYTES // max(1, pixels * itemsize))) * pixels
+    if binning == 1:
+        return frames * pixels * (itemsize if source.dtype.kind in "ui" else 4) + at_once * itemsize
+    return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2)  # as float32, with a mask
+
+
 def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     k, rows, cols = raw.shape
     blocks = raw.reshape(k, rows // n, n, cols // n, n)
