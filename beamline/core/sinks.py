@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from queue import SimpleQueue
 from typing import Self, TextIO
 
 from beamline.core.events import Event, Sink, Warned
 from drivers.base.clock import Clock
+
+Warn = Callable[[str], None]
+"""Takes a sentence about something that is wrong though work goes on."""
 
 
 class JsonLines:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import ScanCorrection, Warn
+from beamline.core.sinks import Warn
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews
 from beamline.projections.jumps import longest_part
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,7 @@ from recon.base.noise import noise_level
 from recon.base.volume import Grid
 from recon.prep.background import AirSums, Background, matter
 from recon.splatting.initialise import first_volume
+from recon.voxels.fbp import fbp_memory
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -22,8 +25,26 @@ F64 = NDArray[np.float64]
 
 _VOXELS, _VIEWS = 2**20, 180  # at most, of the volume that tells where the sample is
 _RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off
+_COPIES = 6  # float32 copies of the volume
+_TERMS, _SUMS = 40, 800  # float64 numbers a binned pixel, and a view
 _AT_ONCE, _NOISE_VIEWS = 64, 16  # views
 _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
+
+
+def background_memory(geometry: Geometry) -> int:
+    """Most bytes that `without_background` takes beside such views, about."""
+    small = geometry.binned(_factor(geometry.detector_shape))
+    n, pixels, grid = geometry.n_views, math.prod(small.detector_shape), Grid.matching(small)
+    some = min(n, _VIEWS)
+    fit = 8 * (_TERMS * pixels + _SUMS * n)
+    volume = 4 * _COPIES * math.prod(grid.shape) + fbp_memory(some, grid.shape[2])
+    return fit + volume + 4 * (4 * some + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
+
+
+def _factor(shape: tuple[int, int]) -> int:
+    """By which views are binned, so that a volume of them has few voxels."""
+    rows, cols = shape
+    return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= _VOXELS), rows)
 
 
 class _Views:
@@ -31,8 +52,7 @@ class _Views:
 
     def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
         self.data, (rows, cols) = data, geometry.detector_shape
-        fine = (f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= _VOXELS)
-        self.factor = next(fine, rows)
+        self.factor = _factor((rows, cols))
         filled = np.zeros((1, rows, cols), np.float32) if unknown is None else unknown[None].astype(np.float32)
         self._measured = bin_views(filled, self.factor)[0] == 0
         self.geometry = geometry.binned(self.factor)

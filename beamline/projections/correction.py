@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,38 +11,22 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.text import count, spans
-from beamline.projections.read import (
-    current_scale,
-    open_beam,
-    photons_of,
-    read_binned,
-    read_references,
-    use_current,
-    with_dynamic_flats,
-)
-from beamline.projections.selection import Selection, rows_of
-from beamline.projections.steps.air import Air
+from beamline.core.sinks import Warn
+from beamline.projections.filters import ViewFilters
+from beamline.projections.open_beam import OpenBeam, count_references
+from beamline.projections.read import current_scale, read_binned, reading_memory, tell_damaged, use_current
+from beamline.projections.selection import Selection
 from beamline.projections.steps.counts import CountModel
-from beamline.projections.steps.defects import Defects
 from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.flats import Flats
-from beamline.projections.steps.references import ReferenceCheck
-from beamline.projections.steps.step import StepDone, ViewFilter, ViewStep
+from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
-from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
-from recon.prep.correct import Correction, CorrectionSettings, Projections, References, Transmission, UnlitViewsError
+from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError
 from recon.prep.counts import Photons
-from recon.prep.defects import SHADOW_REACH, shadowed
 
-_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # by which a shadow is found, and rows at a time
+_COPIES = 3  # float32 copies of the views that are corrected at once
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
-
-Warn = Callable[[str], None]
-"""Takes a sentence about something that is wrong though work goes on."""
 
 
 class ScanCorrection:
@@ -61,46 +45,28 @@ class ScanCorrection:
                 without the counts of a photon.
             DataError: references that cannot be used.
         """
-        self.rows, self.binning = rows_of(source, selection), selection.binning
-        counted = selection.step(CountModel).noise == "counts"
-        self._filters: list[ViewFilter] = []
-        self._filtered: dict[str, StepDone] = {}
-        for step in selection.in_order:
-            if isinstance(step, ViewStep):
-                found, self._filtered[step.name] = step.on(source, selection)
-                self._filters += [] if found is None else [found]
-        if self._filters:
-            if counted:
-                raise ConfigError(
-                    f"{self._filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
-                )
+        self._filters = ViewFilters.of(source, selection)
+        self.rows, self.binning = self._filters.rows, selection.binning
+        if self._filters.filters:
             selection = selection.having(CountModel("log"))
         self._source, self._selection, self._warn = source, selection, warn
         if source.altered:
             warn(altered_said(source))
-        defects = selection.step(Defects)
-        self._settings = CorrectionSettings(
-            defects.floor, defects.hot_threshold, defects.zinger_threshold, selection.step(Air).columns
-        )
-        self._current_factor = current_scale(source) if use_current(selection) else None  # [frame], by the ring current
-        wide, _ = self._widened(None)
-        self._n_references = _count_references(source)
-        self._references: References | None = None
+        self._beam: OpenBeam | None = None
         self._shadow: Mask | None = None  # [row, col] of the rows read, binned; None: not looked for
-        self.photons: Photons | None = None
-        if counted and source.quantity != "counts":
-            raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
         if source.quantity == "counts":
-            groups = reference_groups(source)
-            used = groups if selection.step(ReferenceCheck).accepted else groups.good()
-            self._references = read_references(source, used, wide, selection)
-            if selection.step(Flats).fields == "dynamic":
-                self._references = with_dynamic_flats(source, used, self._references, wide, selection)
-            self._tell_damaged(np.concatenate([*used.darks, *used.flats]))
-            self._tell_parts_without_flats(self._references)
-            self.photons = photons_of(source, used, self._references, self.rows, selection)
+            self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
+        elif selection.step(CountModel).noise == "counts":
+            raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
+        elif use_current(selection):
+            current_scale(source)  # refuses a file without any
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
+
+    @property
+    def photons(self) -> Photons | None:
+        """How pixels count photons; None: they do not, or logarithms are taken."""
+        return None if self._beam is None else self._beam.photons
 
     def at_once(
         self,
@@ -119,12 +85,12 @@ class ScanCorrection:
             DataError: frames that cannot be corrected; the message names the file.
         """
         self._look_for_shadow(frames)
-        steps = 1 if self._references is None else _STEPS
+        steps = 1 if self._beam is None else _STEPS
         data, frames = self._read(frames, rows, lambda n, of: progress(n // steps, of))
         if not frames.size:
             raise self._no_view()
-        if self._references is None:
-            return self._filtered_views(_as_given(data, frames), rows)
+        if self._beam is None:
+            return self._filters.apply(_as_given(data, frames), rows)
         return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, progress=progress)
 
     def in_batches(
@@ -145,9 +111,9 @@ class ScanCorrection:
                 f"memory. Give --noise log, or --bin {2 * self.binning}."
             )
         self._look_for_shadow(frames)
-        parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._references is None else 2
+        parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._beam is None else 2
         stream, columns, alive = None, (0, 0), []
-        if self._references is not None:
+        if self._beam is not None:
             survey = self._correction(None)
             for done, part in enumerate(parts):
                 data, found = self._read(part, None)
@@ -156,8 +122,8 @@ class ScanCorrection:
                     survey.survey(self._transmission(survey, data, found))
                 progress(min((done + 1) * batch, frames.size), passes * frames.size)
             columns = survey.air_columns
-            settings = replace(self._settings, air=columns if any(columns) else "none")
-            stream = Correction(self._references, settings, masked=survey.masked)
+            settings = replace(self._beam.settings, air=columns if any(columns) else "none")
+            stream = Correction(self._beam.references, settings, masked=survey.masked)
             parts = [found for found in alive if found.size]
         at, kept, begun = 0, [], (passes - 1) * frames.size
         for done, part in enumerate(parts):
@@ -166,7 +132,7 @@ class ScanCorrection:
             if stream is not None:
                 corrected = self._corrected(stream, data, found, last)
             elif found.size:
-                corrected = self._filtered_views(_as_given(data, found), None)
+                corrected = self._filters.apply(_as_given(data, found), None)
             else:
                 continue
             n = len(corrected.data)
@@ -189,8 +155,8 @@ class ScanCorrection:
             DataError: as `at_once`.
         """
         data, frames = self._read(frames, None)
-        if self._references is None:
-            return self._filtered_views(_as_given(data, frames), None) if frames.size else None
+        if self._beam is None:
+            return self._filters.apply(_as_given(data, frames), None) if frames.size else None
         if self._stream is None:
             self._stream = self._correction(None)
         if not frames.size and not (last and self._stream.waiting):
@@ -204,75 +170,21 @@ class ScanCorrection:
     def newest(self) -> Projections | None:
         """Line integrals of the newest view while it waits for the next, as if none came after it."""
         part = None if self._stream is None else self._stream.provisional()
-        return None if part is None else self._filtered_views(part, None)
+        return None if part is None else self._filters.apply(part, None)
 
     @property
     def done(self) -> dict[str, StepDone]:
         """What each step did, by name."""
-        if self._references is None:
-            return {**{name: StepDone(parameters={}) for name in ("flats", "defects", "noise")}, **self._filtered}
-        flats, noise, settings = self._flats, self._noise, asdict(self._settings)
-        recorded = {name: value if isinstance(value, float) else str(value) for name, value in settings.items()}
-        return {
-            "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
-            "flats": StepDone(flats, {"flats": flats or self._selection.step(Flats).fields}),
-            "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
-            **self._filtered,
-        }
-
-    @property
-    def _flats(self) -> str:
-        """What was done about changes of the beam, in words; empty where nothing was asked."""
-        said = []
-        if self._current_factor is not None:
-            currents = 1 / self._current_factor[self._source.image_key == FrameKind.PROJECTION]
-            said.append(
-                f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
-            )
-        if self._references is not None and self._references.dynamic is not None:
-            n = len(self._references.dynamic.components)
-            said.append(
-                f"Flats: {count(n, 'component')} of their changes, weighed for each view (dynamic)."
-                if n
-                else "Flats: they do not differ by more than noise; their mean is used."
-            )
-        return " ".join(said)
-
-    def _look_for_shadow(self, views: NDArray[np.int64]) -> None:
-        """Find what stands in the beam of all views of a finished scan, by some of these; once."""
-        known = self._references is None or self._shadow is not None
-        if known or not self._source.finished or views.size < _LEAST_VIEWS:
-            return
-        assert self._references is not None
-        references, first = replace(self._references, dynamic=None), self._widened(None)[0].start
-        found = np.zeros(self._references.dark.shape, np.bool_)
-        views = views[np.linspace(0, views.size - 1, min(views.size, _SHADOW_VIEWS)).astype(int)]
-        for start in range(0, len(found), _BAND):
-            rows = slice(max(0, start - SHADOW_REACH), min(len(found), start + _BAND + SHADOW_REACH))
-            read = slice(first + rows.start * self.binning, first + rows.stop * self.binning)
-            data = np.nan_to_num(read_binned(self._source, views, read, self.binning))
-            plain = Correction(references.rows(rows), replace(self._settings, air="none"))
-            light = plain.transmission(data, views.astype(np.float64)).data
-            found[start : start + _BAND] = shadowed(light, self._settings.floor)[start - rows.start :][:_BAND]
-        self._shadow = np.zeros_like(found) if found.all() else found
-
-    @property
-    def _noise(self) -> str:
-        """How counts become line integrals, in words; empty where they are logarithms."""
-        if self.photons is None or self._references is None:
-            return ""
-        light, readout = open_beam(self._references, self.photons), self.photons.variance**0.5
-        return (
-            f"Photons are counted: {light:.3g} a pixel in the open beam, {self.photons.gain:.3g} counts each, readout "
-            f"noise {readout:.3g} counts"
-        )
+        nothing = {name: StepDone(parameters={}) for name in ("flats", "defects", "noise")}
+        return {**(nothing if self._beam is None else self._beam.done), **self._filters.done}
 
     @property
     def outdated(self) -> bool:
         """Views that were fed would be corrected otherwise now: by references that came later, or other air columns."""
-        if self._references is None or self._stream is None:
+        if self._beam is None or self._stream is None:
             return False
-        return _count_references(self._source) != self._n_references or self._columns != {self._stream.air_columns}
+        more = count_references(self._source) != self._beam.n_references
+        return more or self._columns != {self._stream.air_columns}
 
     def renewed(self) -> ScanCorrection:
         """A correction of the same views by all references that are there now."""
@@ -285,38 +197,16 @@ class ScanCorrection:
         progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one and are not damaged, and these frames."""
-        data = read_binned(self._source, frames, self._widened(rows)[0], self.binning, progress)
+        data = read_binned(self._source, frames, self._filters.read(rows), self.binning, progress)
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             lost = frames[~alive]
             self._warn(f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out.")
             data, frames = data[alive], frames[alive]
-        if (damaged := self._tell_damaged(frames)).any() and self._selection.step(Flags).used:
+        damaged = tell_damaged(self._source, self._selection, frames, self._warn)
+        if damaged.any() and self._selection.step(Flags).used:
             data, frames = data[~damaged], frames[~damaged]
         return data, frames
-
-    def _tell_damaged(self, frames: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of the frames are not what was written, as far as they were read; a warning names them."""
-        damaged = np.isin(frames, sorted(self._source.damaged))
-        if damaged.any():
-            taken = "left out" if self._selection.step(Flags).used else "used as they are (--flags ignore)"
-            self._warn(
-                f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
-                f"checksums: {taken}. Look for a good copy of {self._source.path}."
-            )
-        return damaged
-
-    def _tell_parts_without_flats(self, references: References) -> None:
-        """A warning for each part of the scan whose views are corrected by the flats of another part."""
-        starts = self._source.part_starts
-        flats = [position for position, _ in references.flats]
-        for start, end in zip(starts, [*starts[1:], self._source.image_key.size], strict=True):
-            has_views = (self._source.image_key[start:end] == FrameKind.PROJECTION).any()
-            if has_views and not any(start <= position < end for position in flats):
-                self._warn(
-                    f"Frames {start}-{end - 1}, a part of the scan, have no flats of their own that can be used. The "
-                    f"nearest flats of another part correct their views, though the beam may have changed."
-                )
 
     def _no_view(self) -> DataError:
         return DataError(
@@ -324,40 +214,18 @@ class ScanCorrection:
             "that were written."
         )
 
+    def _look_for_shadow(self, views: NDArray[np.int64]) -> None:
+        """Find what stands in the beam of all views of a finished scan, by some of these; once."""
+        if self._beam is not None and self._shadow is None and self._source.finished:
+            first = self._filters.read(None).start
+            self._shadow = self._beam.shadow(self._source, views, first, self.binning)
+
     def _correction(self, rows: slice | None) -> Correction:
-        assert self._references is not None
-        first = self._widened(None)[0].start
-        part = self._widened(rows)[0]
-        within = slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
-        references = self._references.rows(within)
+        assert self._beam is not None
         try:
-            found = Correction(references, self._settings, photons=self.photons)
-            if self._shadow is not None and (shadow := self._shadow[within]).any():
-                found = Correction(references, self._settings, found.masked | shadow, self.photons)
-            return found
+            return self._beam.correction(self._filters.within(rows), self._shadow)
         except ValueError as error:
             raise self._refusal(error) from error
-
-    def _widened(self, rows: slice | None) -> tuple[slice, slice]:
-        """Detector rows to read for some binned rows (None: all), with the rows around that a filter or new pixels
-        need. Then which of the rows read are wanted, in binned rows."""
-        first, end = self.rows.start, self.rows.stop
-        if rows is not None:
-            start, stop, _ = rows.indices((end - first) // self.binning)
-            first, end = first + start * self.binning, first + stop * self.binning
-        n, reach = self.binning, sum(each.reach for each in self._filters)
-        above = min(reach, first // n)
-        below = min(reach, (self._source.shape[0] - end) // n)
-        return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
-
-    def _filtered_views(self, part: Projections, rows: slice | None) -> Projections:
-        """The views through the filters of the steps, in the rows wanted."""
-        if not self._filters or not part.view_ids.size:
-            return part
-        read, wanted = self._widened(rows)
-        for each in self._filters:
-            part = each.apply(part, read.start)
-        return replace(part, data=np.ascontiguousarray(part.data[:, wanted]), masked=part.masked[wanted])
 
     def _corrected(
         self,
@@ -375,7 +243,7 @@ class ScanCorrection:
                 views = self._transmission(correction, data, frames, lambda done: progress((n + done) // _STEPS, n))
                 correction.survey(views)
             lines = correction.line_integrals(views, last, lambda done: progress((2 * n + done) // _STEPS, n))
-            return self._filtered_views(lines, rows)
+            return self._filters.apply(lines, rows)
         except UnlitViewsError as error:
             judged = self._selection.step(Flags).judged
             advice = "" if judged else " (--flags judge leaves out what the monitor finds dark)"
@@ -396,8 +264,8 @@ class ScanCorrection:
             views = correction.transmission(data, frames.astype(np.float64), frames, progress)
         except ValueError as error:
             raise self._refusal(error) from error
-        if self._current_factor is not None:
-            light = self._current_factor[frames].astype(np.float32)[:, None, None]
+        if self._beam is not None and self._beam.current_factor is not None:
+            light = self._beam.current_factor[frames].astype(np.float32)[:, None, None]
             np.multiply(views.data, light, out=views.data)
             if views.beam is not None:
                 np.divide(views.beam, light, out=views.beam)
@@ -407,8 +275,15 @@ class ScanCorrection:
         return DataError(f"{self._source.path} cannot be corrected: {error}")
 
 
-def _count_references(source: ScanSource) -> int:
-    return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
+def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: slice | None = None) -> int:
+    """Bytes that correcting so many frames at once takes, with the line integrals; `rows` as in `at_once`.
+
+    Raises:
+        ConfigError: the selection does not fit the scan.
+    """
+    read = ViewFilters.of(source, selection).read(rows)
+    pixels = frames * (read.stop - read.start) * source.shape[1] // selection.binning**2
+    return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels
 
 
 def _joined(parts: list[Projections], data: NDArray[np.float32]) -> Projections:

@@ -1,17 +1,28 @@
-"""Views by their flags: those with an alarm are left out, those with a warning weigh less; or only a part of them."""
+"""Usable views of a scan: what refuses all of them, and which its flags leave out or give less weight."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.errors import DataError
+from beamline.core.sinks import Warn
 from beamline.core.text import count
 from beamline.projections.flag_regions import Regions, regions_of
+from beamline.projections.replay import judged_flags
+from beamline.projections.selection import Selection
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.references import ReferenceCheck
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.flags import frames_flagged
+from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.treatment import treatment_of
+from beamline.storage.rules.validate import quantity_said, references_present, scan_findings
 from drivers.base.frame import FrameKind
 
 WARNED_WEIGHT = 0.5
@@ -42,6 +53,10 @@ class UsableViews:
     flags: FrameFlags | None = None
     regions: Regions = field(default_factory=Regions)
     jumps: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def only(self, frames: NDArray[np.int64]) -> UsableViews:
+        """The same without the frames that are not among these."""
+        return replace(self, frames=frames, left_out=self.left_out + self.frames.size - frames.size)
 
     def weights_of(self, rows: NDArray[np.int64]) -> NDArray[np.float32] | None:
         """[view] weights of some rows of the file; None where they all weigh the same."""
@@ -78,6 +93,43 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     said = f"{treated.said}{gap} --flags ignore takes all alike."
     regions = regions_of(treated.flags, source.shape)
     return UsableViews(good, weights, int(treated.left_out.sum()), said, flags, regions, treated.jumps)
+
+
+def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
+    """The views of a finished scan that may be used, by the flags of the monitor.
+
+    What else its file lacks is told as a warning, also what its flags mean for this scan.
+
+    Raises:
+        DataError: it cannot be reconstructed; with every reason, and what to do about each.
+    """
+    flags = selection.step(Flags)
+    judged = judged_flags(source) if flags.judged and source.finished else None
+    findings = [*scan_findings(source), *references_usable(source, selection.step(ReferenceCheck).accepted)]
+    if flags.used:
+        findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
+    refuse(source, findings)
+    usable = usable_views(source, flags.used, judged)
+    if usable.said:
+        warn(usable.said)
+    for finding in findings:
+        if finding.severity == "warning":
+            warn(finding.message)
+    return usable
+
+
+def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
+    """Raises DataError for the errors among the findings, with what to do about each."""
+    reasons = [finding.message for finding in findings if finding.severity == "error"]
+    if reasons:
+        raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
+
+
+def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
+    """Why the frames of a scan that is still growing cannot be corrected."""
+    checked = () if selection.step(ReferenceCheck).accepted else (references_usable,)
+    rules = (quantity_said, references_present, *checked)
+    return [finding for rule in rules for finding in rule(source)]
 
 
 def _widest_gap(angles: NDArray[np.float64], period: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.projections.steps.hardening import Hardening
 from recon.base.arrays import F32
@@ -14,12 +15,15 @@ from recon.base.volume import Grid, Volume
 from recon.post.clusters import k_means
 from recon.prep.hardening import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
 from recon.reconstruction import reconstruct
+from recon.voxels.fbp import fbp_memory
 from recon.voxels.projector import project
 
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
 _LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
 _AS_EVEN = 1e-3  # by which the mass may vary more, of itself: noise grows, too
+_CURVED = 24  # float32 copies of a view while a curve corrects it
+_RAYS, _VOLUMES = 16, 10  # float32 copies of the views and of the volume while a curve is fitted
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
 
 
@@ -40,6 +44,17 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
     return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
 
 
+def curve_memory(geometry: Geometry, fitted: bool) -> int:
+    """Most bytes that the curve of such views takes, and their correction by it."""
+    rows, cols = geometry.detector_shape
+    view = _CURVED * 4 * rows * cols
+    if not fitted:
+        return view
+    _, _, small = _small(geometry)
+    grid, rays = Grid.matching(small), small.n_views * math.prod(small.detector_shape)
+    return max(view, 4 * (_RAYS * rays + _VOLUMES * math.prod(grid.shape)) + fbp_memory(small.n_views, grid.shape[2]))
+
+
 def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     """The curve by the paths through the sample as its own reconstruction shows it, taken as one material.
 
@@ -55,11 +70,8 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
     """
     if geometry.is_cone:
         raise NoCurveError("that takes a parallel beam, whose views all hold the same mass: state material and beam")
-    n, rows, cols = views.shape
-    factor = max(1, min(round(cols / _COLS), rows))
-    some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
+    some, factor, small = _small(geometry)
     measured = np.concatenate([bin_views(views[view : view + 1], factor) for view in some])
-    small = geometry.select(some).binned(factor)
     grid, highest, now, before = Grid.matching(small), max(float(view.max()) for view in views), measured, math.inf
     for _ in range(_ROUNDS):
         volume = reconstruct(now, small, "fbp", grid=grid).volume.data
@@ -80,6 +92,14 @@ def fitted(views: F32, geometry: Geometry) -> tuple[Curve, float]:
                 )
             return curve, explained
     raise NoCurveError(f"the curve does not settle in {_ROUNDS} rounds")
+
+
+def _small(geometry: Geometry) -> tuple[NDArray[np.int64], int, Geometry]:
+    """Views and a binning that are enough for a curve, and the geometry that they have."""
+    n, (rows, cols) = geometry.n_views, geometry.detector_shape
+    some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).astype(int))
+    factor = max(1, min(round(cols / _COLS), rows))
+    return some, factor, geometry.select(some).binned(factor)
 
 
 def _unevenness(views: F32) -> float:

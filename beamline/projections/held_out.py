@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from recon.base.geometry import Geometry
 
 F32 = NDArray[np.float32]

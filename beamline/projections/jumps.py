@@ -10,12 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import count
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrection, at_once_memory
+from beamline.projections.flags import usable_views
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
+from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
-from recon.voxels.displacement import Displacement, Judgement, displaced, displacements, judge
+from recon.base.volume import Grid
+from recon.voxels.displacement import SWEEPS, Displacement, Judgement, displaced, displacements, judge
+from recon.voxels.methods.os_sirt_tv import OsSirtTv
 
 LEAST = 6  # views of a part that its displacement is fitted to
 LARGEST = 0.5  # pixels that nobody sees: a doubled edge as wide as the resolution begins there (see the check `motion`)
@@ -26,13 +32,14 @@ _HELPS = 0.005  # share of the deviation that a jump takes away, or a part may a
 _ROWS = 16  # binned rows looked at
 _VIEWS = 360  # looked at, and all of parts that have no more than
 _SHORT = 40
+_COPIES = 24  # float32 copies of the views looked at while they are registered
 
 I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Jumps:
-    """How the views of a scan in which the sample jumped are used.
+class Places:
+    """Where the sample was in the views of a scan in which it jumped.
 
     Attributes:
         starts: int64, rows of the file at which a part begins, without the first.
@@ -45,6 +52,11 @@ class Jumps:
     starts: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     moves: tuple[Displacement, ...] = (Displacement(),)
     said: str = ""
+
+    @property
+    def done(self) -> StepDone:
+        """What the step did; the file of a volume records jumps where there were some."""
+        return StepDone(self.said, {"jumps": self.said} if self.said else {}, warned=True)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The geometry of these rows of the file, views shifted and turned as the sample was."""
@@ -66,7 +78,7 @@ def find_jumps(
     jumps: I64,
     axis_col: float,
     progress: Callable[[int, int], None] = lambda n, most: None,
-) -> Jumps:
+) -> Places:
     """Where the sample was in each part of a scan between jumps, and which of the views can be used.
 
     A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
@@ -80,10 +92,10 @@ def find_jumps(
     """
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
-        return Jumps(frames)
+        return Places(frames)
     if cone_of(source, selection) is not None:
         where = frames_text(jumps)
-        return Jumps(
+        return Places(
             frames,
             said=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as if "
             "it had not moved. Choose those of one side with --views.",
@@ -107,6 +119,25 @@ def find_jumps(
     if not bad.size and fit.largest(moves) < LARGEST:
         return _done(fit, [], _groups(fit.sizes, []), [Displacement()])
     return _done(fit, real, np.where(spoilt, -1, groups), moves, found.verdict, bool(bad.size))
+
+
+def search_memory(source: ScanSource, selection: Selection) -> int:
+    """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
+    flags, jumps = selection.step(Flags), usable_views(source, selection.step(Flags).used).jumps
+    if cone_of(source, selection) is not None or not (flags.judged or jumps.size):
+        return 0
+    frames = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    fit = _Fit(source, selection, (source.shape[1] - 1) / 2, frames, jumps)
+    n = min(frames.size, _VIEWS + _SHORT * (1 + jumps.size))
+    most, looked_at = 0, 0
+    for factor, _ in fit.levels():
+        band = fit.band(factor)
+        views = geometry_of(source, band, fit.axis_col, np.linspace(0, math.pi, n, endpoint=False))
+        copy = 4 * n * math.prod(views.detector_shape)
+        work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
+        looked_at += copy
+        most = max(most, at_once_memory(source, band, n), work + _COPIES * copy)
+    return looked_at + most
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,13 +277,13 @@ class _Fit:
         """Views of each group of parts; those of parts in no group (-1) are not among them."""
         group = groups[_parts(self.jumps, self.frames)]
         frames, group = self.frames[group >= 0], group[group >= 0]
-        band = self._band(factor)
+        band = self.band(factor)
         views = ScanCorrection(self.source, band, _quiet).at_once(frames[_thinned(group)])
         kept = group[np.searchsorted(frames, views.view_ids)]
         geometry = geometry_of(self.source, band, self.axis_col, self.source.angles[views.view_ids])
         return _Views(views.data, geometry, kept, ~areas(views.masked), rounds)
 
-    def _band(self, factor: int) -> Selection:
+    def band(self, factor: int) -> Selection:
         """Binned pixels, and rows around the middle of those that are used, also outside them."""
         binning = self.selection.binning * factor
         used, height = rows_of(self.source, self.selection), self.source.shape[0]
@@ -269,7 +300,7 @@ def _done(
     moves: Sequence[Displacement],
     verdict: Judgement | None = None,
     unlike: bool = False,
-) -> Jumps:
+) -> Places:
     """The views that are used, where the sample is in them, and what was done in a line.
 
     Args:
@@ -305,7 +336,7 @@ def _done(
             f"After the alarm of motion at {frames_text(fit.jumps[none])} the other views show nothing (less than "
             f"{LARGEST:g} px): views on both sides are used as they are."
         )
-    return Jumps(frames, fit.jumps, places, " ".join(text))
+    return Places(frames, fit.jumps, places, " ".join(text))
 
 
 def _parts(jumps: I64, rows: I64) -> I64:

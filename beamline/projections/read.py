@@ -10,25 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.sinks import Warn
+from beamline.core.text import spans
 from beamline.projections.selection import Selection
-from beamline.projections.steps.counts import CountModel
 from beamline.projections.steps.defects import Defects
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.flats import Flats
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups
 from drivers.base.frame import FrameKind
-from recon.base.choices import FEW_PHOTONS
 from recon.prep.correct import References
-from recon.prep.counts import Photons, photon_transfer
 from recon.prep.defects import dead_pixels
 from recon.prep.dynamic_flats import find_dynamic_flats
 
 _BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
-
-_PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
-
-_TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
 def read_binned(
@@ -55,6 +50,15 @@ def read_binned(
         out[start : start + batch] = raw
         progress(min(start + batch, len(frames)), len(frames))
     return out
+
+
+def reading_memory(source: ScanSource, frames: int, rows: slice, binning: int) -> int:
+    """Bytes that `read_binned` takes, with what it returns."""
+    pixels, itemsize = (rows.stop - rows.start) * source.shape[1], source.dtype.itemsize
+    at_once = min(frames, max(1, _BATCH_BYTES // max(1, pixels * itemsize))) * pixels
+    if binning == 1:
+        return frames * pixels * (itemsize if source.dtype.kind in "ui" else 4) + at_once * itemsize
+    return 4 * frames * pixels // binning**2 + at_once * (itemsize + 4 + 2)  # as float32, with a mask
 
 
 def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
@@ -121,6 +125,18 @@ def with_dynamic_flats(
     return replace(references, dynamic=found)
 
 
+def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> NDArray[np.bool_]:
+    """Which of the frames are not what was written, as far as they were read; a warning names them."""
+    damaged = np.isin(frames, sorted(source.damaged))
+    if damaged.any():
+        taken = "left out" if selection.step(Flags).used else "used as they are (--flags ignore)"
+        warn(
+            f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
+            f"checksums: {taken}. Look for a good copy of {source.path}."
+        )
+    return damaged
+
+
 def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
     """By how much the light of each frame grows from its own exposure to the projections'; 1 where one is unknown.
 
@@ -174,59 +190,3 @@ def _mean(
             total += image if weights is None else weights[i] * image
             n += 1
     return total / n if n else None
-
-
-def photons_of(
-    source: ScanSource, used: ReferenceGroups, references: References, rows: slice, selection: Selection
-) -> Photons | None:
-    """How the pixels of a scan count photons, as they are read (binned); None: their logarithms are to be taken.
-
-    The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
-    of the largest group of darks.
-
-    Raises:
-        ConfigError: counts are asked for, and the flats do not tell the gain. Or the gain given makes the photons of
-            the open beam too many or too few for any detector.
-    """
-    wanted = selection.step(CountModel)
-    if wanted.noise == "log":
-        return None
-    binning = selection.binning
-    first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
-    middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
-    spoilt = [] if not selection.step(Flags).used else sorted(source.damaged)
-    flats, darks = (
-        read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
-        for groups in (used.flats, used.darks)
-    )
-    if wanted.gain is not None:  # a mean of n pixels has n times as many photons a count
-        light = _open_beam_counts(references) * binning**2 / wanted.gain
-        low, high = _PHOTONS
-        if not low <= light <= high:
-            raise ConfigError(
-                f"--gain {wanted.gain:g} makes {light:.3g} photons a pixel of the open beam of {source.path}; "
-                f"expected {low:g} to {high:g}. Give counts a photon, or leave --gain out."
-            )
-        variance = float(np.median(darks.var(axis=0, ddof=1))) if len(darks) > 1 else 0.0
-        found = Photons(wanted.gain / binning**2, variance)
-    else:
-        try:
-            found = Photons(*photon_transfer(flats, darks if len(darks) > 1 else None))
-        except ValueError as error:
-            if wanted.noise == "auto":
-                return None
-            raise ConfigError(
-                f"--noise counts: {source.path} does not tell the counts of a photon: {error}. Say --gain COUNTS."
-            ) from error
-    if wanted.noise == "auto" and not open_beam(references, found) < FEW_PHOTONS:
-        return None
-    return found
-
-
-def open_beam(references: References, photons: Photons) -> float:
-    """Photons in a pixel of the open beam, the median of the flats."""
-    return _open_beam_counts(references) / photons.gain
-
-
-def _open_beam_counts(references: References) -> float:
-    return float(np.median(references.flats[0][1] - references.dark))

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.projections.correction import ScanCorrection, Warn
+from beamline.core.sinks import Warn
+from beamline.projections.correction import ScanCorrection, at_once_memory
 from beamline.projections.selection import Selection, cone_of
 from beamline.projections.steps.counts import CountModel
 from beamline.projections.steps.phase import Phase
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.readers.base import ScanSource
+from drivers.base.frame import FrameKind
 from recon.prep.tilt import FEWEST_BANDS, STEEPEST, TiltEstimate, find_tilt
 
 _BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240
@@ -25,6 +27,7 @@ _MATTERS = 0.5  # px over the rows
 _NOTHING = 0.05  # px over the rows, not worth new pixels
 _SURE = 3.0  # standard deviations from which on a tilt is one
 _ROUNDS = 5
+_COPIES = 12  # float32 copies of all bands while their axes are found
 BandsDone = Callable[[int, int], None]
 """(n, N): so many are done, of so many."""
 
@@ -65,6 +68,17 @@ def with_tilt(
     if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
         return selection.having(replace(step, tilt=0.0)), f"{said}: not corrected."
     return selection.having(replace(step, tilt=math.degrees(tilt))), f"{said}; views are turned."
+
+
+def search_memory(source: ScanSource, selection: Selection) -> int:
+    """Bytes that `with_tilt` takes at most, if it is to find the tilt."""
+    step, frames = selection.step(TiltAndLens), int((source.image_key == FrameKind.PROJECTION).sum())
+    steepest = replace(_plain(selection), rows=None).having(replace(step, tilt=math.degrees(STEEPEST)))
+    n, cols = min(frames, _VIEWS), source.shape[1] // selection.binning
+    rows = source.shape[0] // selection.binning
+    middle = max(0, rows // 2 - _BAND_ROWS)
+    band = at_once_memory(source, steepest, n, slice(middle, min(rows, middle + _BAND_ROWS)))
+    return 4 * n * _BANDS * cols + max(band, _COPIES * 4 * n * _BANDS * cols)
 
 
 def warn_of_tilt(
@@ -119,7 +133,7 @@ def _refined(
     Raises:
         ValueError: see `find_tilt`.
     """
-    plain, step = selection.having(Phase(), CountModel("log")), selection.step(TiltAndLens)
+    plain, step = _plain(selection), selection.step(TiltAndLens)
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
@@ -129,6 +143,11 @@ def _refined(
         if abs(found.tilt) < found.uncertainty / 4 or abs(found.tilt) * rows < _NOTHING / 2:
             break
     return tilt, found.uncertainty
+
+
+def _plain(selection: Selection) -> Selection:
+    """Without what blurs the views."""
+    return selection.having(Phase(), CountModel("log"))
 
 
 def _after(before: int, total: int, progress: BandsDone) -> BandsDone:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import recon
-from beamline.projections.correction import Warn
+from beamline.core.sinks import Warn
 from beamline.projections.held_out import with_held_out
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from recon.assess.plans import Choice, Speeds, plans
 from recon.assess.time_model import duration_text
 from recon.auto import is_wider

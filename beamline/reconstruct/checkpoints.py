@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing
-from beamline.projections.correction import Warn
-from beamline.projections.prepare import PreparedProjections
+from beamline.core.sinks import Warn
+from beamline.projections.prepared import PreparedProjections
 from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.writers.recon_file import Value
 from recon.base.geometry import Geometry

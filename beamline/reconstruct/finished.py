@@ -19,7 +19,7 @@ from beamline.core.phases import Phases
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch, StopScope, never_stopped
 from beamline.projections.held_out import hold_out, with_held_out
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
@@ -136,7 +136,7 @@ def reconstruct_file(
 
 def announce(options: ReconOptions, prepared: PreparedProjections, sink: Sink, clock: Clock) -> None:
     """Report the requested corrections of the views, then send the event `recon_started`."""
-    corrections_done({name: done.said for name, done in prepared.done.items()}, sink, clock)
+    corrections_done({name: done.said for name, done in prepared.done.items() if not done.warned}, sink, clock)
     views, confident = prepared.geometry, None if prepared.axis is None else prepared.axis.confident
     more = {"n_projections": prepared.n_projections, "detector": views.detector_shape, "axis_confident": confident}
     sink(

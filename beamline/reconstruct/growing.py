@@ -14,18 +14,13 @@ from beamline.core.sinks import Warnings
 from beamline.core.stop import StopLatch
 from beamline.core.text import count
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.flags import UsableViews, usable_views
+from beamline.projections.flags import UsableViews, checked_views, correction_blockers, refuse, usable_views
 from beamline.projections.jumps import frames_text
-from beamline.projections.prepare import (
-    PreparedProjections,
-    assemble,
-    checked_views,
-    correction_blockers,
-    refuse,
-)
+from beamline.projections.prepare import assemble
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, geometry_of
 from beamline.projections.steps.flags import Flags
-from beamline.projections.steps.step import ScanStep, StepDone
+from beamline.projections.steps.step import PlaceStep, ScanStep, StepDone
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
@@ -334,9 +329,13 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        found = assemble(self.source, selection, projections, (axis_col, self._axis.estimate), usable, self._warn)
+        geometry = geometry_of(self.source, selection, axis_col, self.source.angles[projections.view_ids])
+        axis = axis_col, self._axis.estimate
+        found = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = self._correction.done
         for step in selection.in_order:
+            if isinstance(step, PlaceStep):
+                done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:
                     done[step.name] = step.apply(found, self.source.angles[projections.view_ids])

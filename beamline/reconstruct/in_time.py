@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from beamline.projections.correction import Warn
-from beamline.projections.prepare import PreparedProjections
+from beamline.core.sinks import Warn
+from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import residual_share
 from beamline.reconstruct.result import OutputPaths
 from drivers.base.clock import Clock

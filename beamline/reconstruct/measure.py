@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.storage import hdf5
 from beamline.storage.volume_file import read_volume
 from recon.assess import metrics

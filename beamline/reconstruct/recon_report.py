@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from beamline.core.phases import Phases
 from beamline.core.text import spans
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.report import figures

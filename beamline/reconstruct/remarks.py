@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from beamline.core.text import count
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import ReconOutcome, label_of
 from recon.assess.lost_mass import Comparison

@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered, VolumeDone, Warned
 from beamline.core.files import refuse_existing, remove
 from beamline.core.text import size
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.steps.registry import recorded
 from beamline.reconstruct.measure import measure, regions, residual_share
 from beamline.reconstruct.model import arrays_of_model
@@ -252,14 +252,14 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "n_projections": prepared.n_projections,
         "views_left_out": prepared.left_out,
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
-        **({"jumps": prepared.jumps, "view_shifts_px": geometry.shifts} if prepared.jumps else {}),
         "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
         **({} if context.region is None else {"roi": str(context.region.region)}),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
         "quantity": prepared.quantity,
-        **recorded(selection.in_order, prepared.done),
+        **(done := recorded(selection.in_order, prepared.done)),
+        **({"view_shifts_px": geometry.shifts} if "jumps" in done else {}),
         "floored_fraction": float(prepared.projections.floored),
         "masked_fraction": float(prepared.projections.masked.mean()),
         "replaced_fraction": float(prepared.projections.replaced),

@@ -14,12 +14,13 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Counted, Sink, StateEntered
 from beamline.core.machine import free_memory
 from beamline.core.phases import Phases
+from beamline.core.sinks import Warn
 from beamline.core.text import size
-from beamline.projections.correction import Warn
-from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
+from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import choose_views, cone_of, rows_of
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import ViewStep
+from beamline.projections.steps.step import ScanPart, StepMemory
 from beamline.reconstruct.cluster import local_workers
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import locate
@@ -44,7 +45,8 @@ _BATCH = 0.25  # share of it for views during correction
 _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
 _REGIONS = 2**24  # voxels, at most, of the regions by which volumes are judged, see `metrics.sampled`
-_ASIDE = 64_000_000  # bytes of figures that are not counted
+_NO_STEPS = StepMemory()
+_ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
 
 
 @dataclass(frozen=True)
@@ -54,14 +56,14 @@ class Needs:
     Attributes:
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
-        copies: float32 views that a step of the correction takes, see `ViewFilter`.
+        steps: bytes that the steps of the correction take.
     """
 
     method: Method
     geometry: Geometry
     raw: int
     weighted: bool
-    copies: int = 0
+    steps: StepMemory = _NO_STEPS
 
     @classmethod
     def of(
@@ -87,12 +89,12 @@ class Needs:
     def at_once(self) -> int:
         """With everything in memory."""
         work = self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
-        return self.raw + self.line_integrals + max(work, self.filters)
+        return self.raw + self.line_integrals + max(work, self.steps.correcting, self._alone)
 
     @property
-    def filters(self) -> int:
-        """While views are filtered, beside the views."""
-        return self.copies * self.line_integrals // self.geometry.n_views
+    def _alone(self) -> int:
+        """A step that is alone in memory, beyond the program's own."""
+        return self.steps.alone if self.steps.alone > _ASIDE else 0
 
     @property
     def view(self) -> int:
@@ -116,7 +118,7 @@ class Needs:
     @property
     def least(self) -> int:
         """The least memory that suffices."""
-        return max(self.slab(_ROWS), self.view + self.filters, self.figures)
+        return max(self.slab(_ROWS), self.view + self.steps.correcting, self._alone, self.figures)
 
     def height(self, memory: int) -> int:
         """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
@@ -152,9 +154,9 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     if axis is not None:
         axis = (axis - (selection.binning - 1) / 2) / selection.binning
     needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
-    filters = [step.on(source, selection)[0] for step in selection.in_order if isinstance(step, ViewStep)]
-    copies = max((each.copies for each in filters if each is not None), default=0)
-    return replace(needs, method=options.method_for(needs.geometry), copies=copies)
+    part = ScanPart(source, selection, needs.geometry)
+    steps = StepMemory.of_all(step.memory(part) for step in selection.in_order)
+    return replace(needs, method=options.method_for(needs.geometry), steps=steps)
 
 
 def spill_of(
@@ -181,7 +183,7 @@ def spill_of(
     refuse_smallest(
         source, replace(needs, weighted=surely_weighted(source, options)), memory, options.selection.binning
     )
-    batch = max(1, int((_BATCH * memory - needs.filters) / needs.view))
+    batch = max(1, int((_BATCH * memory - needs.steps.correcting) / needs.view))
     warn(
         f"All at once would take {size(needs.at_once)}, {size(memory)} of memory may be used: views and volume lie on "
         f"the disk of the output while it works, {size(needs.line_integrals + needs.volume)}."

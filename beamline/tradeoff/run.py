@@ -16,7 +16,8 @@ from beamline.core.files import refuse_existing, result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.projections.held_out import hold_out
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.recon_report import facts_of

@@ -166,7 +166,8 @@ class AirSums:
             return None
         error, n, found = best
         terms = self._terms.reshape(-1, self._terms.shape[-1])
-        size, mean = float(np.sqrt(np.mean(np.square(terms @ found.T)))), terms @ found.mean(axis=0)
+        squares = np.einsum("vi,ij,vj", found, terms.T @ terms, found, optimize=True)
+        size, mean = float(np.sqrt(squares / (len(terms) * n_views))), terms @ found.mean(axis=0)
         return Background(
             order=n, coefficients=found, shape=self._shape, size=size, lowest=float(mean.min()),
             highest=float(mean.max()), before=float(before) ** 0.5, after=max(error, 0.0) ** 0.5,

@@ -130,6 +130,17 @@ def find_dynamic_flats(
     return DynamicFlats(mean, components)
 
 
+def search_memory(flats: int, pixels: int) -> int:
+    """Most bytes that `find_dynamic_flats` takes, with the components; `pixels` of a flat."""
+    return 4 * pixels * (_MOST + 16) + 8 * flats * (6 * min(pixels, 2 * _SAMPLED) + 4 * flats)
+
+
+def view_memory(flats: int, pixels: int) -> int:
+    """Most bytes that the components take, with the weights of a view by them."""
+    found = min(_MOST, flats)
+    return 4 * pixels * (4 * found + 16) + 8 * 2 * _SAMPLED * (4 * found + 8)
+
+
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:
     """The logarithm of a flat over the mean, without its level; 0 in unused pixels."""
     ratio = np.divide(flat, mean, out=np.ones_like(mean), where=good & (flat > 0))

@@ -25,6 +25,7 @@ _FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more
 _MOST = 0.1  # of the columns
 _EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
 _SEEN = 4.5  # `stripe_score` from which on there are stripes: 1.4 to 3.6 without, 5 to 10 in two real scans
+_COPIES = 16  # float32 copies of a sinogram
 _LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
 
 # Scaling filter of Daubechies' wavelet with five vanishing moments (Daubechies 1992, table 6.1).
@@ -212,6 +213,15 @@ def remove_rings_in_place(views: F32, angles: NDArray[np.float64], rings: Rings)
         views[order, row] = clean
     after = float(np.median([stripe_score(views[order, row]) for row in rows]))
     return taken, f"Rings: removed by {way}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+
+
+def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
+    """Most bytes that `remove_rings_in_place` takes beside views of a detector (rows, cols)."""
+    rows, cols = shape
+    if rings == "none" or views < _FEWEST_VIEWS or cols < _NARROWEST:
+        return 4 * rows * cols
+    padded = (views + 2 ** (_LEVELS + 3)) * (cols + 2 ** (_LEVELS + 3))
+    return 4 * (rows * cols + _COPIES * (padded if rings == "wavelet" else views * cols))
 
 
 def ring_score(image: NDArray[np.floating], axis: tuple[float, float], width: int = 9) -> float:

@@ -6,13 +6,13 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from beamline.projections.steps.step import StepDone, option
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.prepare import PreparedProjections
+    from beamline.projections.prepared import PreparedProjections
 
 Columns = Literal["none", "auto"] | tuple[int, int]
 Surface = Literal["auto", "none"] | int
@@ -51,7 +51,7 @@ class Air:
     """
 
     name: ClassVar[str] = "background"
-    follows: ClassVar[tuple[str, ...]] = ("phase",)
+    follows: ClassVar[tuple[str, ...]] = ("jumps",)
     needs_finished: ClassVar[str] = ""
     model: str = option(
         "--air",
@@ -72,6 +72,11 @@ class Air:
     def surface(self) -> Surface:
         """See `beamline.projections.background`."""
         return _parts(self.model)[1]
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from beamline.projections.background import background_memory
+
+        return StepMemory(alone=0 if self.surface == "none" else background_memory(part.geometry))
 
     def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         from beamline.projections.background import without_background

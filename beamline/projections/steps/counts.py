@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from beamline.projections.steps.step import option, positive
+from beamline.projections.steps.step import ScanPart, StepMemory, option, positive
 from recon.base.choices import FEW_PHOTONS, Noise
 
 
@@ -41,3 +41,6 @@ class CountModel:
     def __post_init__(self) -> None:
         if self.gain is not None and self.noise == "log":
             raise ValueError("--gain is for counted photons; it does not go with --noise log.")
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from beamline.projections.steps.step import option
+from beamline.projections.steps.step import ScanPart, StepMemory, option, view_bytes
+from drivers.base.frame import FrameKind
 from recon.base.choices import FlatFields
 
 
@@ -35,3 +36,11 @@ class Flats:
         "use: views and flats are divided by the current of each frame in the file (control/data of NXtomo).",
         choices=("ignore", "use"),
     )
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        if self.fields != "dynamic":
+            return StepMemory()
+        from recon.prep.dynamic_flats import search_memory, view_memory
+
+        pixels, flats = view_bytes(part) // 4, int((part.source.image_key == FrameKind.FLAT).sum())
+        return StepMemory(view_memory(flats, pixels), search_memory(flats, pixels))

@@ -6,13 +6,13 @@ import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import StepDone, option
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.prepare import PreparedProjections
+    from beamline.projections.prepared import PreparedProjections
 
     Spectrum = tuple[NDArray[np.float64], NDArray[np.float64]]
 
@@ -62,6 +62,11 @@ class Hardening:
     @property
     def needs_finished(self) -> str:
         return "" if self.wanted is None else "--hardening is for a finished scan: its curve is of all views."
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from beamline.projections.hardening import curve_memory
+
+        return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, fitted=self.spectrum is None))
 
     def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         if self.wanted is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from beamline.core.errors import ConfigError
-from beamline.projections.steps.step import StepDone, ViewFilter, option, positive
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, ViewFilter, option, positive, view_bytes
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -98,6 +98,12 @@ class Phase:
 
         return delta_beta(str(self.material), energy_kev)
 
+    def memory(self, part: ScanPart) -> StepMemory:
+        if self.material is None:
+            return StepMemory()
+        found, _ = self.filter_of(part.source, part.selection)
+        return StepMemory((7 if self.unsharp is None else 9) * view_bytes(part, found.reach))
+
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         from beamline.projections.steps.defects import Defects
 
@@ -109,8 +115,7 @@ class Phase:
             found.retrieve(views.data, selection.step(Defects).floor)
             return views
 
-        copies = 7 if self.unsharp is None else 9
-        return ViewFilter(apply, found.reach, "--phase mixes", copies), StepDone(said, {"phase": said})
+        return ViewFilter(apply, found.reach, "--phase mixes"), StepDone(said, {"phase": said})
 
     def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
         """The filter for the pixels that the selection makes, and a sentence about it.

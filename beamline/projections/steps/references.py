@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import option
+from beamline.projections.steps.step import ScanPart, StepMemory, option
 
 
 @dataclass(frozen=True)
@@ -30,3 +30,6 @@ class ReferenceCheck:
     @property
     def accepted(self) -> bool:
         return self.wanted == "accept"
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()

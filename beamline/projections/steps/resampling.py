@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from beamline.core.errors import ConfigError
 from beamline.core.files import text_in
-from beamline.projections.steps.step import StepDone, ViewFilter, option
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, ViewFilter, option, view_bytes
 
 if TYPE_CHECKING:
     from beamline.projections.selection import Selection
@@ -88,6 +88,17 @@ class TiltAndLens:
         said = "--tilt auto is for a finished scan: it needs all views. Give it in degrees."
         return said if self.sought else ""
 
+    def memory(self, part: ScanPart) -> StepMemory:
+        from beamline.projections.tilt import search_memory
+        from recon.prep.tilt import STEEPEST
+
+        known = replace(self, tilt=math.degrees(STEEPEST)) if self.sought else self
+        if (found := known.of(part.source, part.selection)) is None:
+            return StepMemory()
+        copies = 17 if self.distortion is None else 26
+        search = search_memory(part.source, part.selection) if self.sought else 0
+        return StepMemory(copies * view_bytes(part, found.reach), search)
+
     def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
         found, turned = self.of(source, selection), f"Views are turned by {self.tilt_deg:g} degrees."
         if found is None:
@@ -97,9 +108,7 @@ class TiltAndLens:
             found.apply(views.data, first)
             return replace(views, masked=found.nearest(views.masked, first))
 
-        copies = 17 if self.distortion is None else 26
-        taken = ViewFilter(apply, found.reach, "--tilt and --distortion mix", copies)
-        return taken, self.done(turned if self.tilt_deg else "")
+        return ViewFilter(apply, found.reach, "--tilt and --distortion mix"), self.done(turned if self.tilt_deg else "")
 
     def done(self, said: str) -> StepDone:
         """What it did, with what is recorded where nothing was asked, too."""

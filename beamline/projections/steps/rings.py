@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
-from beamline.projections.steps.step import StepDone, option
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
 from recon.base.choices import Rings as Way
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.prepare import PreparedProjections
+    from beamline.projections.prepared import PreparedProjections
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,11 @@ class Rings:
     @property
     def needs_finished(self) -> str:
         return "" if self.way == "none" else "--rings is for a finished scan: it needs all views."
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from recon.prep.rings import removal_memory
+
+        return StepMemory(alone=removal_memory(part.geometry.n_views, part.geometry.detector_shape, self.way))
 
     def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         from recon.prep.rings import remove_rings_in_place

@@ -7,7 +7,7 @@ module of a step is imported for every help text: what computes is imported wher
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
@@ -15,10 +15,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.prepare import PreparedProjections
+    from beamline.projections.flags import UsableViews
+    from beamline.projections.jumps import Places
+    from beamline.projections.prepared import PreparedProjections
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.writers.recon_file import Value
+    from recon.base.geometry import Geometry
     from recon.prep.correct import Projections
 
 
@@ -71,10 +74,44 @@ class StepDone:
     Attributes:
         said: a sentence; empty where nothing was asked, or nothing found.
         parameters: what the file of the volume records of it, by name; None: the step's options, and `said`.
+        warned: a warning told it.
     """
 
     said: str = ""
     parameters: Mapping[str, Value] | None = None
+    warned: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ScanPart:
+    """The part of a scan that is to be used, before any frame is read.
+
+    Attributes:
+        geometry: of views as many and as large, binned, as those that are used.
+    """
+
+    source: ScanSource
+    selection: Selection
+    geometry: Geometry
+
+
+@dataclass(frozen=True)
+class StepMemory:
+    """Bytes that a step takes at most, beside raw pixels, line integrals and volume.
+
+    Attributes:
+        correcting: while views are corrected, a batch at a time.
+        alone: before or after that.
+    """
+
+    correcting: int = 0
+    alone: int = 0
+
+    @classmethod
+    def of_all(cls, steps: Iterable[StepMemory]) -> StepMemory:
+        """That of all steps, which act one after the other."""
+        found = list(steps)
+        return cls(max(each.correcting for each in found), max(each.alone for each in found))
 
 
 class PrepStep(Protocol):
@@ -92,6 +129,19 @@ class PrepStep(Protocol):
     def needs_finished(self) -> str:
         """Why the scan must have ended, as a sentence for who follows one; empty: it need not."""
 
+    def memory(self, part: ScanPart) -> StepMemory:
+        """The memory that it takes, known before any frame is read.
+
+        Raises:
+            ConfigError: the step does not fit the scan.
+        """
+
+
+def view_bytes(part: ScanPart, reach: int = 0) -> int:
+    """Bytes of a float32 view, with so many rows on either side as far as the detector has them."""
+    rows, cols = part.geometry.detector_shape
+    return 4 * min(rows + 2 * reach, part.source.shape[0] // part.selection.binning) * cols
+
 
 @dataclass(frozen=True, eq=False)
 class ViewFilter:
@@ -102,13 +152,11 @@ class ViewFilter:
             changed in place.
         reach: rows, binned, beside a row from which it takes something.
         mixes: the subject and verb that say who mixes neighbouring pixels.
-        copies: memory that it takes, as float32 views; it does not grow with the views in a batch.
     """
 
     apply: Callable[[Projections, int], Projections]
     reach: int
     mixes: str
-    copies: int
 
 
 @runtime_checkable
@@ -120,6 +168,26 @@ class ViewStep(PrepStep, Protocol):
 
         Raises:
             ConfigError: the scan does not say what the step needs, or the step does not fit it.
+        """
+
+
+@runtime_checkable
+class PlaceStep(PrepStep, Protocol):
+    """A step that finds where the sample was in each view, before views are corrected."""
+
+    def place(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        usable: UsableViews,
+        axis_col: float,
+        progress: Callable[[int, int], None],
+    ) -> Places:
+        """The views that are used, where the sample was in them, and what was done.
+
+        Args:
+            usable: the views that may be used.
+            progress: takes how much is done, and of how much at most.
         """
 
 

@@ -10,7 +10,8 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
+from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.storage.readers.open import open_scan

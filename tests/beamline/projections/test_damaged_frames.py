@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.projections.prepare import PreparedProjections, Spill, prepare_projections
+from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags

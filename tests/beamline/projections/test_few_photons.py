@@ -10,7 +10,8 @@ import pytest
 from beamline.core.errors import ConfigError
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.held_out import hold_out
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.counts import CountModel

@@ -12,7 +12,8 @@ from beamline.core.errors import DataError
 from beamline.monitor.check import Level
 from beamline.projections.flags import WARNED_WEIGHT
 from beamline.projections.held_out import hold_out
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags

@@ -12,7 +12,8 @@ import pytest
 import recon
 from beamline.core.errors import DataError
 from beamline.projections import axis as axis_module
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.tilt import spread_views

@@ -14,7 +14,8 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.core.phases import Phases
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.counts import CountModel

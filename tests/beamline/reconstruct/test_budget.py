@@ -12,7 +12,8 @@ import pytest
 
 import recon
 from beamline.core.events import Event
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import budget as module
 from beamline.reconstruct.budget import Budgeted, binned, within

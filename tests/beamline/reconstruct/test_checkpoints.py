@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions, differences, origin_of
 from beamline.storage.readers.open import SourceOptions

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct import in_time
 from beamline.reconstruct.finished import reconstruct_file

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepare import PreparedProjections
+from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct import measure as module
 from beamline.reconstruct.measure import fit_truth, measure, read_truth, regions
 from recon.base.geometry import Geometry

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 import recon
 from beamline.core.events import Event
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.result import OutputPaths, write_result

@@ -16,7 +16,8 @@ import pytest
 from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.files import parts_of
 from beamline.core.stop import StopRequest
-from beamline.projections.prepare import checked_views, prepare_projections
+from beamline.projections.flags import checked_views
+from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags

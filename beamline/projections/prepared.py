@@ -1,0 +1,117 @@
+"""Prepared projections: line integrals ready for reconstruction, with their geometry and the weights of their rays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.projections.steps.step import StepDone
+from beamline.storage.flag_legend import FrameFlags
+from recon.base.geometry import Geometry
+from recon.base.masks import RayWeights
+from recon.base.volume import Grid
+from recon.prep.align import AxisEstimate
+from recon.prep.correct import Projections
+from recon.voxels.projector import seen_rays
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedProjections:
+    """Line integrals ready for reconstruction.
+
+    Attributes:
+        projections: of the views used; view_ids are their rows in the file.
+        geometry: of these views, binned; mm, or px where the pixel size is unknown.
+        axis_col: rotation axis in columns of the full detector.
+        axis: how it was found; None where it was given.
+        held_out: line integrals of some views that are not used, and their geometry; None where all are used.
+        n_projections: how many views the scan has.
+        length_unit: "mm" or "px".
+        quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
+        view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
+        left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
+        flags: of all frames of the scan; None where there are none.
+        measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
+        shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
+        done: what each step did, by name, in the order in which it did.
+        shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
+            None: as `shares` says.
+    """
+
+    projections: Projections
+    geometry: Geometry
+    axis_col: float
+    axis: AxisEstimate | None
+    held_out: tuple[NDArray[np.float32], Geometry] | None
+    n_projections: int
+    length_unit: str
+    quantity: str
+    view_weights: NDArray[np.float32] | None = None
+    left_out: int = 0
+    flags: FrameFlags | None = None
+    measured: NDArray[np.bool_] | None = None
+    shares: NDArray[np.float32] | None = None
+    done: Mapping[str, StepDone] = field(default_factory=dict)
+    shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
+
+    @property
+    def on_disk(self) -> bool:
+        """Line integrals lie on disk, where rays that weigh nothing were filled from their neighbours."""
+        return isinstance(self.projections.data, np.memmap)
+
+    def of_rows(self, rows: slice, geometry: Geometry) -> PreparedProjections:
+        """The same views in some detector rows, which `geometry` is of; line integrals stay where they are."""
+
+        def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
+            return None if array is None else array[..., rows, :]
+
+        found, held = self.projections, self.held_out
+        if held is not None:
+            held = held[0][:, rows], held[1].rows(rows.start, rows.stop)
+        shares = cut(self.shares) if self.shares_of is None else self.shares_of(slice(None), rows)
+        return replace(
+            self,
+            projections=replace(found, data=found.data[:, rows], masked=found.masked[rows], weights=cut(found.weights)),
+            geometry=geometry,
+            held_out=held,
+            measured=cut(self.measured),
+            shares=shares,
+            shares_of=None,
+        )
+
+    def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
+        """Weights [view, row, col] as `ray_factors` says, read-only."""
+        factors = self.ray_factors(others)
+        return None if factors is None else factors[...]
+
+    def ray_factors(self, others: int = 0) -> RayWeights | None:
+        """Weights [view, row, col], computed only where they are asked for; None: one for all rays.
+
+        Args:
+            others: views after these, which weigh 1, as a usual ray of these does.
+        """
+        factors: list[NDArray[np.float32]] = []
+        if self.view_weights is not None:
+            factors.append(_and_ones(self.view_weights, others)[:, None, None])
+        if (counted := self.projections.weights) is not None:
+            factors.append(_and_ones(counted / counted.mean(where=counted > 0), others))
+        if self.measured is not None:
+            factors.append(self.measured.astype(np.float32)[None])
+        if np.ptp(self.geometry.shifts[:, 1]) > 0:
+            seen = seen_rays(self.geometry, Grid.matching(self.geometry)).astype(np.float32)
+            factors.append(_and_ones(seen, others)[:, :, None])
+        if self.shares is not None:
+            factors.append(_and_ones(self.shares, others))
+        if not factors:
+            return None
+        shape = (self.geometry.n_views + others, *self.geometry.detector_shape)
+        return RayWeights(tuple(np.broadcast_to(factor, shape) for factor in factors))
+
+
+def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
+    """The values of views, and ones for others after them."""
+    return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))

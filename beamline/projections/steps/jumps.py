@@ -1,0 +1,56 @@
+"""Jumps: views after the sample moved on its stage are corrected by shifts and a turn, or left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from beamline.projections.steps.step import ScanPart, StepMemory, option
+
+if TYPE_CHECKING:
+    from beamline.projections.flags import UsableViews
+    from beamline.projections.jumps import Places
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.base import ScanSource
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """What becomes of views on either side of an alarm of motion.
+
+    Attributes:
+        wanted: "correct": see `beamline.projections.jumps.find_jumps`. "ignore": they are used as they are.
+    """
+
+    name: ClassVar[str] = "jumps"
+    follows: ClassVar[tuple[str, ...]] = ("phase",)
+    needs_finished: ClassVar[str] = ""
+    wanted: str = option(
+        "--jumps",
+        "correct",
+        "correct: where the monitor saw the sample jump, views are corrected by shifts and a turn, or left out. "
+        "ignore: they are used as they are.",
+        choices=("correct", "ignore"),
+    )
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from beamline.projections.jumps import search_memory
+
+        return StepMemory(alone=search_memory(part.source, part.selection) if self.wanted == "correct" else 0)
+
+    def place(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        usable: UsableViews,
+        axis_col: float,
+        progress: Callable[[int, int], None],
+    ) -> Places:
+        from beamline.projections.jumps import Places, find_jumps, frames_text
+
+        if self.wanted == "correct":
+            return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
+        where = frames_text(usable.jumps)
+        said = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
+        return Places(usable.frames, said=said if usable.jumps.size else "")
