@@ -58,8 +58,11 @@ def _axis_of_cone(
     if selection.axis_rows is not None:
         selection = replace(selection, rows=selection.axis_rows)
     rows = rows_of(source, selection)
-    binning = max(selection.binning, min(cols // COLS, rows.stop - rows.start))
-    coarse = replace(selection, binning=binning)
+    # Few rows would leave columns fine, for which volumes take minutes: rows beside them are read, too.
+    height = max(rows.stop - rows.start, min(cols // COLS, source.shape[0]))
+    first = min(max((rows.start + rows.stop - height) // 2, 0), source.shape[0] - height)
+    binning = max(selection.binning, min(cols // COLS, height))
+    coarse = replace(selection, binning=binning, rows=(first, first + height))
     views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(usable.frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
     geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])
@@ -78,6 +81,11 @@ def _axis_of_cone(
         if not found.confident:
             warn(_unclear(axis_col))
         return axis_col, found
+    if not found.confident:
+        warn(
+            f"The file's rotation axis, column {stated:.2f}, was not confirmed: views held out show no axis clearly. "
+            "Check the slices for doubled edges, or give --axis COLUMN."
+        )
     if not found.confident or found.value == geometry.axis_col:
         return stated, None
     warn(

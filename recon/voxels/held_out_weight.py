@@ -224,7 +224,9 @@ class _Trial:
         return math.inf if self._ended else self.error(x)
 
     def error(self, x: F32) -> float:
-        """Root mean square of what slices [y, x, z] leave of the views held out."""
+        """Root mean square of what slices [y, x, z] leave of the views held out; infinite where these weigh nothing."""
+        if self._unseen.weight is not None and not self._unseen.weight.any():
+            return math.inf
         left = self._unseen.projector.forward_lines(x)
         left -= self._unseen.data
         return math.sqrt(float(np.average(np.square(left, dtype=np.float64), weights=self._unseen.weight)))

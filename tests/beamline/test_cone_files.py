@@ -18,7 +18,10 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
+from recon.axis_by_views import axis_by_views
+from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.prep.align import AxisEstimate
 from recon.voxels.fdk import fdk
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
@@ -93,6 +96,24 @@ def test_an_axis_that_is_not_stated_or_wrong_is_found_by_views_held_out(
     assert prepared.axis_col == pytest.approx(AXIS, abs=0.05)
     assert prepared.axis is not None and prepared.axis.confident and given.axis_col == 20.2
     assert len(warnings) == len(told) and all(words in warning for words, warning in zip(told, warnings, strict=True))
+
+
+def test_the_axis_of_one_row_is_found_on_pixels_as_coarse_as_that_of_all_rows(
+    scan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, columns, told = list[Geometry](), 12, list[str]()
+
+    def find(data: NDArray[np.float32], geometry: Geometry, *_: object, near: bool) -> AxisEstimate:
+        asked.append(geometry)
+        return axis_by_views(data, geometry, near=near)
+
+    monkeypatch.setattr("beamline.projections.axis.COLS", columns)
+    monkeypatch.setattr("beamline.projections.axis.axis_by_views", find)
+    with open_scan(scan) as source:
+        for row in (14, 26):
+            prepare_projections(source, replace(PLAIN, rows=(row, row + 1)), told.append)
+    assert [each.detector_shape for each in asked] == 2 * [(1, columns)]
+    assert [each.axis_row for each in asked] == pytest.approx([1.5, -1.5])
 
 
 def test_rows_and_bins_keep_the_central_ray(scan: Path) -> None:

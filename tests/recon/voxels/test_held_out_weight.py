@@ -193,3 +193,14 @@ def test_a_slab_is_where_most_matter_is_and_sees_its_own_slices() -> None:
     volume = np.random.default_rng(1).random((40, 8, 8)).astype(np.float32)
     whole = Projector(geometry, Grid.matching(geometry)).forward(volume)
     np.testing.assert_allclose(Projector(views, box).forward(volume[rows]), whole[:, rows], rtol=1e-5)
+
+
+def test_views_held_out_that_weigh_nothing_in_the_busiest_rows_leave_the_weight_by_the_noise(
+    foam: tuple[F32, Geometry, Grid, F32],
+) -> None:
+    data, geometry, grid, _ = (np.concatenate([foam[0], foam[0] / 2], axis=1), *foam[1:])
+    geometry, grid = replace(geometry, detector_shape=(2 * ROWS, COLS)), replace(grid, shape=(2 * ROWS, COLS, COLS))
+    weights = np.ones_like(data)
+    weights[split_views(geometry)[1], :ROWS] = 0
+    found = recon.reconstruct(data, geometry, FistaTv(iterations=1), grid=grid, use=recon.DataUse(weights=weights))
+    assert np.isfinite(found.volume.data).all()
