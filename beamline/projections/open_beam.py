@@ -29,8 +29,8 @@ from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups, reference_groups
 from drivers.base.frame import FrameKind
-from recon.base.choices import FEW_PHOTONS
 from recon.base.arrays import Mask
+from recon.base.choices import FEW_PHOTONS
 from recon.prep.correct import Correction, CorrectionSettings, References
 from recon.prep.counts import Photons, photon_transfer
 from recon.prep.defects import SHADOW_REACH, shadowed
