@@ -26,8 +26,8 @@ _SAMPLE = 2_000_000  # values that show the histogram as well as all do
 class ViewedVolume:
     """A volume file of any kind that is read here. All calls come from one thread (HDF5).
 
-    Slices across z are read from the file. Those across y and x of a volume above `held` bytes come from the coarse
-    copy, for which a file of 2048³ voxels would have to be read as a whole each time.
+    Of a volume above `held` bytes, slices across z are read from the file. One across y or x would read all of the
+    file, so it comes from the coarse copy.
 
     Args:
         progress: takes slices read and slices to read of the coarse copy.
