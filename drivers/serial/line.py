@@ -20,9 +20,8 @@ import serial
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, readable
+from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 from drivers.serial.ports import open_port
-from drivers.serial.transcript import Transcript
 
 QUIET = 0.05
 """s without a byte after which a line counts as silent."""
