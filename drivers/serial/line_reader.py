@@ -27,8 +27,8 @@ class Transcript:
     """Record of one serial line. Safe from several threads.
 
     The last lines are for error messages; a log file has every byte. A log file that fails later is closed: a full disk
-    must not end a scan. Each of its lines holds the time in s since the epoch, a mark and the bytes as a Python literal.
-    Marks: ">" sent, "<" received, "!" done by the driver.
+    must not end a scan. Each of its lines holds the time in s since the epoch, a mark and the bytes as a Python
+    literal. Marks: ">" sent, "<" received, "!" done by the driver.
 
     Args:
         path: log file, appended to; None: no file.

@@ -1,8 +1,8 @@
 """Simulated Zaber rotary stage on its wire: ASCII packets in, replies and alerts out, and faults on request.
 
 One device with one rotary axis that turns the sample; one of its digital outputs is cabled to the camera. Behaviour
-follows the vendor's own library, packets also the test vectors of zproto; nothing is shared with the driver. From memory:
-a wrong checksum gets no answer. Other modules of this folder say what else is from memory.
+follows the vendor's own library, packets also the test vectors of zproto; nothing is shared with the driver. From
+memory: a wrong checksum gets no answer. Other modules of this folder say what else is from memory.
 """
 
 from __future__ import annotations
