@@ -108,12 +108,9 @@ class Channel:
         """P, N or S: turns CW, CCW, stands."""
         return "SPN"[self.motor.move.direction] if self.motor.moving() else "S"
 
-    def status(self, now: float) -> int:
-        """b7 emergency stop, b6 slow stop, b5 limit, b3 decelerating, b2 accelerating, b1 driving, b0 busy."""
-        if not self.motor.moving():
-            return int(self.motor.ended)
-        gaining = self.motor.move.acceleration(now) * self.motor.move.direction
-        return 0b11 | (0b100 if gaining > 0 else 0) | (0b1000 if gaining < 0 else 0)
+    def status(self) -> int:
+        """b7 emergency stop, b6 slow stop, b5 limit, b1 driving, b0 busy. Speeding up and slowing down are not told."""
+        return 0b11 if self.motor.moving() else int(self.motor.ended)
 
 
 @dataclass(frozen=True)
@@ -290,7 +287,7 @@ class PM16CBox:
     def channel_status(self, c: str) -> str:
         """The reply to STSx?; a channel without a position controller shows no switches and no status."""
         channel = self.channels[c]
-        bits = f"0{channel.status(self.clock.now()):02X}" if c in self.mapped else "---"
+        bits = f"0{channel.status():02X}" if c in self.mapped else "---"
         return f"{self.place}{c}{channel.letter}{bits}{channel.motor.position():+08d}"
 
 
