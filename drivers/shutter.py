@@ -8,6 +8,8 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput
 
+NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
+
 
 class OutputShutter:
     """Implements `drivers.base.protocols.Shutter` on a controller's output.
@@ -66,7 +68,17 @@ class OutputShutter:
             self._clock.sleep(self._settle)
             held = self._output.get()
         except DeviceError as cause:
-            raise self._not_set(opened, level, cause) from cause
+            wanted = "high" if level else "low"
+            raise DeviceError(
+                self.name,
+                f"it could not be {'opened' if opened else 'closed'}: {cause.device}: {cause.problem}",
+                request=cause.request or f"{self._output.name} {wanted}",
+                reply=cause.reply,
+                expected=cause.expected or f"{wanted} on {self._output.name}",
+                advice=cause.advice or "Check the controller's power and cable",
+                state=NOT_KNOWN,
+                wire=cause.wire,
+            ) from cause
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
@@ -75,19 +87,6 @@ class OutputShutter:
                 reply="high" if held else "low",
                 expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",
                 advice="Check the output's number, its wiring for a short, and that no other program sets it",
-                state="Whether the shutter is open is not known: look before anybody goes near the beam",
+                state=NOT_KNOWN,
             )
         self._open = opened
-
-    def _not_set(self, opened: bool, level: bool, cause: DeviceError) -> DeviceError:
-        """Turn an error of the output into an error of the shutter."""
-        return DeviceError(
-            self.name,
-            f"it could not be {'opened' if opened else 'closed'}: {cause.device}: {cause.problem}",
-            request=cause.request or f"{self._output.name} {'high' if level else 'low'}",
-            reply=cause.reply,
-            expected=cause.expected or f"{'high' if level else 'low'} on {self._output.name}",
-            advice=cause.advice or "Check the controller's power and cable",
-            state="Whether the shutter is open is not known: look before anybody goes near the beam",
-            wire=cause.wire,
-        )

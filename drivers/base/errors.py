@@ -33,19 +33,15 @@ class DeviceError(Exception):
     ) -> None:
         self.device, self.problem, self.request, self.reply = device, problem, request, reply
         self.expected, self.advice, self.state, self.wire = expected, advice, state, wire
-        parts = [f"{device}: {problem}"]
-        if request:
-            parts.append(f"Asked {request!r}")
-        if reply:
-            parts.append(f"Answered {reply!r}")
-        if expected:
-            parts.append(f"Expected {expected}")
-        if advice:
-            parts.append(advice)
-        if state:
-            parts.append(state)
-        if wire:
-            parts.append(f"On the wire: {wire}")
+        said = (
+            ("Asked {!r}", request),
+            ("Answered {!r}", reply),
+            ("Expected {}", expected),
+            ("{}", advice),
+            ("{}", state),
+            ("On the wire: {}", wire),
+        )
+        parts = [f"{device}: {problem}", *(form.format(text) for form, text in said if text)]
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
@@ -270,6 +269,3 @@ class Devices:
     camera: Camera
     shutter: Shutter
     sample: SampleMover
-
-    def names(self) -> Sequence[str]:
-        return [self.stage.name, self.camera.name, self.shutter.name, self.sample.name]

@@ -36,33 +36,19 @@ def wait_until_cold(
         history = [(time, value) for time, value in history if time >= now - STEADY_FOR - POLL] + [(now, celsius)]
         if status is Cooler.READY or (status in (Cooler.NONE, Cooler.ALWAYS) and _steady(history)):
             return celsius
+        kind, advice = DeviceError, "Check the camera's fan and cooling water"
         if status < 0:
             problem = f"its cooler reports {status.name} at {celsius:.1f} °C"
-            raise DeviceError(
-                device,
-                problem,
-                expected=_target(properties),
-                advice="Check the camera's fan and cooling water",
-                state="Nothing was measured",
-            )
-        if status is Cooler.OFF:
-            raise DeviceRefused(
-                device,
-                f"its cooler is off ({celsius:.1f} °C)",
-                expected=_target(properties),
-                advice="Switch the cooler on, or set devices.camera.cool_s: 0",
-                state="Nothing was measured",
-            )
-        if now >= deadline:
+        elif status is Cooler.OFF:
+            kind, problem = DeviceRefused, f"its cooler is off ({celsius:.1f} °C)"
+            advice = "Switch the cooler on, or set devices.camera.cool_s: 0"
+        elif now >= deadline:
+            kind, advice = DeviceTimeout, "Wait longer, or check the camera's fan and cooling water"
             problem = f"its sensor is not cold after {timeout:g} s: {celsius:.1f} °C, cooler {status.name.lower()}"
-            raise DeviceTimeout(
-                device,
-                problem,
-                expected=_target(properties),
-                advice="Wait longer, or check the camera's fan and cooling water",
-                state="Nothing was measured",
-            )
-        clock.sleep(min(POLL, deadline - now))
+        else:
+            clock.sleep(min(POLL, deadline - now))
+            continue
+        raise kind(device, problem, expected=_target(properties), advice=advice, state="Nothing was measured")
 
 
 def _status(properties: Properties) -> Cooler:

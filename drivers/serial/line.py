@@ -20,9 +20,8 @@ import serial
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, readable
+from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 from drivers.serial.ports import open_port
-from drivers.serial.transcript import Transcript
 
 QUIET = 0.05
 """s without a byte after which a line counts as silent."""
@@ -134,39 +133,20 @@ class SerialLine:
                 self._reader.discard_lines()
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
+            if isinstance(text, str) and (match := re.fullmatch(reply, text)) is not None:
+                self._in_step = True
+                return match
+            kind = DeviceTimeout if text is None else DeviceError
             if text is None:
-                raise self._error(
-                    DeviceTimeout,
-                    f"no whole reply within {self._timeout:g} s",
-                    request=request,
-                    reply=self._reader.incomplete[:80],
-                    expected=meaning,
-                    advice="Check power, cable and baud rate; the next request first brings the line into step again",
-                    state=state,
-                )
-            if isinstance(text, Damaged):
-                raise self._error(
-                    DeviceError,
-                    f"the reply was damaged on the way: {text.why}",
-                    request=request,
-                    reply=text.text,
-                    expected=meaning,
-                    advice="Check the cable, its shield and the baud rate",
-                    state=state,
-                )
-            match = re.fullmatch(reply, text)
-            if match is None:
-                raise self._error(
-                    DeviceError,
-                    "the reply does not have the form it must have",
-                    request=request,
-                    reply=text,
-                    expected=meaning,
-                    advice="The line may be disturbed, or the device may be another model",
-                    state=state,
-                )
-            self._in_step = True
-            return match
+                problem, found = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
+                advice = "Check power, cable and baud rate; the next request first brings the line into step again"
+            elif isinstance(text, Damaged):
+                problem, found = f"the reply was damaged on the way: {text.why}", text.text
+                advice = "Check the cable, its shield and the baud rate"
+            else:
+                problem, found = "the reply does not have the form it must have", text
+                advice = "The line may be disturbed, or the device may be another model"
+            raise self._error(kind, problem, request=request, reply=found, expected=meaning, advice=advice, state=state)
 
     def close(self) -> None:
         """Close the port once a request of another thread has ended; calling again does nothing."""

@@ -1,13 +1,101 @@
-"""What the stages of this package share: places by their travel, and stops."""
+"""What the stages of this package share: places by their travel, stops, and the wait until they stand."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol, TypeVar
 
 from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.stages.stops import Stops, longest_stop, until_standing
 from drivers.stages.travel import Travel
+
+
+class Stops:
+    """`count` is the number of stops so far.
+
+    A stop goes out at once, perhaps just before the move command that another thread is about to send. So the thread
+    that starts a move checks after its command whether a stop came meanwhile, and sends the stop again.
+
+    Args:
+        send: sends a stop (True: without deceleration) and does not wait until it stands.
+    """
+
+    def __init__(self, name: str, send: Callable[[bool], object]) -> None:
+        self._name, self._send = name, send
+        self.count = 0
+        self._hard = False
+
+    def came(self, *, hard: bool) -> None:
+        """Call this before the stop is sent. The stop is then counted in time, or sent after the move's command."""
+        self._hard = hard
+        self.count += 1
+
+    @contextmanager
+    def none_while(self, purpose: str, since: int | None = None) -> Iterator[None]:
+        """Context around the commands that begin a move.
+
+        Args:
+            purpose: the move, for the error message.
+            since: the number of stops before the first of several commands.
+
+        Raises:
+            DeviceError: a stop came; it has been sent again.
+        """
+        before, problem = self.count if since is None else since, None
+        try:
+            yield
+        except DeviceError as error:
+            problem = error
+        finally:
+            if came := self.count != before:
+                self._send(self._hard)
+        if came:
+            raise DeviceError(
+                self._name,
+                f"{purpose} was stopped while it was started",
+                advice="Find who stopped it before moving on",
+                state="The stop was sent again: it stands, or slows down to stand",
+            ) from problem
+        if problem is not None:
+            raise problem
+
+
+POLL = 0.02
+"""s between two status queries of a moving stage."""
+STOP_MARGIN = 2.0
+"""s beyond the longest deceleration after which a stop has failed."""
+Status = TypeVar("Status")
+
+
+def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[Status], bool], timeout: float) -> Status:
+    """The last status: the stage stands, or it still moves after `timeout` s.
+
+    Args:
+        look: asks the controller, at least once.
+        moves: whether the stage moves by what a look has shown.
+    """
+    deadline = clock.now() + timeout
+    while moves(status := look()) and (left := deadline - clock.now()) > 0:
+        clock.sleep(min(POLL, left))
+    return status
+
+
+def longest_stop(limits: StageLimits) -> float:
+    """s after a stop by which every stage stands: it slows down from its full speed."""
+    return limits.max_speed / limits.acceleration + STOP_MARGIN
+
+
+def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> DeviceRefused:
+    """The refusal of what needs a standing stage."""
+    return DeviceRefused(
+        name,
+        f"{purpose} is not possible while it moves",
+        reply=reply,
+        advice="Wait for the move to end, or stop it",
+        state=f"The move under way goes on; it is at {counts} counts",
+    )
 
 
 class LineStage(RotationStage, Protocol):

@@ -122,21 +122,16 @@ class Travel:
 
         Also if the stage is past the count before the first pulse at which the output opens.
         """
+        here = self.degrees(counts)
         if train.interval * (train.start - counts) <= 0:
-            raise DeviceRefused(
-                self.name,
-                f"it stands at {self.degrees(counts)}, at or past the first pulse at {self.degrees(train.start)}",
-                advice="Move to before the first pulse, then arm",
-                state="Nothing has moved and this train is not armed",
-            )
-        if opening is not None and train.interval * (opening - counts) <= 0:
-            here, begin = self.degrees(counts), self.degrees(opening)
-            raise DeviceRefused(
-                self.name,
-                f"it stands at {here}, at or past {begin}, where pulses are let through",
-                advice=f"Move back by {self.degrees(abs(train.interval))} at least, then arm",
-                state="Nothing has moved and this train is not armed",
-            )
+            problem = f"it stands at {here}, at or past the first pulse at {self.degrees(train.start)}"
+            advice = "Move to before the first pulse, then arm"
+        elif opening is not None and train.interval * (opening - counts) <= 0:
+            problem = f"it stands at {here}, at or past {self.degrees(opening)}, where pulses are let through"
+            advice = f"Move back by {self.degrees(abs(train.interval))} at least, then arm"
+        else:
+            return
+        raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved and this train is not armed")
 
     def refuse_narrower(self, low: int, high: int, advice: str) -> None:
         """Refuses a controller whose own limits (counts) are narrower."""

@@ -136,14 +136,11 @@ class SimulatedOrcaQuest:
             self._answer(armed=True)
             now, source = self._clock.now(), self._settings.trigger
             wait = self._accepted + self._timing.min_period - now
-            if source is not TriggerSource.SOFTWARE:
-                raise DeviceRefused(
-                    self.name, f"waits for {source} triggers, not for software", state="Nothing was exposed"
-                )
-            if wait > TOLERANCE:
-                raise DeviceRefused(
-                    self.name, f"is ready for the next trigger in {wait * 1e3:.3g} ms", state="Nothing was exposed"
-                )
+            if source is not TriggerSource.SOFTWARE or wait > TOLERANCE:
+                problem = f"is ready for the next trigger in {wait * 1e3:.3g} ms"
+                if source is not TriggerSource.SOFTWARE:
+                    problem = f"waits for {source} triggers, not for software"
+                raise DeviceRefused(self.name, problem, state="Nothing was exposed")
             self._trigger(now, self._line.angle_at(now))
 
     def next_frame(self, timeout: float) -> CameraFrame:

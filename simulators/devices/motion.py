@@ -101,10 +101,6 @@ class TrapezoidMove:
         phase = self._phase(time)
         return 0.0 if phase is None else phase.velocity_after(time - self.begin - phase.begin)
 
-    def acceleration(self, time: float) -> float:
-        phase = self._phase(time)
-        return 0.0 if phase is None else phase.acceleration
-
     def time_at(self, position: float) -> float:
         """When the move passes `position`.
 

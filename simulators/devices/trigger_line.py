@@ -45,13 +45,10 @@ class TriggerLine:
         with self._lock:
             self._pulses = sorted([*self._pulses, *new])
 
-    def cancel_after(self, time: float) -> int:
-        """Remove the pulses later than `time`; returns their number."""
+    def cancel_after(self, time: float) -> None:
+        """Remove the pulses later than `time`."""
         with self._lock:
-            keep = bisect_right(self._pulses, time, key=attrgetter("time"))
-            cancelled = len(self._pulses) - keep
-            del self._pulses[keep:]
-            return cancelled
+            del self._pulses[bisect_right(self._pulses, time, key=attrgetter("time")) :]
 
     def next_after(self, time: float) -> Pulse | None:
         """The first pulse strictly later than `time`, even in the future; None without one."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 
 from simulators.frame.shot import Shot
 
@@ -14,7 +15,15 @@ VISIBLE = 1e-3
 """Least change of the light that is labelled, as a share."""
 NARROWEST = 1e-9
 """mm: an edge with a smaller penumbra is a step."""
-Views: TypeAlias = tuple[int, int]
+
+
+def _in_order(views: tuple[int, int]) -> tuple[int, int]:
+    if not 0 <= views[0] < views[1]:
+        raise ValueError(f"must be [first, one after the last] with 0 <= first < last, got {list(views)}")
+    return views
+
+
+Views = Annotated[tuple[int, int], AfterValidator(_in_order)]
 """First view and the one after the last. A flat belongs to the view that is exposed next."""
 
 
@@ -37,12 +46,6 @@ class Label:
         (top, below, left, right), region = self.region, other.region
         joined = min(top, region[0]), max(below, region[1]), min(left, region[2]), max(right, region[3])
         return Label(self.kind, joined, self.which)
-
-
-def check_views(views: Views | None) -> None:
-    """Raises ValueError if the range is empty or begins before view 0."""
-    if views is not None and not 0 <= views[0] < views[1]:
-        raise ValueError(f"views must be [first, one after the last] with 0 <= first < last, got {list(views)}")
 
 
 def within(views: Views | None, shot: Shot) -> bool:

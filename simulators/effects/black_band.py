@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from simulators.effects.anomaly import Label, Views, check_views, lit_share, within
+from simulators.effects.anomaly import Label, Views, lit_share, within
 from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.mapping import BelowOne, NotNegative, Positive
 from simulators.frame.shot import Image, Shot
@@ -29,9 +29,6 @@ class BlackBand(ImageEffect, Anomaly):
     penumbra: NotNegative = 0.0
     share: BelowOne = 0.0
     views: Views | None = None
-
-    def __post_init__(self) -> None:
-        check_views(self.views)
 
     def apply(self, image: Image, shot: Shot) -> Image:
         if within(self.views, shot):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.chain import PoseEffect
-from simulators.effects.turn_waves import Wave, check, series
+from simulators.effects.turn_waves import Waves, series
 from simulators.frame.mapping import NotNegative
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
@@ -24,11 +24,8 @@ class EncoderError(PoseEffect):
         random_mdeg: standard deviation of the random part, drawn for each frame.
     """
 
-    harmonics: tuple[Wave, ...] = ()
+    harmonics: Waves = ()
     random_mdeg: NotNegative = 0.0
-
-    def __post_init__(self) -> None:
-        check("harmonics", self.harmonics)
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         error = series(pose.angle, self.harmonics).real + self.random_mdeg * frame_rng(self.name, shot).normal()

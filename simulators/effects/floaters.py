@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from simulators.effects.anomaly import VISIBLE, Label, Views, check_views, within
+from simulators.effects.anomaly import VISIBLE, Label, Views, within
 from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.mapping import Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
@@ -79,7 +79,6 @@ class Floaters(ImageEffect, Anomaly):
     seed: Whole = 0
 
     def __post_init__(self) -> None:
-        check_views(self.views)
         for name in ("distance", "size", "heights"):
             least, most = getattr(self, name)
             if not least <= most:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from simulators.effects.anomaly import Label, Views, check_views, within
+from simulators.effects.anomaly import Label, Views, within
 from simulators.effects.chain import Anomaly, ImageEffect
 from simulators.frame.mapping import BelowOne
 from simulators.frame.shot import Image, Shot
@@ -26,7 +26,6 @@ class LostBeam(ImageEffect, Anomaly):
     share: BelowOne = 0.0
 
     def __post_init__(self) -> None:
-        check_views(self.views)
         if (self.views is None) == (self.seconds is None):
             raise ValueError("a lost beam needs either views or seconds, and not both")
         if self.seconds is not None and not self.seconds[0] < self.seconds[1]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simulators.effects.chain import PoseEffect
-from simulators.effects.turn_waves import Wave, check, series
+from simulators.effects.turn_waves import Waves, series
 from simulators.frame.mapping import NotNegative
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot, frame_rng
@@ -27,14 +27,10 @@ class Runout(PoseEffect):
         axial_random_um: of the random part, vertically.
     """
 
-    radial: tuple[Wave, ...] = ()
-    axial: tuple[Wave, ...] = ()
+    radial: Waves = ()
+    axial: Waves = ()
     radial_random_um: NotNegative = 0.0
     axial_random_um: NotNegative = 0.0
-
-    def __post_init__(self) -> None:
-        check("radial", self.radial)
-        check("axial", self.axial)
 
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         radial, axial = series(pose.angle, self.radial), series(pose.angle, self.axial)

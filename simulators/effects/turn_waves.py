@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator
 
-Wave: TypeAlias = tuple[int, float, float]
+from simulators.frame.mapping import NotNegative
+
+Wave = tuple[int, NotNegative, float]
 """Waves a turn, amplitude (its unit is the effect's) and phase in degrees; 0 waves are a constant."""
 
 
-def check(what: str, waves: Sequence[Wave]) -> None:
-    """Raises ValueError if an amplitude is negative or a number of waves occurs twice."""
+def _once(waves: tuple[Wave, ...]) -> tuple[Wave, ...]:
     orders = [order for order, _, _ in waves]
-    if any(amplitude < 0 for _, amplitude, _ in waves) or len(set(orders)) < len(orders):
+    if len(set(orders)) < len(orders):
         raise ValueError(
-            f"{what} must be [waves a turn, amplitude >= 0, phase in degrees] for each number of waves once, "
-            f"got {[list(wave) for wave in waves]}"
+            f"must be [waves a turn, amplitude, phase in degrees] for each number of waves once, got "
+            f"{[list(wave) for wave in waves]}"
         )
+    return waves
+
+
+Waves = Annotated[tuple[Wave, ...], AfterValidator(_once)]
 
 
 def series(angle: NDArray[np.float64], waves: Sequence[Wave]) -> NDArray[np.complex128]:

@@ -14,7 +14,7 @@ from drivers.stages.pi_gcs.errors import NOT_ALLOWED_TO_MOVE, REFUSALS, UNKNOWN_
 from drivers.stages.pi_gcs.line import ANY_NUMBER, NUMBER, GcsLine, is_rounding_of, plain
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.train import TriggerWindow
-from drivers.stages.stops import while_it_moves
+from drivers.stages.shared import while_it_moves
 
 ARE_THEY_MOVING, READY, REGISTER, STOP_ALL = b"\x05", b"\x07", b"\x04", b"\x18"
 ACCELERATION, DECELERATION, NUMERATOR, DENOMINATOR = "0xB", "0xC", "0xE", "0xF"

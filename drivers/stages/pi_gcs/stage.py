@@ -19,8 +19,7 @@ from drivers.stages.pi_gcs.errors import EVENTS, STOPPED, advice, meaning
 from drivers.stages.pi_gcs.line import GcsLine, GcsOutput
 from drivers.stages.pi_gcs.settings import SLOWEST, PiGcsSettings
 from drivers.stages.pi_gcs.train import is_spent_by, window_of
-from drivers.stages.shared import LineStage
-from drivers.stages.stops import POLL, Stops, until_standing
+from drivers.stages.shared import POLL, LineStage, Stops, until_standing
 from drivers.stages.travel import Travel
 
 

@@ -14,7 +14,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.stages.pm16c.line import PM16CLine
 from drivers.stages.pm16c.train import TriggerPoints
 from drivers.stages.settings import Wiring
-from drivers.stages.stops import while_it_moves
+from drivers.stages.shared import while_it_moves
 
 COUNT = r"([+-]\d{7,10})"
 STATUS_SINCE = (1, 47)

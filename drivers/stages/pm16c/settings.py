@@ -96,10 +96,9 @@ class PM16CSettings:
         if max(abs(figures.low), abs(figures.high)) > MAX_COUNT * radians:
             most = math.degrees(MAX_COUNT * radians)
             raise ValueError(f"the controller counts to {MAX_COUNT}, which is {most:g} deg")
-        fastest = round(figures.max_speed / radians)
-        if not 1 <= fastest <= MAX_SPEED:
+        if not 1 <= self.fastest <= MAX_SPEED:
             speed = math.degrees(figures.max_speed)
-            raise ValueError(f"{speed:g} deg/s are {fastest} pulses/s, the controller gives 1 to {MAX_SPEED}")
+            raise ValueError(f"{speed:g} deg/s are {self.fastest} pulses/s, the controller gives 1 to {MAX_SPEED}")
         acceleration = 1e6 / RATES[self.rate_code] * radians
         run_up = 1 if self.first_pulse is Pm16cFirstPulse.INTERVAL_AFTER else 0
         return figures.limits(acceleration, self.widths.spacing, run_up=run_up)

@@ -15,8 +15,7 @@ from drivers.base.protocols import DigitalOutput, TriggerTrain
 from drivers.stages.pm16c.channel import ChannelStatus, HomeSearch, PM16CChannel
 from drivers.stages.pm16c.settings import PM16CSettings
 from drivers.stages.pm16c.train import MODES, points_of
-from drivers.stages.shared import LineStage
-from drivers.stages.stops import Stops, until_standing
+from drivers.stages.shared import LineStage, Stops, until_standing
 from drivers.stages.travel import Travel
 
 

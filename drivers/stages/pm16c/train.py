@@ -34,19 +34,14 @@ class PulseWidths:
         return [width for width in MODES if self.chosen is None or math.isclose(width, self.chosen)]
 
     @property
-    def narrowest(self) -> float:
-        """s."""
-        return min(self.allowed)
-
-    @property
     def spacing(self) -> float:
         """Least s between pulses. Closer pulses would merge: the controller then leaves the output high."""
-        return 2 * self.narrowest
+        return 2 * self.allowed[-1]
 
     def widest_for(self, train: TriggerTrain, limits: StageLimits) -> float:
         """The widest pulse that leaves the output low as long as high at full speed, for a train with this spacing."""
         fits = (w for w in self.allowed if train.n == 1 or abs(train.interval) >= counts_in(2 * w, limits))
-        return next(fits, self.narrowest)
+        return next(fits, self.allowed[-1])
 
 
 class Pm16cFirstPulse(StrEnum):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
 from drivers.serial.line import Probe
-from drivers.stages.stops import while_it_moves
+from drivers.stages.shared import while_it_moves
 from drivers.stages.zaber.packet import (
     REASONS,
     UNREFERENCED,

@@ -13,8 +13,7 @@ from dataclasses import replace
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.shared import LineStage
-from drivers.stages.stops import Stops, until_standing
+from drivers.stages.shared import LineStage, Stops, until_standing
 from drivers.stages.travel import Travel
 from drivers.stages.zaber.axis import ZaberAxis
 from drivers.stages.zaber.packet import meaning_of

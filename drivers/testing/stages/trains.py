@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 
 import pytest
@@ -11,6 +12,26 @@ import pytest
 from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.testing.stages.bench import LONG, SPEED, Build, StageBench, StageKind
+
+Step = float | tuple[float, float, int] | None
+"""A move to an angle, a train to arm (first, step, n), or None: disarm; in degrees."""
+SCRIPTS: Mapping[str, tuple[Sequence[Step], Sequence[int]]] = {
+    "a train ends with its last pulse": ([(1.0, 1.0, 3), 30.0], [3]),
+    "it fires once": ([(1.0, 1.0, 3), 5.0, 0.0, 5.0], [3]),
+    "one after another": ([(1.0, 1.0, 3), 5.0, (4.5, -1.0, 4), 0.0], [3, 4]),
+    "no pulse without a train": ([None, None, 10.0], []),
+    "disarmed before it begins": ([(1.0, 1.0, 3), None, 10.0], [0]),
+    "disarmed in the middle": ([(1.0, 1.0, 9), 3.5, None, 7.5, 0.0, 20.0, (21.0, 1.0, 4), 30.0], [3, 4]),
+    "replaced before it begins": ([(1.0, 1.0, 9), (2.0, 3.0, 2), 20.0], [0, 2]),
+    "replaced in the middle": ([(1.0, 1.0, 9), 3.5, (2.0, -1.0, 2), 0.0, 20.0], [3, 2]),
+    "halts in the middle": ([-4.5, (-3.0, 0.5, 20), -1.75, 0.1, 7.0], [20]),
+    "halts in the middle, backwards": ([10.0, (8.0, -0.5, 20), 6.75, 4.9, -2.0], [20]),
+    "turned back far before it begins": ([(2.0, 1.0, 5), -2.0, -4.0, 20.0], [5]),
+    "turned back before it begins": ([(2.0, 1.0, 5), 0.5, -4.0, 20.0], [5]),
+    "turned back within a step before it begins": ([(2.0, 1.0, 5), 1.5, -4.0, 20.0], [5]),
+    "turned back just before it begins": ([(2.0, 1.0, 5), 1.9, -4.0, 20.0], [5]),
+}
+"""Name -> steps, and how many pulses each train gives."""
 
 
 class Trains:
@@ -44,75 +65,21 @@ class Trains:
         periods = [later - earlier for earlier, later in itertools.pairwise(times)]
         assert periods == pytest.approx([0.05] * 20, rel=1e-3)
 
-    def test_the_train_ends_with_its_last_pulse_however_far_it_turns(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 3))
-        bench.go(30.0)
-        assert len(bench.pulses()) == 3
-
-    def test_a_train_fires_once(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 3))
-        bench.go(5.0)
-        bench.go(0.0)
-        bench.go(5.0)
-        assert len(bench.pulses()) == 3
-
-    def test_one_train_after_another(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 3))
-        bench.go(5.0)
-        bench.stage.arm(bench.train(4.5, -1.0, 4))
-        bench.go(0.0)
-        assert bench.pulse_counts() == [bench.counts(at) for at in (1.0, 2.0, 3.0, 4.5, 3.5, 2.5, 1.5)]
-
-    def test_no_pulse_without_arming(self, bench: StageBench) -> None:
-        bench.go(10.0)
-        assert bench.pulses() == []
-
-    def test_no_pulse_after_disarming(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 3))
-        bench.stage.disarm()
-        bench.go(10.0)
-        assert bench.pulses() == []
-
-    def test_disarming_in_the_middle_of_a_train_ends_it(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 9))
-        bench.go(3.5)
-        bench.stage.disarm()
-        bench.go(7.5)
-        bench.go(0.0)
-        bench.go(20.0)
-        assert len(bench.pulses()) == 3
-        bench.stage.arm(bench.train(21.0, 1.0, 4))
-        bench.go(30.0)
-        assert bench.pulse_counts() == [bench.counts(at) for at in (1.0, 2.0, 3.0, 21.0, 22.0, 23.0, 24.0)]
-
-    @pytest.mark.parametrize("sign", [1, -1])
-    def test_a_train_that_is_stopped_in_the_middle_goes_on_with_the_next_move(
-        self, bench: StageBench, sign: int
+    @pytest.mark.parametrize(("steps", "given"), SCRIPTS.values(), ids=SCRIPTS)
+    def test_every_train_gives_its_pulses_until_it_is_over(
+        self, bench: StageBench, steps: Sequence[Step], given: Sequence[int]
     ) -> None:
-        bench.go(-4.5 if sign > 0 else 10.0)
-        first = -3.0 if sign > 0 else 8.0
-        bench.stage.arm(bench.train(first, sign * 0.5, 20))
-        for degrees in (first + sign * 1.25, first + sign * 3.1, first + sign * 10.0):
-            bench.go(degrees)
-        assert bench.pulse_counts() == [bench.counts(first) + sign * k * bench.counts(0.5) for k in range(20)]
-
-    def test_arming_again_replaces_the_train(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 9))
-        bench.stage.arm(bench.train(2.0, 3.0, 2))
-        bench.go(20.0)
-        assert bench.pulse_counts() == [bench.counts(2.0), bench.counts(5.0)]
-
-    def test_arming_again_in_the_middle_of_a_train_replaces_it(self, bench: StageBench) -> None:
-        bench.stage.arm(bench.train(1.0, 1.0, 9))
-        bench.go(3.5)
-        bench.stage.arm(bench.train(2.0, -1.0, 2))
-        bench.go(0.0)
-        bench.go(20.0)
-        assert bench.pulse_counts() == [bench.counts(at) for at in (1.0, 2.0, 3.0, 2.0, 1.0)]
-
-    def test_disarming_what_is_not_armed_is_fine(self, bench: StageBench) -> None:
-        bench.stage.disarm()
-        bench.stage.disarm()
+        trains = []
+        for step in steps:
+            if step is None:
+                bench.stage.disarm()
+            elif isinstance(step, tuple):
+                trains.append(bench.train(*step))
+                bench.stage.arm(trains[-1])
+            else:
+                bench.go(step)
+        expected = [train.start + train.interval * k for train, n in zip(trains, given, strict=True) for k in range(n)]
+        assert bench.pulse_counts() == expected
 
     def test_a_train_under_which_the_stage_is_stopped_goes_on_with_the_next_move(self, bench: StageBench) -> None:
         train = bench.train(1.0, 1.0, 30)
@@ -145,15 +112,6 @@ class Trains:
         assert bench.pulse_counts() == [
             train.start + train.interval * k for k in range(before if kind.turning_back_ends else 30)
         ]
-
-    @pytest.mark.parametrize("stop", [-2.0, 0.5, 1.5, 1.9])
-    def test_turning_back_before_the_first_pulse_keeps_the_train(self, bench: StageBench, stop: float) -> None:
-        train = bench.train(2.0, 1.0, 5)
-        bench.stage.arm(train)
-        bench.go(stop)
-        bench.go(-4.0)
-        bench.go(20.0)
-        assert bench.pulse_counts() == [train.start + train.interval * k for k in range(5)]
 
     def test_disarming_on_the_way_ends_the_pulses_or_is_refused_and_lets_it_move(
         self, kind: StageKind, bench: StageBench

@@ -48,9 +48,6 @@ class PiAxisBuild:
         lost: trigger pulses, counted from 0 since power-on, that never reach the line.
         stall_at: a move that would pass this true count ends there with error 1024 and the servo off.
         switch_at: a move that would pass this true count ends there by a limit switch, the servo on.
-
-    Raises:
-        ValueError: a turn without counts.
     """
 
     counts_per_turn: int = 360_000
@@ -71,10 +68,6 @@ class PiAxisBuild:
     lost: Set[int] = frozenset()
     stall_at: int | None = None
     switch_at: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.counts_per_turn < 1:
-            raise ValueError(f"a turn cannot have {self.counts_per_turn} counts")
 
 
 class GcsAxis:

@@ -43,9 +43,6 @@ class PiGcsBuild:
         unknown: commands (like "ACC" or "TMN?") that this model does not know.
         spoil: damages replies: (number since power-on, bytes) -> the bytes that arrive.
         specimen: the axis, and its faults.
-
-    Raises:
-        ValueError: there is no such output.
     """
 
     axis: str = "1"
@@ -54,10 +51,6 @@ class PiGcsBuild:
     unknown: Set[str] = frozenset()
     spoil: Spoil = lambda number, reply: reply
     specimen: PiAxisBuild = field(default=PiAxisBuild())
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.output <= OUTPUTS:
-            raise ValueError(f"there is no digital output {self.output}; there are 1 to {OUTPUTS}")
 
     @classmethod
     def matching(cls, settings: PiGcsSettings) -> Self:

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 
 from drivers.base.clock import Clock
-from simulators.devices.motor import PulseMotor, TriggerSettings
+from simulators.devices.motor import PulseMotor
 from simulators.devices.trigger_line import TriggerLine
 
 VERSION = "1.50 17-04-01 PM16C-04XDL-SIMULATED"
@@ -108,12 +108,9 @@ class Channel:
         """P, N or S: turns CW, CCW, stands."""
         return "SPN"[self.motor.move.direction] if self.motor.moving() else "S"
 
-    def status(self, now: float) -> int:
-        """b7 emergency stop, b6 slow stop, b5 limit, b3 decelerating, b2 accelerating, b1 driving, b0 busy."""
-        if not self.motor.moving():
-            return int(self.motor.ended)
-        gaining = self.motor.move.acceleration(now) * self.motor.move.direction
-        return 0b11 | (0b100 if gaining > 0 else 0) | (0b1000 if gaining < 0 else 0)
+    def status(self) -> int:
+        """b7 emergency stop, b6 slow stop, b5 limit, b1 driving, b0 busy. Speeding up and slowing down are not told."""
+        return 0b11 if self.motor.moving() else int(self.motor.ended)
 
 
 @dataclass(frozen=True)
@@ -129,9 +126,6 @@ class BoxBuild:
         stall_at, switch_at: counts at which a move of the sample's motor that would pass stops short, as by an
             interlock or a limit switch.
         fires_at_start: a train's start point itself gives a pulse [from memory: it does].
-
-    Raises:
-        ValueError: there is no such channel.
     """
 
     channel: int = 0
@@ -142,10 +136,6 @@ class BoxBuild:
     stall_at: int | None = None
     switch_at: int | None = None
     fires_at_start: bool = True
-
-    def __post_init__(self) -> None:
-        if self.channel not in range(16):
-            raise ValueError(f"there is no channel {self.channel}; there are 0 to 15")
 
 
 class PM16CBox:
@@ -271,10 +261,10 @@ class PM16CBox:
             raise Refused(Pm16cError.COMMAND)
         channel.rate = code
 
-    def set_trigger(self, c: str, change: Callable[[TriggerSettings], TriggerSettings]) -> None:
+    def set_trigger(self, c: str, **changes: float | None) -> None:
         """Change the trigger settings of a motor that stands and is not armed."""
         trigger = self.standing(c).motor.trigger
-        settings = change(trigger.settings)
+        settings = replace(trigger.settings, **changes)  # type: ignore[arg-type]
         if trigger.ready(self.clock.now()) or settings.interval < 1:
             raise Refused(Pm16cError.COMMAND)
         trigger.settings = settings
@@ -297,7 +287,7 @@ class PM16CBox:
     def channel_status(self, c: str) -> str:
         """The reply to STSx?; a channel without a position controller shows no switches and no status."""
         channel = self.channels[c]
-        bits = f"0{channel.status(self.clock.now()):02X}" if c in self.mapped else "---"
+        bits = f"0{channel.status():02X}" if c in self.mapped else "---"
         return f"{self.place}{c}{channel.letter}{bits}{channel.motor.position():+08d}"
 
 

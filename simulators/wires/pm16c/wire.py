@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Self, TypeVar
 
 from drivers.base.clock import Clock
@@ -43,10 +43,6 @@ def _set_limit(box: PM16CBox, side: str, c: str, value: str) -> None:
 
 def _set_switches(box: PM16CBox, c: str, bits: str) -> None:
     box.standing(c).switches = bits
-
-
-def _set_mode(box: PM16CBox, c: str, digit: str) -> None:
-    box.set_trigger(c, lambda settings: replace(settings, width=WIDTHS[digit]))
 
 
 QUERIES: tuple[tuple[str, Query], ...] = (
@@ -92,13 +88,10 @@ REMOTE_ONLY: tuple[tuple[str, Setting], ...] = (
     (rf"RTE{_C}(\d{{1,3}})", lambda box, c, d: box.set_rate(c, int(d))),
     (rf"([FB])L{_C}{_D}", _set_limit),
     (rf"SETLS{_C}([01]{{4}}0[01]{{3}})", _set_switches),
-    (rf"TMGM{_C}([02-5])", _set_mode),
-    (rf"TMGS{_C}{_D}", lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, start=int(d)))),
-    (rf"TMGE{_C}{_D}", lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, end=int(d)))),
-    (
-        rf"TMGI{_C}(\d{{1,10}})",
-        lambda box, c, d: box.set_trigger(c, lambda settings: replace(settings, interval=int(d))),
-    ),
+    (rf"TMGM{_C}([02-5])", lambda box, c, digit: box.set_trigger(c, width=WIDTHS[digit])),
+    (rf"TMGS{_C}{_D}", lambda box, c, d: box.set_trigger(c, start=int(d))),
+    (rf"TMGE{_C}{_D}", lambda box, c, d: box.set_trigger(c, end=int(d))),
+    (rf"TMGI{_C}(\d{{1,10}})", lambda box, c, d: box.set_trigger(c, interval=int(d))),
     (rf"TMGR{_C}", PM16CBox.arm),
     (rf"TMGC{_C}", lambda box, c: box.standing(c).motor.trigger.clear()),
 )

@@ -33,9 +33,6 @@ class DeviceBuild:
         latency: s from a trigger's condition to its actions.
         fires_when_enabled: a distance trigger fires where it is enabled, too.
         lost: trigger pulses (from 0, since power-on) that never reach the line.
-
-    Raises:
-        ValueError: there is no such output.
     """
 
     output: int = 1
@@ -48,10 +45,6 @@ class DeviceBuild:
     fires_when_enabled: bool = False
     lost: Set[int] = frozenset()
     axis: ZaberAxisBuild = field(default=ZaberAxisBuild())
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.output <= OUTPUTS:
-            raise ValueError(f"there is no digital output {self.output}; there are 1 to {OUTPUTS}")
 
 
 class ZaberDevice:

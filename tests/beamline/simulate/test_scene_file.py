@@ -36,7 +36,7 @@ def test_a_volume_is_sought_beside_its_scene(scene: Path) -> None:
 
 def test_wrong_settings_of_a_volume_are_the_scenes_fault(scene: Path) -> None:
     scene.write_text(scene.read_text(encoding="utf-8").replace("0.1", "-0.1"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"scene\.yaml: scene\.phantom \(volume\): voxel_mm must be positive"):
+    with pytest.raises(ConfigError, match=r"scene\.yaml: scene\.phantom \(volume\)\.voxel_mm must be greater than 0"):
         open_scene(str(scene))
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.serial.line import Probe, SerialLine
-from drivers.serial.transcript import RECENT_LINES
+from drivers.serial.line_reader import RECENT_LINES
 from simulators.devices.clock import VirtualClock
 from simulators.wires.serial_url import register
 

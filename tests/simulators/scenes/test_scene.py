@@ -104,7 +104,7 @@ def _with(**changes: Any) -> dict[str, Any]:
             "scene: key 'colour' is unknown; legal: phantom, beam, axis_offset_px, effects",
         ),
         (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s, sod, sdd"),
-        (_with(beam={"photons_per_s": -1}), "scene.beam: photons_per_s must be >= 0, got -1.0"),
+        (_with(beam={"photons_per_s": -1}), "scene.beam.photons_per_s must be greater than or equal to 0, got -1"),
         (_with(beam={"photons_per_s": "many"}), "scene.beam.photons_per_s must be a finite number, got 'many'"),
         (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd, energy_kev"),
         (_with(axis_offset_px=True), "scene.axis_offset_px must be a number, got True"),

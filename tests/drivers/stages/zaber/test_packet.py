@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.stages.zaber.packet import ENDINGS, FAULTS, damage, encode, lrc, meaning_of, reply_form, reply_of
-from simulators.wires.zaber.packets import frame
+from simulators.wires.zaber.wire import frame
 from tests.drivers.zaber_vectors import VECTORS
 
 COMMANDS = [

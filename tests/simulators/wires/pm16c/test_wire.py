@@ -162,7 +162,7 @@ def test_a_move_is_a_trapezoid_in_pulses(wire: Wire) -> None:
         wire.clock.sleep(seconds)
         assert int(wire.ask("PS?0")) == pytest.approx(expected, abs=1)
         bits.append(wire.ask("STS0?")[4:6])
-    assert bits == ["07", "03", "03", "0B", "00"]
+    assert bits == ["03", "03", "03", "03", "00"]
     assert wire.line.angle_at(wire.clock.now()) == pytest.approx(2 * math.pi * 100_000 / TURN)
 
 

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.packets import Command, PacketReader, frame, lrc
-from simulators.wires.zaber.wire import Fault, ZaberBuild
+from simulators.wires.zaber.wire import Command, Fault, PacketReader, ZaberBuild, frame, lrc
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_vectors import VECTORS
 from tests.simulators.zaber_host import SPEED, TURN, Wire

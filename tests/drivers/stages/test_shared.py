@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base.protocols import StageLimits
-from drivers.stages.stops import POLL, STOP_MARGIN, longest_stop, until_standing
+from drivers.stages.shared import POLL, STOP_MARGIN, longest_stop, until_standing
 from simulators.devices.clock import VirtualClock
 
 
