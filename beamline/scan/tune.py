@@ -57,10 +57,10 @@ class Tuning:
     saturated: float  # fraction of its pixels that are saturated at the configured exposure
     gain: float  # counts of a photon; NaN where the frames have no noise
     transmission: tuple[float, float]  # of the view, at its darkest hundredth and in the median
-    # exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN where darks
-    # have light or flats none
+    # advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
+    # where darks have light or flats none
     advised: float
-    # of a line integral in one view at the advised exposure, at the darkest hundredth and in the median
+    # noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median
     noise: tuple[float, float]
     longest: float  # exposure that the period and the camera allow
     angle: float  # of the view, rad
