@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, create_model, model_validator
 
-from beamline.config.declared import declared, read_from
-from beamline.config.section import Section
+from beamline.config.section import Section, declared, read_from
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock

@@ -1,10 +1,17 @@
-"""Section: a frozen group of configuration keys; unknown keys are refused."""
+"""Section: a frozen group of configuration keys, some of them declared by a driver's settings with `key`."""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from dataclasses import MISSING
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from drivers.flat import FlatField, flat_fields, from_flat
+from drivers.stages.settings import ANGULAR, Key
 
 
 class Section(BaseModel):
@@ -20,3 +27,57 @@ class Section(BaseModel):
                 value = str(data[name]).lower()
                 raise ValueError(f"{name} is {value} (YAML reads yes, no, on and off as true and false)")
         return data
+
+
+def declared(settings: type[Any]) -> dict[str, Any]:
+    """Type and default of each key, by name, as `pydantic.create_model` takes them."""
+    return {_name(field): _declared(field) for field in flat_fields(settings)}
+
+
+def read_from(section: Section, settings: type[Any]) -> Any:
+    """The driver's settings from a section with their keys."""
+    return from_flat(
+        settings, {field.name: _inside(field, getattr(section, _name(field))) for field in flat_fields(settings)}
+    )
+
+
+def _key(field: FlatField) -> Key:
+    found = field.metadata["key"]
+    assert isinstance(found, Key)
+    return found
+
+
+def _name(field: FlatField) -> str:
+    """The key of a field."""
+    return _key(field).name_of(field.name)
+
+
+def _inside(field: FlatField, value: Any) -> Any:
+    """A key's value for the driver: radians, and the type of the field."""
+    if value is None:
+        return None
+    if _key(field).unit in ANGULAR:
+        return math.radians(value)
+    return field.plain(value) if issubclass(field.plain, StrEnum | Path) else value
+
+
+def _declared(field: FlatField) -> tuple[Any, Any]:
+    """Type and default of a field's key, as pydantic takes them."""
+    key, plain = _key(field), field.plain
+    legal: Any = plain
+    if issubclass(plain, StrEnum):
+        legal = Literal[tuple(choice.value for choice in plain)]
+    elif issubclass(plain, Path):
+        legal = str
+    if key.bounds:
+        legal = Annotated[legal, Field(**key.bounds)]
+    if field.optional:
+        legal = legal | None
+    default = field.default
+    if default is MISSING:
+        default = ...
+    elif key.unit in ANGULAR:
+        default = key.default
+    elif isinstance(default, StrEnum):
+        default = default.value
+    return legal, Field(default, description=key.doc or None)

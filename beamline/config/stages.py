@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import Field, create_model, model_validator
 
-from beamline.config.declared import declared, read_from
-from beamline.config.section import Section
+from beamline.config.section import Section, declared, read_from
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
 from drivers.stages.registry import STAGES

@@ -16,7 +16,7 @@ from beamline.doctor import camera, disk
 from beamline.doctor.check import Diagnosis, Grade, of_error
 from beamline.doctor.disk import ScanNeeds, needs
 from beamline.doctor.ports import port, ports
-from beamline.instrument.beam_monitors import make_beam_monitor
+from beamline.instrument.devices import make_beam_monitor
 from beamline.scan.preflight import DryRun, dry_run
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError

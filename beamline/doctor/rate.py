@@ -132,7 +132,7 @@ class StageRun:
 
     stage: str
     frames: int
-    # from the first frame until all are on the disk and the file is closed; cpu_seconds: of all threads
+    # seconds: from the first frame until all are on the disk and the file is closed; cpu_seconds: of all threads
     seconds: float
     cpu_seconds: float
     lost: int  # frames that are not in the file, in their row

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Self
 from beamline.config.devices import DcamOrca, NoBeamMonitor, SimulatedOrca, StageOutputShutter
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError
-from beamline.instrument.beam_monitors import make_beam_monitor
-from beamline.instrument.cameras import make_camera, wait_until_cold
+from beamline.instrument.devices import make_beam_monitor, make_camera, wait_until_cold
 from beamline.instrument.operator import ask_operator
 from beamline.instrument.simulated import SimulatedScene, clock_of, scene_of, simulated_devices
 from drivers.base.clock import Clock, SystemClock

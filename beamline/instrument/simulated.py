@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 class SimulatedScene:
     """Facts about a simulated scene that an instrument cannot know."""
 
-    # the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the camera's
-    # rows
+    # truth: the sample's attenuation on a grid whose z is measured, as reconstructions do it, from the middle of the
+    # camera's rows
     truth: Callable[[Grid], Volume]
-    # mm from the source to the rotation axis and to the detector; None for a parallel beam
+    # cone: mm from the source to the rotation axis and to the detector; None for a parallel beam
     cone: tuple[float, float] | None
-    # the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch)
+    # labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch)
     labels: Callable[[float], Sequence[Label]]
-    # makes a frame with the camera's present settings; ConfigError where the scene cannot be exposed so
+    # rehearse: makes a frame with the camera's present settings; ConfigError where the scene cannot be exposed so
     rehearse: Callable[[], None]
 
 

@@ -43,8 +43,8 @@ class BeamState:
     usual: float = 0.0  # the normal level
     dipping: int = 0  # views in a row with a dip
     whole: float = math.nan  # logarithm of the light of the whole view before; NaN before any
-    # of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the limit is at
-    # most 3.8 times `alarm`
+    # changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the limit
+    # is at most 3.8 times `alarm`
     changes: FrameScatter = field(default_factory=FrameScatter)
 
 

@@ -62,7 +62,7 @@ def covariance(lags: tuple[int, ...], clutter: Clutter) -> Reals:
 class Filters:
     """Filters for several signals."""
 
-    # float32 [signal, lag, column]; on clutter and noise as assumed their output has the variance 1
+    # weights: float32 [signal, lag, column]; on clutter and noise as assumed their output has the variance 1
     weights: CellValues
     strength: Reals  # float64 [signal], output for a signal of amplitude 1
     speeds: Reals  # float64 [signal], cells a view

@@ -52,14 +52,15 @@ class FloaterState:
 
     raw: tuple[CellView, ...] = ()  # the last two views
     indices: tuple[int, ...] = ()  # rows in the file of the SPAN views before the last
-    # their line integrals, without zingers and smoothed along the columns; oldest first
+    # depths: their line integrals, without zingers and smoothed along the columns; oldest first
     depths: tuple[CellValues, ...] = ()
-    # for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight `light`
+    # filters: for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight
+    # `light`
     filters: Filters | None = None
     step: float = math.nan
     rim: float = math.nan
     light: float = 1.0
-    # usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely
+    # usual: usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely
     usual: CellValues | None = None
     peaks: Peaks = field(default_factory=no_peaks)  # of the last views
 

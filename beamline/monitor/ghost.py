@@ -137,13 +137,12 @@ class GhostCheck:
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
     """Mean line integral of the cells that are lit [part of the rows, broad column]."""
     starts = np.arange(min(PARTS, depth.shape[0])) * depth.shape[0] // min(PARTS, depth.shape[0])
-    sums, lit = (_broad(np.add.reduceat(x, starts, axis=0)) for x in (depth, (weight > 0).astype(np.float32)))
+    columns = np.arange(COLUMNS) * depth.shape[1] // COLUMNS
+    sums, lit = (
+        np.add.reduceat(np.add.reduceat(x, starts, axis=0), columns, axis=1)
+        for x in (depth, (weight > 0).astype(np.float32))
+    )
     return np.asarray(sums / np.maximum(lit, 1), np.float32)
-
-
-def _broad(cols: CellValues) -> CellValues:
-    """Sums over COLUMNS groups of columns."""
-    return np.add.reduceat(cols, np.arange(COLUMNS) * cols.shape[1] // COLUMNS, axis=1)
 
 
 def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:

@@ -63,8 +63,8 @@ class CellView:
 
     index: int  # its row in the file
     angle: float  # radians
-    # float32 [row, col], line integrals; where a cell is not lit those between its left and right neighbour, or 0 where
-    # they are not lit either
+    # depth: float32 [row, col], line integrals; where a cell is not lit those between its left and right neighbour, or
+    # 0 where they are not lit either
     depth: CellValues
     weight: CellValues  # float32 [row, col], photons relative to the open beam: 0 where unlit, exp(-depth) elsewhere
     # rows, cols: float32 [preview row], [preview col]: mean counts above the dark

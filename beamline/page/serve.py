@@ -6,7 +6,6 @@ import asyncio
 import ipaddress
 import secrets
 import socket
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -39,17 +38,10 @@ def open_port(bind: str, port: int) -> socket.socket:
         raise ConfigError(f"--bind is {bind!r}; expected an IP address of this machine, such as 127.0.0.1.") from error
     reason = ""
     for candidate in range(port, min(port + 10, 65536)):
-        listening = socket.socket(family, socket.SOCK_STREAM)
-        if sys.platform != "win32":
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listening.bind((bind, candidate))
-            listening.listen()
+            return socket.create_server((bind, candidate), family=family)
         except OSError as error:
-            listening.close()
             reason = error.strerror or str(error)
-        else:
-            return listening
     raise ConfigError(f"The page finds no port at {bind} from {port} on ({reason}). Name another by --port.")
 
 

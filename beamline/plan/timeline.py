@@ -258,8 +258,9 @@ def describe(
     facts = [("views", f"{views.n}{stored}, {plan.scheme} angles, {plan.mode} scan")]
     if views.trains:
         passes = f" in each of {len(views.trains)} passes" if len(views.trains) > 1 else ""
+        count = 2 * math.pi / stage.counts_per_turn
         facts += [
-            ("step", f"{degrees(timeline.step)} = {timeline.step_counts} counts of {degrees(_count(stage))}{passes}"),
+            ("step", f"{degrees(timeline.step)} = {timeline.step_counts} counts of {degrees(count)}{passes}"),
             ("speed", f"{degrees(views.speed)}/s (the stage's most {degrees(stage.max_speed)}/s)"),
             ("taxi", f"{degrees(views.taxi)} before the first and after the last trigger"),
             ("blur", f"{timeline.blur_px:.3g} px at the detector's edge during an exposure"),
@@ -278,10 +279,6 @@ def describe(
     lines += [f"{'remark':<10}{text}" for text in timeline.remarks]
     lines += [f"{'VIOLATION':<10}{text}" for text in timeline.violations]
     return lines
-
-
-def _count(stage: StageLimits) -> float:
-    return 2 * math.pi / stage.counts_per_turn
 
 
 def _angles(angles: NDArray[np.float64]) -> str:

@@ -16,7 +16,7 @@ from itertools import pairwise
 
 from beamline.scan.ledger import DeliveredFrame, Ledger, enter, start_known
 
-EARLY, LATE = 0.02, 0.5  # s before and after the stop was sent between which the braking must begin, as worked out
+EARLY, LATE = 0.02, 0.5  # s: braking begins at most so long before, and so long after, the stop was sent
 MOST = 0.75  # share of the triggers that must have a frame by their times; by chance 0.4 do
 FEW = 4  # triggers; fewer exposures show nothing
 SHRINKS = 0.2  # periods by which an interval may be shorter than the one before

@@ -83,7 +83,7 @@ class Ledger:
     # phase, period: estimated time of the last matched trigger, and estimated period, both in s
     phase: float = math.nan
     period: float = math.nan
-    # the first matched frame: framestamp, trigger, and periods since the expected time of trigger 0
+    # first: the first matched frame: framestamp, trigger, and periods since the expected time of trigger 0
     first: tuple[int, int, float] = (-1, -1, math.nan)
     missing: tuple[int, ...] = ()  # triggers without a frame, ascending: up to `last`, in a settled ledger all
     lost: int = 0  # of these, exposed but never delivered (framestamp gap)
@@ -91,12 +91,12 @@ class Ledger:
     extra: tuple[int, ...] = ()  # framestamps of frames that no trigger exposed
     beyond: int = 0  # of these, frames that came when a trigger after the last one would have come
     unconfirmed: int = 0  # of the extra frames, those exposed while the stage braked
-    # of the matched frames the largest distance from the trigger's expected time, in periods: steps by which the angle
-    # of a frame may be wrong
+    # off: of the matched frames the largest distance from the trigger's expected time, in periods: steps by which the
+    # angle of a frame may be wrong
     off: float = 0.0
-    # in a settled ledger, by how many triggers all angles may be wrong: triggers missing at one end could as well be
-    # missing at the other, and an extra frame at the end could be one at the beginning. 0 without such frames, or if
-    # the time of the first trigger is known
+    # shift: in a settled ledger, by how many triggers all angles may be wrong: triggers missing at one end could as
+    # well be missing at the other, and an extra frame at the end could be one at the beginning. 0 without such frames,
+    # or if the time of the first trigger is known
     shift: int = 0
 
     @property

@@ -119,19 +119,16 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
         earlier: files of the same scan, whose views come first.
     """
     recon, plan = config.recon, plan or LivePlan()
-
-    def command(scan: Path, output: Path) -> Sequence[str]:
-        options: dict[str, object] = {**_common(config), "--seconds": recon.seconds, "-o": output}
-        if (when := recon.stop_when) is not None:
-            limits = {"--enough-gain": when.psnr_gain_per_10_views, "--enough-loss": when.psnr_loss}
-            options |= {name: limit for name, limit in limits.items() if limit is not None}
-        if plan.binning > 1:
-            options["--bin"] = plan.binning
-        if plan.every > 1:
-            options["--views"] = f"every:{plan.every}"
-        return _words(scan, ["--follow", *(word for part in earlier for word in ("--earlier", str(part)))], options)
-
-    return command
+    options = {**_common(config), "--seconds": recon.seconds}
+    if (when := recon.stop_when) is not None:
+        limits = {"--enough-gain": when.psnr_gain_per_10_views, "--enough-loss": when.psnr_loss}
+        options |= {name: limit for name, limit in limits.items() if limit is not None}
+    if plan.binning > 1:
+        options["--bin"] = plan.binning
+    if plan.every > 1:
+        options["--views"] = f"every:{plan.every}"
+    flags = ["--follow", *(word for part in earlier for word in ("--earlier", str(part)))]
+    return lambda scan, output: _words(scan, flags, {**options, "-o": output})
 
 
 def finished_command(config: Config) -> LiveCommand:

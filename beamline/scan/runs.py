@@ -6,6 +6,7 @@ import json
 import os
 import time
 from calendar import timegm
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -80,9 +81,7 @@ def describe(run: Path) -> Run:
         state, n, joined, found = _part(part)
         frames = n if joined or frames is None or n is None else frames + n
         for check, levels in found.items():
-            for level, count in levels.items():
-                flags.setdefault(check, {}).setdefault(level, 0)
-                flags[check][level] += count
+            flags[check] = dict(Counter(flags.get(check)) + Counter(levels))
     return Run(
         folder=run,
         sample=str(heads[0].get("sample") or run.name.partition("_")[2] or run.name),

@@ -29,19 +29,20 @@ def _wait_in_pause() -> bool:
 class Supervision:
     """Callbacks of the acquisition."""
 
-    # called once, before the first projection, when all earlier frames are recorded. Returns why no projection should
-    # be taken; None: projections may be taken
+    # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no projection
+    # should be taken; None: projections may be taken
     refusal: Callable[[], str | None] = lambda: None
-    # checked before each frame of a standing stage, and all the time while it turns
+    # pause: checked before each frame of a standing stage, and all the time while it turns
     pause: PauseRequest = field(default_factory=PauseRequest)
-    # called repeatedly while the scan is paused. It waits a moment, and returns whether the operator at the terminal
-    # has let the scan go on
+    # wait_in_pause: called repeatedly while the scan is paused. It waits a moment, and returns whether the operator at
+    # the terminal has let the scan go on
     wait_in_pause: Callable[[], bool] = _wait_in_pause
-    # told the states of the scan
+    # states: told the states of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
-    # called once, after the last projection, with the triggers without a frame; returns the views to repeat
+    # retakes: called once, after the last projection, with the triggers without a frame; returns the views to repeat
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
-    # called after the last frame of flats and views: returns when it is known whether there was beam
+    # wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there was
+    # beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
 
 

@@ -57,10 +57,10 @@ class Tuning:
     saturated: float  # fraction of its pixels that are saturated at the configured exposure
     gain: float  # counts of a photon; NaN where the frames have no noise
     transmission: tuple[float, float]  # of the view, at its darkest hundredth and in the median
-    # exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN where darks
-    # have light or flats none
+    # advised: exposure that brings the brightest pixels to 80 % of the range, as far as camera and period allow. NaN
+    # where darks have light or flats none
     advised: float
-    # of a line integral in one view at the advised exposure, at the darkest hundredth and in the median
+    # noise: of a line integral in one view at the advised exposure, at the darkest hundredth and in the median
     noise: tuple[float, float]
     longest: float  # exposure that the period and the camera allow
     angle: float  # of the view, rad
@@ -123,9 +123,8 @@ def tune(
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
     timing = camera.timing
     blocks = _blocks(exposures, angle)
-    acquisition = Acquisition(
-        instrument.devices, _timeline(blocks, timing), settings, plan.settle, instrument.clock, stop, sink
-    )
+    worked = Timeline(tuple(blocks), 0.0, 2 * math.prod(timing.shape), 0, 0, 0.0, 0.0, 0.0, (), ())
+    acquisition = Acquisition(instrument.devices, worked, settings, plan.settle, instrument.clock, stop, sink)
     try:
         frames = list(acquisition.frames())
     except LedgerError as error:
@@ -245,11 +244,6 @@ def _blocks(exposures: Sequence[float], angle: float) -> list[Block]:
         *(static(FrameKind.FLAT, 2, exposure) for exposure in exposures),
         *views,
     ]
-
-
-def _timeline(blocks: Sequence[Block], timing: CameraTiming) -> Timeline:
-    frame_bytes = 2 * math.prod(timing.shape)
-    return Timeline(tuple(blocks), 0.0, frame_bytes, 0, 0, 0.0, 0.0, 0.0, (), ())
 
 
 def _longest(plan: ScanPlan, settings: CameraSettings, timing: CameraTiming) -> float:

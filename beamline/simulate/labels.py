@@ -22,7 +22,7 @@ class LabelledRun:
 
     kind: str  # the anomaly's name
     first: int  # its first frame, counted in the file from 0
-    # one for each frame: (first row, row after the last, first column, column after the last)
+    # regions: one for each frame: (first row, row after the last, first column, column after the last)
     regions: tuple[PixelBox, ...]
 
     @property
