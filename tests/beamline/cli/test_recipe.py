@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.cli import recon
+from beamline.cli import log
 from beamline.cli.recipe import repeating
 from beamline.cli.segment import segment
 from beamline.cli.study import study
@@ -136,7 +136,7 @@ def test_a_log_that_the_disk_does_not_take_is_named_and_does_not_end_the_work(
         path.touch()
         yield Full()
 
-    monkeypatch.setattr(recon, "new_log", new_log)
+    monkeypatch.setattr(log, "new_log", new_log)
     result = beamline("recon", "scan.h5", "-m", "fbp", "--log", "log.txt", "-o", "x.h5", "--no-report")
     assert result.exit_code == 0
     assert result.stderr.count(f"log.txt could not be written ({os.strerror(number)})") == 1
