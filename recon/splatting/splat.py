@@ -35,7 +35,7 @@ class Project(torch.autograd.Function):
         ctx.save_for_backward(means, log_scales, quaternions, raw)
         ctx.given = (unit, kernel, backend), geometry, (faint, cut, model)
         run = _begin((means, log_scales, quaternions, raw), unit, kernel, backend)
-        images = torch.empty((geometry.n_views, *geometry.detector_shape), device=means.device)
+        images = means.new_empty((geometry.n_views, *geometry.detector_shape))
         for view, image in enumerate(images):
             image.copy_(torch.as_tensor(run.view(geometry, view, faint, cut, model).image))
         return images

@@ -56,10 +56,10 @@ def test_projectors(beam: str) -> None:
     rays = projector.forward_lines(lines)
     volume, views = np.ones(grid.shape, np.float32), np.ones(projector.projection_shape, np.float32)
     for name, call in (
-        ("forward, lines", lambda: projector.forward_lines(lines, rays)),
+        ("forward, lines", lambda: projector.forward_lines(lines)),
         ("adjoint, lines", lambda: projector.adjoint_lines(rays, lines)),
-        ("forward", lambda: projector.forward(volume, views)),
-        ("adjoint", lambda: projector.adjoint(views, volume)),
+        ("forward", lambda: projector.forward(volume)),
+        ("adjoint", lambda: projector.adjoint(views)),
         ("direct", lambda: fdk(views, geometry, grid) if geometry.is_cone else fbp(views, geometry, grid)),
     ):
         middle, best, busy = _seconds(call)

@@ -202,6 +202,16 @@ def test_without_gradients_the_memory_is_that_of_the_images_however_many_views(r
     assert peaks[1] - peaks[0] < 4 * images  # a table of the Gaussians would be 2000 x 32 bytes a view
 
 
+def test_parameters_that_change_before_the_gradient_are_refused(random_gaussians: Make) -> None:
+    g = as_leaves(random_gaussians(4))
+    image, volume = project(g, geometry()), voxelize(g, Grid((3, 4, 5)))
+    with torch.no_grad():
+        g.means.add_(1)
+    for rendered in (image, volume):
+        with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+            rendered.sum().backward()
+
+
 def test_a_sub_volume_is_the_cut_out_of_the_volume(random_gaussians: Make) -> None:
     g = random_gaussians(80)
     whole = Grid((16, 18, 20), 0.7)
