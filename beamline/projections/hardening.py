@@ -21,8 +21,9 @@ _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
 _LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
 _AS_EVEN = 1e-3  # by which the mass may vary more, of itself: noise grows, too
-_CURVED = 24  # float32 copies of a view while a curve corrects it
-_RAYS, _VOLUMES = 16, 10  # float32 copies of the views and of the volume while a curve is fitted
+_CURVED = 16  # float32 copies of a view while a curve corrects it
+_RAYS, _VOLUMES = 10, 3  # float32 copies of the views and of the volume while a curve is fitted
+_NODE = 40_000  # bytes of a curve for each energy
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
 
 
@@ -43,12 +44,11 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
     return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
 
 
-def curve_memory(geometry: Geometry, fitted: bool) -> int:
+def curve_memory(geometry: Geometry, wanted: Hardening) -> int:
     """Most bytes that the curve of such views takes, and their correction by it."""
-    rows, cols = geometry.detector_shape
-    view = _CURVED * 4 * rows * cols
-    if not fitted:
-        return view
+    view = _CURVED * 4 * math.prod(geometry.detector_shape)
+    if wanted.spectrum is not None:
+        return max(view, _NODE * wanted.spectrum[0].size)
     _, _, small = _small(geometry)
     grid, rays = Grid.matching(small), small.n_views * math.prod(small.detector_shape)
     return max(view, 4 * (_RAYS * rays + _VOLUMES * math.prod(grid.shape)) + fbp_memory(small.n_views, grid.shape[2]))

@@ -32,7 +32,7 @@ _HELPS = 0.005  # share of the deviation that a jump takes away, or a part may a
 _ROWS = 16  # binned rows looked at
 _VIEWS = 360  # looked at, and all of parts that have no more than
 _SHORT = 40
-_COPIES = 24  # float32 copies of the views looked at while they are registered
+_COPIES = 28  # float32 copies of the views looked at while they are registered
 
 I64 = NDArray[np.int64]
 

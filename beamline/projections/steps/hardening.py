@@ -66,7 +66,7 @@ class Hardening:
     def memory(self, part: ScanPart) -> StepMemory:
         from beamline.projections.hardening import curve_memory
 
-        return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, fitted=self.spectrum is None))
+        return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, self))
 
     def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         if self.wanted is None:
