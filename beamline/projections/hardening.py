@@ -1,8 +1,9 @@
-"""Beam hardening of a scan: the curve of its material, or of what its own views show, and the views by that curve."""
+"""Beam hardening of a scan: the curve of a material in a beam, or of what its own views show."""
 
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,13 @@ from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import k_means
-from recon.prep.hardening import F32, Curve, NoCurveError, curve_of_paths, curve_of_spectrum
+from recon.prep.hardening import F32, F64, Curve, NoCurveError, curve_of_paths, curve_of_spectrum
+from recon.prep.matter import mass_attenuation, tube_spectrum
 from recon.reconstruction import reconstruct
 from recon.voxels.fbp import fbp_memory
 from recon.voxels.projector import project
 
+_TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
 _LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
@@ -25,6 +28,33 @@ _CURVED = 16  # float32 copies of a view while a curve corrects it
 _RAYS, _VOLUMES = 10, 3  # float32 copies of the views and of the volume while a curve is fitted
 _NODE = 40_000  # bytes of a curve for each energy
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
+
+
+def in_beam(material: str, beam: str) -> tuple[F64, F64]:
+    """Mass attenuation of a material at the energies of a beam, cm²/g, and their shares of the light detected.
+
+    Args:
+        material: a known one, or a chemical formula.
+        beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
+            weight, with the detector's response and in any unit. A filter needs its density: it is
+            one of the known materials.
+
+    Raises:
+        ValueError: what is wrong with either.
+    """
+    tube = _TUBE.fullmatch(beam)
+    if tube is not None:
+        filters = dict(part.split("=") for part in tube[2].split(",")[1:])
+        energies, weights = tube_spectrum(float(tube[1]), {name: float(mm) for name, mm in filters.items()})
+    else:
+        try:
+            table = np.loadtxt(beam, ndmin=2)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{beam} is neither a tube such as 60kV,Al=1 nor a table of keV and weight") from error
+        if table.shape[1] != 2 or not (table >= 0).all() or not table[:, 1].any():
+            raise ValueError(f"{beam} must hold two columns, keV and weight, 0 or more, and not all weights 0")
+        energies, weights = table[table[:, 1] > 0].T
+    return mass_attenuation(material, energies), weights
 
 
 def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve | None, str]:

@@ -52,7 +52,7 @@ class Hardening:
     def __post_init__(self) -> None:
         if self.wanted is None or self.wanted == "fit" or self.spectrum is not None:
             return
-        from beamline.projections.beam import in_beam
+        from beamline.projections.hardening import in_beam
 
         try:
             object.__setattr__(self, "spectrum", in_beam(*self.wanted.split(":", 1)))

@@ -25,7 +25,7 @@ from beamline.projections.steps.step import PrepStep, ScanPart, ScanStep, StepMe
 from beamline.projections.tilt import with_tilt
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths
-from beamline.reconstruct.slabs import needs_of
+from beamline.reconstruct.slabs import Needs, needs_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
@@ -65,12 +65,11 @@ def part_of(source: ScanSource, *steps: PrepStep) -> ScanPart:
     return ScanPart(source, selection, geometry_of(source, selection, source.shape[1] / 2, source.angles[views]))
 
 
-def needs(path: Path, *steps: PrepStep) -> StepMemory:
-    options = ReconOptions(
-        SourceOptions(path), OutputPaths(path.with_name("out.h5"), None), Selection(steps=steps), Fbp()
-    )
+def needs(path: Path, *steps: PrepStep) -> Needs:
+    output = OutputPaths(path.with_name("out.h5"), None)
+    options = ReconOptions(SourceOptions(path), output, Selection(steps=steps), Fbp())
     with open_scan(SourceOptions(path)) as source:
-        return needs_of(source, options).steps
+        return needs_of(source, options)
 
 
 @pytest.mark.parametrize("step", ON_VIEWS, ids=["tilt", "lens", "phase", "unsharp"])
