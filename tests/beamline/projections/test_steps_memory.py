@@ -133,7 +133,7 @@ def test_the_search_of_a_jump_takes_no_more_than_it_states(tmp_path: Path) -> No
         part = part_of(source, step)
         usable = usable_views(source, True)
         taken = peak(lambda: step.place(source, part.selection, usable, 23.5, lambda n, of: None))
-    assert 0.25 * step.memory(part).alone < taken < step.memory(part).alone
+        assert 0.25 * step.memory(part).alone < taken < step.memory(part).alone
 
 
 def test_a_scan_without_a_jump_needs_no_memory_for_it_unless_the_monitor_is_to_look(tmp_path: Path) -> None:
