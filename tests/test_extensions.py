@@ -367,7 +367,7 @@ STEP = Extension(
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.projections.steps.step import StepDone, option
+from beamline.projections.steps.step import StepDone, StepMemory, option
 
 
 @dataclass(frozen=True)
@@ -383,6 +383,9 @@ class Lift:
     @property
     def needs_finished(self):
         return "--lift is for a finished scan." if self.by else ""
+
+    def memory(self, part):
+        return StepMemory(alone=10**9 if self.by else 0)
 
     def apply(self, views, angles):
         views.projections.data[...] += self.by

@@ -22,7 +22,7 @@ from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.validate import altered_said
 from recon.base.arrays import Mask
-from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError
+from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
 from recon.prep.counts import Photons
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
@@ -89,8 +89,6 @@ class ScanCorrection:
         data, frames = self._read(frames, rows, lambda n, of: progress(n // steps, of))
         if not frames.size:
             raise self._no_view()
-        if self._beam is None:
-            return self._filters.apply(_as_given(data, frames), rows)
         return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, progress=progress)
 
     def in_batches(
@@ -113,8 +111,7 @@ class ScanCorrection:
         self._look_for_shadow(frames)
         parts, passes = np.split(frames, np.arange(batch, frames.size, batch)), 1 if self._beam is None else 2
         stream, columns, alive = None, (0, 0), []
-        if self._beam is not None:
-            survey = self._correction(None)
+        if self._beam is not None and (survey := self._correction(None)) is not None:
             for done, part in enumerate(parts):
                 data, found = self._read(part, None)
                 alive.append(found)
@@ -129,12 +126,9 @@ class ScanCorrection:
         for done, part in enumerate(parts):
             last = done == len(parts) - 1
             data, found = self._read(part, None)
-            if stream is not None:
-                corrected = self._corrected(stream, data, found, last)
-            elif found.size:
-                corrected = self._filters.apply(_as_given(data, found), None)
-            else:
+            if stream is None and not found.size:
                 continue
+            corrected = self._corrected(stream, data, found, last)
             n = len(corrected.data)
             out[at : at + n] = corrected.data
             at += n
@@ -142,7 +136,8 @@ class ScanCorrection:
             progress(begun + min((done + 1) * batch, frames.size), passes * frames.size)
         if not at:
             raise self._no_view()
-        return _joined(kept, out[:at])
+        masked = np.logical_and.reduce([part.masked for part in kept])
+        return replace(merge_and_empty(kept, out[:at]), masked=masked)
 
     def feed(self, frames: NDArray[np.int64], *, last: bool) -> Projections | None:
         """Line integrals of the next frames; None where there are none yet, since the newest view waits for the next.
@@ -155,11 +150,9 @@ class ScanCorrection:
             DataError: as `at_once`.
         """
         data, frames = self._read(frames, None)
-        if self._beam is None:
-            return self._filters.apply(_as_given(data, frames), None) if frames.size else None
         if self._stream is None:
             self._stream = self._correction(None)
-        if not frames.size and not (last and self._stream.waiting):
+        if not frames.size and not (last and self._stream is not None and self._stream.waiting):
             return None
         part = self._corrected(self._stream, data, frames, last)
         if not part.view_ids.size:
@@ -220,8 +213,10 @@ class ScanCorrection:
             first = self._filters.read(None).start
             self._shadow = self._beam.shadow(self._source, views, first, self.binning)
 
-    def _correction(self, rows: slice | None) -> Correction:
-        assert self._beam is not None
+    def _correction(self, rows: slice | None) -> Correction | None:
+        """None: the scan holds line integrals already."""
+        if self._beam is None:
+            return None
         try:
             return self._beam.correction(self._filters.within(rows), self._shadow)
         except ValueError as error:
@@ -229,13 +224,15 @@ class ScanCorrection:
 
     def _corrected(
         self,
-        correction: Correction,
+        correction: Correction | None,
         data: NDArray[Any],
         frames: NDArray[np.int64],
         last: bool,
         rows: slice | None = None,
         progress: Callable[[int, int], None] = lambda n, total: None,
     ) -> Projections:
+        if correction is None:
+            return self._filters.apply(_as_given(data, frames), rows)
         n = frames.size
         try:
             views = None
@@ -284,16 +281,6 @@ def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: 
     read = ViewFilters.of(source, selection).read(rows)
     pixels = frames * (read.stop - read.start) * source.shape[1] // selection.binning**2
     return reading_memory(source, frames, read, selection.binning) + 4 * _COPIES * pixels
-
-
-def _joined(parts: list[Projections], data: NDArray[np.float32]) -> Projections:
-    """Batches as one, with their line integrals in `data`; a pixel is masked where it is in all of them."""
-    n = np.array([part.view_ids.size for part in parts], np.float64)
-    share = n / n.sum()
-    floored, replaced = (float(share @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
-    ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
-    masked = np.logical_and.reduce([part.masked for part in parts])
-    return Projections(data, ids, floored, air, masked, parts[-1].air_columns, replaced)
 
 
 def _as_given(data: NDArray[Any], frames: NDArray[np.int64]) -> Projections:

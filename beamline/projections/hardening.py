@@ -1,30 +1,61 @@
-"""Beam hardening of a scan: the curve of its material, or of what its own views show, and the views by that curve."""
+"""Beam hardening of a scan: the curve of a material in a beam, or of what its own views show."""
 
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.projections.steps.hardening import Hardening
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import k_means
 from recon.prep.hardening import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
+from recon.prep.matter import mass_attenuation, tube_spectrum
 from recon.reconstruction import reconstruct
 from recon.voxels.fbp import fbp_memory
 from recon.voxels.projector import project
 
+_TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
 _LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
 _AS_EVEN = 1e-3  # by which the mass may vary more, of itself: noise grows, too
-_CURVED = 24  # float32 copies of a view while a curve corrects it
-_RAYS, _VOLUMES = 16, 10  # float32 copies of the views and of the volume while a curve is fitted
+_CURVED = 16  # float32 copies of a view while a curve corrects it
+_RAYS, _VOLUMES = 10, 3  # float32 copies of the views and of the volume while a curve is fitted
+_NODE = 40_000  # bytes of a curve for each energy
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges
+
+
+def in_beam(material: str, beam: str) -> tuple[F64, F64]:
+    """Mass attenuation of a material at the energies of a beam, cm²/g, and their shares of the light detected.
+
+    Args:
+        material: a known one, or a chemical formula.
+        beam: a tube such as "60kV", behind mm of filters "60kV,Al=1,Cu=0.1". Or a text file of two columns, keV and
+            weight, with the detector's response and in any unit. A filter needs its density: it is
+            one of the known materials.
+
+    Raises:
+        ValueError: what is wrong with either.
+    """
+    tube = _TUBE.fullmatch(beam)
+    if tube is not None:
+        filters = dict(part.split("=") for part in tube[2].split(",")[1:])
+        energies, weights = tube_spectrum(float(tube[1]), {name: float(mm) for name, mm in filters.items()})
+    else:
+        try:
+            table = np.loadtxt(beam, ndmin=2)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{beam} is neither a tube such as 60kV,Al=1 nor a table of keV and weight") from error
+        if table.shape[1] != 2 or not (table >= 0).all() or not table[:, 1].any():
+            raise ValueError(f"{beam} must hold two columns, keV and weight, 0 or more, and not all weights 0")
+        energies, weights = table[table[:, 1] > 0].T
+    return mass_attenuation(material, energies), weights
 
 
 def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve | None, str]:
@@ -44,12 +75,11 @@ def curve_of(views: F32, geometry: Geometry, wanted: Hardening) -> tuple[Curve |
     return curve, f"Hardening: corrected by the curve {how}: line integrals of {highest:.3g} became {corrected:.3g}."
 
 
-def curve_memory(geometry: Geometry, fitted: bool) -> int:
+def curve_memory(geometry: Geometry, wanted: Hardening) -> int:
     """Most bytes that the curve of such views takes, and their correction by it."""
-    rows, cols = geometry.detector_shape
-    view = _CURVED * 4 * rows * cols
-    if not fitted:
-        return view
+    view = _CURVED * 4 * math.prod(geometry.detector_shape)
+    if wanted.spectrum is not None:
+        return max(view, _NODE * wanted.spectrum[0].size)
     _, _, small = _small(geometry)
     grid, rays = Grid.matching(small), small.n_views * math.prod(small.detector_shape)
     return max(view, 4 * (_RAYS * rays + _VOLUMES * math.prod(grid.shape)) + fbp_memory(small.n_views, grid.shape[2]))

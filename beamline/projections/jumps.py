@@ -32,7 +32,7 @@ _HELPS = 0.005  # share of the deviation that a jump takes away, or a part may a
 _ROWS = 16  # binned rows looked at
 _VIEWS = 360  # looked at, and all of parts that have no more than
 _SHORT = 40
-_COPIES = 24  # float32 copies of the views looked at while they are registered
+_COPIES = 28  # float32 copies of the views looked at while they are registered
 
 I64 = NDArray[np.int64]
 
@@ -278,7 +278,7 @@ class _Fit:
         group = groups[_parts(self.jumps, self.frames)]
         frames, group = self.frames[group >= 0], group[group >= 0]
         band = self.band(factor)
-        views = ScanCorrection(self.source, band, _quiet).at_once(frames[_thinned(group)])
+        views = ScanCorrection(self.source, band, lambda _: None).at_once(frames[_thinned(group)])
         kept = group[np.searchsorted(frames, views.view_ids)]
         geometry = geometry_of(self.source, band, self.axis_col, self.source.angles[views.view_ids])
         return _Views(views.data, geometry, kept, ~areas(views.masked), rounds)
@@ -357,7 +357,3 @@ def frames_text(frames: Sequence[int] | I64) -> str:
     """Frames of a file as `frame 3` or `frames 3, 7`."""
     frames = np.asarray(frames).tolist()
     return ("frame " if len(frames) == 1 else "frames ") + ", ".join(map(str, frames))
-
-
-def _quiet(text: str) -> None:
-    """What the correction of all views says is not said twice."""

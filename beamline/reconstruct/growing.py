@@ -20,6 +20,7 @@ from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, geometry_of
 from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.jumps import Jumps
 from beamline.projections.steps.step import PlaceStep, ScanStep, StepDone
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
@@ -275,7 +276,7 @@ class ScanFollower:
         assert self._fit is not None and self.axis_col is not None  # two views are there, and settled the axis
         if self._newest is not None:  # the scan was stopped: no other view comes
             self._feed(np.empty(0, np.int64), last=True)
-        if usable.jumps.size:
+        if usable.jumps.size and self._options.selection.step(Jumps).wanted == "correct":
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume takes the views as if it had not. "
                 "`beamline recon` on the finished file corrects them, or leaves them out."

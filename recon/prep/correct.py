@@ -339,17 +339,22 @@ def correct(
     return correction.line_integrals(views)
 
 
-def merge_and_empty(parts: list[Projections]) -> Projections:
+def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
     """Batches of one scan's views as one. The list is emptied meanwhile, so that no view is in memory twice for long.
 
     The air columns and the mask are those of the last batch.
+
+    Args:
+        data: the line integrals of all, if they are together already; those of the batches do not count then.
     """
-    n = np.array([len(part.data) for part in parts], np.float64)
+    n = np.array([part.view_ids.size for part in parts], np.float64)
     weights, last = n / max(n.sum(), 1), parts[-1]
     ids, air = (np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air"))
     floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
     each = [part.weights for part in parts if part.weights is not None]
     counted = np.concatenate(each) if each else None
+    if data is not None:
+        return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted)
     data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
     while parts:
         part = parts.pop(0).data

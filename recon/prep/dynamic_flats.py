@@ -132,13 +132,13 @@ def find_dynamic_flats(
 
 def search_memory(flats: int, pixels: int) -> int:
     """Most bytes that `find_dynamic_flats` takes, with the components; `pixels` of a flat."""
-    return 4 * pixels * (_MOST + 16) + 8 * flats * (6 * min(pixels, 2 * _SAMPLED) + 4 * flats)
+    return 4 * pixels * (_MOST + 16) + 8 * flats * 6 * min(pixels, 2 * _SAMPLED)
 
 
 def view_memory(flats: int, pixels: int) -> int:
     """Most bytes that the components take, with the weights of a view by them."""
-    found = min(_MOST, flats)
-    return 4 * pixels * (4 * found + 16) + 8 * 2 * _SAMPLED * (4 * found + 8)
+    found, samples = min(_MOST, flats), min(2 * pixels, 3 * _SAMPLED // 2)
+    return 4 * pixels * (4 * found + 14) + 8 * samples * (3 * found + 8)
 
 
 def _shape(flat: F32, mean: F32, good: NDArray[np.bool_]) -> F32:

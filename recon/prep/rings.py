@@ -25,7 +25,7 @@ _FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more
 _MOST = 0.1  # of the columns
 _EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
 _SEEN = 4.5  # `stripe_score` from which on there are stripes: 1.4 to 3.6 without, 5 to 10 in two real scans
-_COPIES = 16  # float32 copies of a sinogram
+_COPIES = 13  # float32 copies of a sinogram
 _LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
 
 # Scaling filter of Daubechies' wavelet with five vanishing moments (Daubechies 1992, table 6.1).

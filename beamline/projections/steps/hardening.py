@@ -52,7 +52,7 @@ class Hardening:
     def __post_init__(self) -> None:
         if self.wanted is None or self.wanted == "fit" or self.spectrum is not None:
             return
-        from beamline.projections.beam import in_beam
+        from beamline.projections.hardening import in_beam
 
         try:
             object.__setattr__(self, "spectrum", in_beam(*self.wanted.split(":", 1)))
@@ -66,7 +66,7 @@ class Hardening:
     def memory(self, part: ScanPart) -> StepMemory:
         from beamline.projections.hardening import curve_memory
 
-        return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, fitted=self.spectrum is None))
+        return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, self))
 
     def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
         if self.wanted is None:

@@ -18,6 +18,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
 from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.jumps import Jumps
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
@@ -99,6 +100,10 @@ def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
     ("selection", "said"),
     [
         (Selection(axis_col=23.5, steps=(Flags("ignore"),)), "--flags ignore: 1 view with an alarm"),
+        (
+            Selection(axis_col=23.5, steps=(Jumps("ignore"),)),
+            "The monitor saw the sample jump at frame 45; --jumps ignore",
+        ),
         (Selection(axis_col=23.5, cone=(100.0, 200.0)), "Views of a cone beam are not corrected"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from beamline.projections.steps.step import StepDone, option
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,9 @@ class Lift:
     @property
     def needs_finished(self) -> str:
         return "--lift is for a finished scan." if self.by else ""
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()
 
     def apply(self, views: Any, angles: Any) -> StepDone:
         views.projections.data[...] += self.by
