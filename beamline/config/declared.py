@@ -16,7 +16,7 @@ from drivers.stages.settings import ANGULAR, Key
 
 
 def declared(settings: type[Any]) -> dict[str, Any]:
-    """Type and default of each key, by name, as `pydantic.create_model` takes them."""
+    """Type and default of each key, by name, as `section_of` takes them."""
     return {_name(field): _declared(field) for field in flat_fields(settings)}
 
 

@@ -10,12 +10,11 @@ from pydantic import (
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
-    create_model,
     model_validator,
 )
 
 from beamline.config.declared import declared, read_from
-from beamline.config.section import Section
+from beamline.config.section import Section, section_of
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
@@ -116,7 +115,7 @@ class PluggedCamera(Section):
 
 def _plugged(kind: str) -> type[PluggedCamera]:
     keys = {"kind": (Literal[kind], ...)} | declared(CAMERAS[kind].Settings)
-    return create_model(f"{kind.title()}CameraConfig", __base__=PluggedCamera, **keys)
+    return section_of(f"{kind.title()}CameraConfig", PluggedCamera, keys)
 
 
 PLUGGED: tuple[type[PluggedCamera], ...] = tuple(map(_plugged, CAMERAS))
