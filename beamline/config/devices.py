@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, create_model, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
-from beamline.config.section import Section, declared, read_from
+from beamline.config.section import Section, declared, read_from, section_of
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
@@ -108,7 +108,7 @@ class PluggedCamera(Section):
 
 def _plugged(kind: str) -> type[PluggedCamera]:
     keys = {"kind": (Literal[kind], ...)} | declared(CAMERAS[kind].Settings)
-    return create_model(f"{kind.title()}CameraConfig", __base__=PluggedCamera, **keys)
+    return section_of(f"{kind.title()}CameraConfig", PluggedCamera, keys)
 
 
 PLUGGED: tuple[type[PluggedCamera], ...] = tuple(map(_plugged, CAMERAS))

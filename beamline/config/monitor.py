@@ -10,9 +10,9 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from pydantic import Field, create_model
+from pydantic import Field
 
-from beamline.config.section import Section
+from beamline.config.section import Section, section_of
 from beamline.monitor.check import Check, Policy
 from beamline.monitor.checks import CHECKS
 
@@ -29,17 +29,17 @@ class MonitorBase(Section):
 
 
 def _limits_of(check: Check) -> Any:
-    """The section with the limits of a check, and its default, as pydantic.create_model takes a field."""
+    """The section with the limits of a check, and its default, as `section_of` takes a key."""
     types = get_type_hints(type(check), include_extras=True)
     keys: dict[str, Any] = {limit.name: (types[limit.name], limit.default) for limit in fields(check)}
-    section = create_model(f"{type(check).__name__}Limits", __base__=Section, __doc__=f"Flag: {check.meaning}.", **keys)
+    section = section_of(f"{type(check).__name__}Limits", Section, keys, f"Flag: {check.meaning}.")
     return section, section()
 
 
 def _policies() -> Any:
-    """The section with the policy of each check, and its default, as pydantic.create_model takes a field."""
+    """The section with the policy of each check, and its default, as `section_of` takes a key."""
     keys: dict[str, Any] = {check.name: (Policy, check.policy) for check in CHECKS}
-    section = create_model("Policies", __base__=Section, __doc__="What alarms of each check do to a scan.", **keys)
+    section = section_of("Policies", Section, keys, "What alarms of each check do to a scan.")
     return section, section()
 
 
@@ -47,9 +47,8 @@ if TYPE_CHECKING:
     MonitorSection = MonitorBase
 else:
     _LIMITS = {check.name: _limits_of(check) for check in CHECKS if fields(check)}
-    MonitorSection = create_model(
-        "MonitorSection", __base__=MonitorBase, __doc__="Section `monitor`.", policy=_policies(), **_LIMITS
-    )
+    _KEYS = {"policy": _policies(), **_LIMITS}
+    MonitorSection = section_of("MonitorSection", MonitorBase, _KEYS, "Section `monitor`.")
 
 
 def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:

@@ -8,9 +8,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Literal, get_type_hints
 
-from pydantic import create_model
-
-from beamline.config.section import Section
+from beamline.config.section import Section, section_of
 from beamline.monitor.references import ReferenceLimits
 
 
@@ -26,9 +24,7 @@ if TYPE_CHECKING:
 else:
     _TYPES = get_type_hints(ReferenceLimits, include_extras=True)
     _KEYS: dict[str, Any] = {limit.name: (_TYPES[limit.name], limit.default) for limit in fields(ReferenceLimits)}
-    ReferencesSection = create_model(
-        "ReferencesSection", __base__=ReferencesBase, __doc__="Section `references`.", **_KEYS
-    )
+    ReferencesSection = section_of("ReferencesSection", ReferencesBase, _KEYS, "Section `references`.")
 
 
 def reference_limits(section: ReferencesBase) -> ReferenceLimits:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
-from pydantic import Field, create_model, model_validator
+from pydantic import Field, model_validator
 
-from beamline.config.section import Section, declared, read_from
+from beamline.config.section import Section, declared, read_from, section_of
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
 from drivers.stages.registry import STAGES
@@ -51,12 +51,8 @@ class StageSection(Section):
 
 def _section(kind: str) -> type[StageSection]:
     settings = STAGES[kind].Settings
-    return create_model(
-        settings.__name__.replace("Settings", "StageConfig"),
-        __base__=StageSection,
-        __doc__=(settings.__doc__ or "").partition("\n")[0],
-        **({"kind": (Literal[kind], ...)} | declared(settings)),
-    )
+    name, doc = settings.__name__.replace("Settings", "StageConfig"), (settings.__doc__ or "").partition("\n")[0]
+    return section_of(name, StageSection, {"kind": (Literal[kind], ...)} | declared(settings), doc)
 
 
 STAGE_SECTIONS: Mapping[str, type[StageSection]] = {kind: _section(kind) for kind in STAGES}

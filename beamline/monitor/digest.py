@@ -149,8 +149,8 @@ def _from_reals(
     preview: NDArray[np.float32],
     peaks: NDArray[np.float32],
 ) -> Numbers:
-    marker = np.nan if no_data is None else image.dtype.type(no_data)
-    threshold = np.inf if saturation is None else saturation
+    marker = np.nan if no_data is None else float(image.dtype.type(no_data))  # floats: numba compiles for each type
+    threshold = np.inf if saturation is None else float(saturation)
     n, low, high, mean, squares, sum_abs, saturated = _sum_reals(image, threshold, preview_bin, marker, preview, peaks)
     invalid = (image.size - n) / image.size
     if n == 0:

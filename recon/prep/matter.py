@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from functools import cache
 from types import MappingProxyType
 
 import numpy as np
@@ -94,7 +95,7 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
     """
     if not 5 <= kv <= 800:
         raise ValueError(f"kv must lie in 5 ... 800, got {kv}")
-    x, w = np.polynomial.legendre.leggauss(_NODES)
+    x, w = _gauss_rule()
     energies = _SOFTEST_KEV + (kv - _SOFTEST_KEV) * (x + 1) / 2
     depth = np.zeros(_NODES)
     for name, mm in filters.items():
@@ -106,6 +107,12 @@ def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:
         raise ValueError(f"no light of the tube's {kv:g} kV passes its filters {dict(filters)} mm")
     kept = weights > _NOTHING * weights.sum()
     return energies[kept], weights[kept]
+
+
+@cache  # half a second
+def _gauss_rule() -> tuple[F64, F64]:
+    """Nodes in -1 ... 1 and their weights."""
+    return np.polynomial.legendre.leggauss(_NODES)
 
 
 def _fractions(name: str) -> dict[int, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -129,8 +130,14 @@ def _gaussian(n: int) -> tuple[Reals, Reals]:
     return x, w / w.sum()
 
 
+@cache  # half a second for many
+def _gauss_rule(n: int) -> tuple[Reals, Reals]:
+    """Nodes in -1 ... 1 and their weights."""
+    return np.polynomial.legendre.leggauss(n)
+
+
 def _tube(tube: Tube, n: int, filters: Callable[[str], Attenuation]) -> Spectrum:
-    x, w = np.polynomial.legendre.leggauss(n)
+    x, w = _gauss_rule(n)
     energies = _LEAST_KEV + (tube.kv - _LEAST_KEV) * (x + 1) / 2
     weights = w * (tube.kv - energies) / energies
     open_beam = weights.sum()

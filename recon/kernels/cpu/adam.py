@@ -91,11 +91,6 @@ def adam_all(
     )  # fmt: skip
 
 
-def adam(parameter: F32, gradient: F32, first: F32, second: F32, rate: float, step: int, eps: float = 1e-15) -> None:
-    """`adam_all` for one array."""
-    adam_all((parameter,), (gradient,), (first,), (second,), (rate,), step, eps=eps)
-
-
 @njit(**OPTIONS)
 def add_lengths(vectors: F32, factor: float, sums: F32) -> None:
     """sums [n] += factor * |vectors [n, 2]|: accumulates gradients on footprints' centres for density control."""

@@ -61,7 +61,7 @@ def project(volume: Voxels32, spacing: Reals, first: Reals, pose: Pose, detector
     rays = VoxelRays(-detector.axis_col * pitch, -detector.axis_row * pitch, pitch, float(detector.sod))
 
     if pose.tilt is None and math.isinf(detector.sod):
-        shift = np.zeros((detector.shape[0], 3)) if pose.shift is None else pose.shift
+        shift = np.zeros((detector.shape[0], 3)) if pose.shift is None else np.ascontiguousarray(pose.shift)
         cosine, sine = np.cos(pose.angle), np.sin(pose.angle)
 
         def rows(low: int, high: int) -> None:
