@@ -153,8 +153,8 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
 
     exp(-mu(E) t) of different energies are nearly linearly dependent. The energies are found by non-negative least
     squares (Lawson & Hanson, Solving Least Squares Problems, 1974, ch. 23). It runs on rays through each material, each
-    pair and all of them. First comes a set of about a hundred with exactly the same transmission, then as few of these as the
-    tolerance allows.
+    pair and all of them. First comes a set of about a hundred with exactly the same transmission, then as few of these
+    as the tolerance allows.
 
     Args:
         attenuation: 1/mm, float64 [energy, material].
