@@ -160,7 +160,7 @@ class SerialLine:
         """The bytes to send, and their text for messages."""
         if isinstance(command, bytes):
             return command, readable(command)
-        return command.encode("ascii") + self._framing.command_end, command
+        return command.encode("ascii") + self._framing.command_end, command or "an empty line"
 
     def _resynchronise(self, request: str, state: str) -> None:
         """Discard what arrives, send the probe, skip late replies until its own, and wait for silence."""
@@ -198,7 +198,7 @@ class SerialLine:
     def _write(self, data: bytes, text: str) -> None:
         with self._writing:
             self._refuse_if_closed(text)
-            self._transcript.add_line(">", text or "an empty line")
+            self._transcript.add_line(">", text)
             self._transcript.log_bytes(">", data)
             with self._port_errors(text):
                 self._port.write(data)

@@ -159,9 +159,9 @@ def fewer(attenuation: Reals, weights: Reals, thickness: float, tolerance: float
     """Few energies with the same transmission for any sample: their indices, and their weights, of sum 1.
 
     exp(-mu(E) t) of different energies are nearly linearly dependent. The energies are found by non-negative least
-    squares (Lawson & Hanson, Solving Least Squares Problems, 1974, ch. 23) on rays through each material, each pair and
-    all of them. First comes a set of about a hundred with exactly the same transmission, then as few of these as the
-    tolerance allows.
+    squares (Lawson & Hanson, Solving Least Squares Problems, 1974, ch. 23). It runs on rays through each material, each
+    pair and all of them. First comes a set of about a hundred with exactly the same transmission, then as few of these
+    as the tolerance allows.
 
     Args:
         attenuation: 1/mm, float64 [energy, material].

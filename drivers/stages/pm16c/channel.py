@@ -211,8 +211,8 @@ class HomeSearch:
     """One search for the home switch: find it (FDHP), go back to it (GTHP), give it its count (PS).
 
     `begin` it, then call `go_on` each time the motor has come to rest, until it returns False. From memory, to be
-    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel, the
-    speed is the selected one, and a search that has found the switch may end some counts beyond it.
+    checked at an instrument: the direction of the search and the switch's kind are set on the controller's panel. The
+    speed is the selected one. A search that has found the switch may end some counts beyond it.
 
     Args:
         home: the count that the reference gets.
