@@ -38,7 +38,7 @@ I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class SamplePlaces:
     """Where the sample was in the views of a scan in which it jumped.
 
     Attributes:
@@ -78,7 +78,7 @@ def find_jumps(
     jumps: I64,
     axis_col: float,
     progress: Callable[[int, int], None] = lambda n, most: None,
-) -> Places:
+) -> SamplePlaces:
     """Where the sample was in each part of a scan between jumps, and which of the views can be used.
 
     A jump is one where views held out, the same for every guess, are predicted better with a displacement than without.
@@ -92,10 +92,10 @@ def find_jumps(
     """
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
-        return Places(frames)
+        return SamplePlaces(frames)
     if cone_of(source, selection) is not None:
         where = frames_text(jumps)
-        return Places(
+        return SamplePlaces(
             frames,
             said=f"The sample jumped at {where}. Views of a cone beam are not corrected for that: they are used as if "
             "it had not moved. Choose those of one side with --views.",
@@ -300,7 +300,7 @@ def _done(
     moves: Sequence[Displacement],
     verdict: Judgement | None = None,
     unlike: bool = False,
-) -> Places:
+) -> SamplePlaces:
     """The views that are used, where the sample is in them, and what was done in a line.
 
     Args:
@@ -336,7 +336,7 @@ def _done(
             f"After the alarm of motion at {frames_text(fit.jumps[none])} the other views show nothing (less than "
             f"{LARGEST:g} px): views on both sides are used as they are."
         )
-    return Places(frames, fit.jumps, places, " ".join(text))
+    return SamplePlaces(frames, fit.jumps, places, " ".join(text))
 
 
 def _parts(jumps: I64, rows: I64) -> I64:

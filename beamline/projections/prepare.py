@@ -14,7 +14,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, checked_views
-from beamline.projections.jumps import Places
+from beamline.projections.jumps import SamplePlaces
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
 from beamline.projections.steps.resampling import TiltAndLens
@@ -82,7 +82,7 @@ def prepare_projections(
     warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
-    moved: dict[str, Places] = {}
+    moved: dict[str, SamplePlaces] = {}
     for place_step in (step for step in selection.in_order if isinstance(step, PlaceStep)):
         phases.enter(place_step.name, "guesses")
         places = place_step.place(source, selection, usable, axis_col, phases.progress)

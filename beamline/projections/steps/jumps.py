@@ -10,7 +10,7 @@ from beamline.projections.steps.step import ScanPart, StepMemory, option
 
 if TYPE_CHECKING:
     from beamline.projections.flags import UsableViews
-    from beamline.projections.jumps import Places
+    from beamline.projections.jumps import SamplePlaces
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
 
@@ -46,11 +46,11 @@ class Jumps:
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
-    ) -> Places:
-        from beamline.projections.jumps import Places, find_jumps, frames_text
+    ) -> SamplePlaces:
+        from beamline.projections.jumps import SamplePlaces, find_jumps, frames_text
 
         if self.wanted == "correct":
             return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
         said = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
-        return Places(usable.frames, said=said if usable.jumps.size else "")
+        return SamplePlaces(usable.frames, said=said if usable.jumps.size else "")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from beamline.projections.flags import UsableViews
-    from beamline.projections.jumps import Places
+    from beamline.projections.jumps import SamplePlaces
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
@@ -182,7 +182,7 @@ class PlaceStep(PrepStep, Protocol):
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
-    ) -> Places:
+    ) -> SamplePlaces:
         """The views that are used, where the sample was in them, and what was done.
 
         Args:
