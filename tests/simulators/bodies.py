@@ -53,14 +53,20 @@ def level(solid: Solid, points: Reals) -> Reals:
     q = points - np.array(solid.centre)
     if isinstance(solid, Cylinder):
         return np.maximum(np.hypot(q[..., 0], q[..., 1]) - solid.radius, np.abs(q[..., 2]) - solid.height / 2)
-    w, x, y, z = solid.quaternion
-    q = Rotation.from_quat([x, y, z, w]).inv().apply(q.reshape(-1, 3)).reshape(q.shape)
+    q = q @ _axes(solid.quaternion)
     if isinstance(solid, Ellipsoid):
         return np.linalg.norm(q / np.array(solid.semi_axes), axis=-1) - 1
     if isinstance(solid, Box):
         return (np.abs(q) - np.array(solid.edges) / 2).max(-1)
     planes = _hull(solid.vertices)
     return (q @ planes[:, :3].T + planes[:, 3]).max(-1)
+
+
+@cache
+def _axes(quaternion: tuple[float, ...]) -> Reals:
+    """The body's axes, a column each."""
+    w, x, y, z = quaternion
+    return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
 @cache
@@ -83,12 +89,25 @@ def volume(solid: Solid) -> float:
     return math.prod(solid.edges) if isinstance(solid, Box) else float(ConvexHull(solid.vertices).volume)
 
 
+def reach(solid: Solid) -> float:
+    """mm from its centre, beyond which it is not."""
+    if isinstance(solid, Cylinder):
+        return math.hypot(solid.radius, solid.height / 2)
+    if isinstance(solid, Ellipsoid):
+        return max(solid.semi_axes)
+    corners = [np.array(solid.edges) / 2] if isinstance(solid, Box) else solid.vertices
+    return max(float(np.linalg.norm(corner)) for corner in corners)
+
+
 def chords(solid: Solid, start: Reals, ray: Reals, far: float) -> Reals:
     """Lengths of rays start + t ray/|ray| [..., 3], |t| <= far, inside a solid: the least level by golden section, then
     both crossings by bisection; no formula of a chord."""
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     # From the point nearest to the body's middle, so that digits are not lost on the way from a far source.
     start = start + ray * ((np.array(solid.centre) - start) * ray).sum(-1, keepdims=True)
+    found = np.zeros(start.shape[:-1])
+    near = np.linalg.norm(start - solid.centre, axis=-1) <= 1.001 * reach(solid)  # the others pass it by
+    start, ray = start[near], ray[near]
 
     def at(t: Reals) -> Reals:
         return level(solid, start + t[..., None] * ray)
@@ -100,6 +119,9 @@ def chords(solid: Solid, start: Reals, ray: Reals, far: float) -> Reals:
         left = at(a) < at(b)
         low, high = np.where(left, low, a), np.where(left, b, high)
     best = (low + high) / 2
+    hit = at(best) <= 0
+    near[near] = hit
+    start, ray, best = start[hit], ray[hit], best[hit]
 
     def crossing(outside: float) -> Reals:
         within, without = best.copy(), np.full(best.shape, outside)
@@ -109,7 +131,8 @@ def chords(solid: Solid, start: Reals, ray: Reals, far: float) -> Reals:
             within, without = np.where(is_in, middle, within), np.where(is_in, without, middle)
         return within
 
-    return np.where(at(best) <= 0, crossing(far) - crossing(-far), 0.0)
+    found[near] = crossing(far) - crossing(-far)
+    return found
 
 
 def rays(pose: Pose, detector: Detector) -> tuple[Reals, Reals]:
