@@ -70,8 +70,8 @@ def warm_up(
 def warm_up_rest() -> None:
     """Compile half of the kernels of an R2 fit beside a process in `warm_up`, which then finds them in numba's cache.
 
-    So two processor cores compile. It begins with the box of voxels and the end of a step, where `warm_up` comes last;
-    the kernels of the finish follow, which a fit needs last.
+    So two processor cores compile. The box of voxels and the end of a step are compiled first, since `warm_up` reaches
+    them last. The kernels of the finish follow.
     """
     views = _views_like(None)
     grid, one = Grid.matching(views), np.ones(1, np.float32)
