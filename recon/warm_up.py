@@ -12,17 +12,20 @@ from numba.core import event
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method
-from recon.base.volume import Grid
-from recon.kernels.cpu.engine import Active, Gradients, grid_layout
+from recon.base.method import DataUse, Method, ReconProblem
+from recon.base.volume import Grid, Volume
+from recon.kernels.cpu.adam import adam_all, add_lengths
+from recon.kernels.cpu.engine import Active, Gradients, RenderedView, Scratch, camera, grid_layout
+from recon.kernels.cpu.footprints import HIDDEN
+from recon.kernels.cpu.losses import total_variation
 from recon.reconstruction import reconstruct
+from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.back_project import compile_gridding
 from recon.voxels.fbp import is_gridded
-from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.view_weights import covers_the_circle
 
 _SHAPE, _VIEWS = (12, 16), 4
@@ -64,18 +67,31 @@ def warm_up(
 
 
 def warm_up_rest() -> None:
-    """Compile the last kernels of an R2 fit beside a process in `warm_up`, which then finds them in numba's cache.
+    """Compile half of the kernels of an R2 fit beside a process in `warm_up`, which then finds them in numba's cache.
 
-    So two processor cores compile.
+    So two processor cores compile. The box of voxels and the end of a step are compiled first, since `warm_up` reaches
+    them last. The kernels of the finish follow.
     """
-    views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
-    data = np.ones((_VIEWS, *_SHAPE), np.float32) * np.hanning(_SHAPE[1]).astype(np.float32)
-    reconstruct(data, views, FistaTv(tv_weight=0.01).toy())
+    views = _views_like(None)
     grid, one = Grid.matching(views), np.ones(1, np.float32)
-    turned = np.eye(3, dtype=np.float32).reshape(1, 9)
-    blob = Active(np.zeros((1, 3), np.float32), np.full((1, 3), 2, np.float32), turned, one, FitSettings().kernel)
+    blob = Active(_rows(3), _rows(3) + 2, np.eye(3, dtype=np.float32).reshape(1, 9), one, FitSettings().kernel)
     layout, into = grid_layout(blob, grid, 0.01, 3.0), Gradients.zeros(1)
-    layout.backward(layout.fill(), into.means, into.log_scales, into.rotations, into.densities)
+    volume = np.ascontiguousarray(layout.fill())
+    layout.backward(volume, into.means, into.log_scales, into.rotations, into.densities)
+    parameters = [_rows(3), _rows(3), _rows(4), one]
+    adam_all(parameters, parameters, parameters, parameters, [0.0] * 4, 1)
+    into.to_raw(_rows(4), one, 1.0)
+    total_variation(volume, np.empty_like(volume), 1.0)
+    add_lengths(_rows(2), 1.0, np.zeros(1, np.float32))
+    image, hidden, none = np.zeros(_SHAPE, np.float32), Scratch.of(1, _SHAPE), np.empty(0, np.intp)
+    hidden.table.fill(HIDDEN)
+    RenderedView(image, blob, camera(views, 0), 0.0, hidden, none, None).backward(image, into, _rows(2))
+    data, views = toy_of()
+    finish(Volume(volume, grid), _blob(views), ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
+
+
+def _rows(n: int) -> F32:
+    return np.zeros((1, n), np.float32)
 
 
 @contextmanager
@@ -99,6 +115,11 @@ def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
 
     The views agree with `geometry` in the beam, in roll, tilt and shifts, and in whether they stand all around.
     """
+    views = _views_like(geometry)
+    return project(_blob(views), views).numpy(), views
+
+
+def _views_like(geometry: Geometry | None) -> Geometry:
     if geometry is None or not geometry.is_cone:
         views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
     else:
@@ -111,7 +132,14 @@ def toy_of(geometry: Geometry | None = None) -> tuple[F32, Geometry]:
         # If only some views lean, the same holds here.
         tilt = np.where(np.arange(_VIEWS) % 2 == 0, _LEAN * leaning.any(), _LEAN * leaning.all())
         views = replace(views, tilt=tilt, shifts=np.full((_VIEWS, 2), _SHIFT * geometry.shifts.any()))
+    return views
+
+
+def _blob(views: Geometry) -> Gaussians:
     width = 2 * views.sample_pitch
-    size, density = np.array([width]), np.array([0.2 / width])
-    blob = Gaussians.from_physical(np.zeros((1, 3)), size, density, kernel=FitSettings().kernel)
-    return project(blob, views).numpy(), views
+    return Gaussians.from_physical(
+        np.zeros((1, 3)),
+        np.array([width]),
+        np.array([0.2 / width]),
+        kernel=FitSettings().kernel,
+    )

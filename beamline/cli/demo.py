@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
 from beamline.cli.terminal import Terminal, results
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.events import Event, FrameFlagged, RunDone, Sink, SnapshotWritten, VolumeDone, Warned
+from beamline.core.events import Event, FrameFlagged, RunDone, ScanDone, Sink, SnapshotWritten, VolumeDone, Warned
 from beamline.core.narration import sentence
 from beamline.core.process import ChildProcess
 from beamline.core.signals import stop_signals
@@ -27,7 +28,7 @@ from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.config.load import Config
-    from recon.base.volume import Volume
+    from recon.base.volume import Grid, Volume
 
 
 @click.command()
@@ -88,25 +89,23 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         DataError: the live reconstruction failed; the scan is in its file.
     """
     from beamline.instrument.connect import connect
-    from beamline.projections.prepare import prepare_projections
-    from beamline.projections.selection import Selection
-    from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
-    from beamline.reconstruct.result import OutputPaths, axis_of, write_result
-    from beamline.report.record import history_from
     from beamline.scan.live_process import follow_command
     from beamline.scan.run import run_scan
     from beamline.scan.run_folder import RECON, RECON_LOG
-    from beamline.storage.readers.open import open_scan
-    from beamline.storage.writers.recon_file import read_reconstruction
-    from recon.assess.metrics import psnr
-    from recon.base.volume import Grid, Volume
 
     clock = SystemClock()
     started = clock.now()
     snapshots = _Snapshots()
     outside = fan_out(*sinks)
 
+    follow = follow_command(config)
+
+    def without_report(scan: Path, output: Path) -> Sequence[str]:
+        return [*follow(scan, output), "--no-report"]  # ours replaces it
+
     def all_but_done(event: Event) -> None:
+        if isinstance(event, ScanDone):
+            ahead.start()
         if not isinstance(event, RunDone):  # of the scan; the demonstration goes on
             outside(event)
 
@@ -114,12 +113,21 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         if instrument.truth is None:
             raise ConfigError("The demonstration needs simulated devices: only a simulator knows the truth.")
         truth = instrument.truth
-        result = run_scan(
-            config, runs, [snapshots, all_but_done], stop, live=follow_command(config), instrument=instrument
-        )
+        ahead = threading.Thread(target=_look_ahead, args=(truth,), name="look ahead", daemon=True)
+        result = run_scan(config, runs, [snapshots, all_but_done], stop, live=without_report, instrument=instrument)
     folder = result.path.parent
     if result.recon is None:
         raise DataError(f"The live reconstruction gave no volume; see {folder / RECON_LOG}. The scan is not affected.")
+
+    from beamline.projections.prepare import prepare_projections
+    from beamline.projections.selection import Selection
+    from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+    from beamline.reconstruct.result import OutputPaths, axis_of, write_result
+    from beamline.report.record import history_from
+    from beamline.storage.readers.open import open_scan
+    from beamline.storage.writers.recon_file import read_reconstruction
+    from recon.assess.metrics import psnr
+    from recon.base.volume import Grid, Volume
 
     record = read_reconstruction(folder / RECON)
     warnings: list[str] = []
@@ -143,6 +151,15 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         facts, selection, command, config.recon.seed, warnings, started, snapshots.flags, live_picture=live
     )
     write_result(made, prepared, ideal, target, context, outside, clock)
+
+
+def _look_ahead(truth: Callable[[Grid], Volume]) -> None:
+    """Import and compile what the comparison needs, while the live reconstruction ends: the scan's process is idle."""
+    with suppress(Exception):  # the comparison meets it again, and says it
+        import beamline.reconstruct.result  # noqa: F401
+        from recon.base.volume import Grid
+
+        truth(Grid((2, 2, 2), 1.0))
 
 
 class _Snapshots:

@@ -20,6 +20,7 @@ from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.writer_lock import held
 from drivers.base.clock import Clock
 from recon.base.views import parse_views
+from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
 
 DEFAULT_SECONDS = 20.0  # of the last round
@@ -101,13 +102,13 @@ def follow(
 
 
 def _compile(options: ReconOptions, sink: Sink, clock: Clock, rhythm: FollowTiming) -> None:
-    """Compile what the fit needs, once on a machine, before the first view.
+    """Compile what the fit needs, once on a machine, before the first view. Sweeps on voxels follow the last one.
 
     The state `ready` then says where the volume can be watched.
     """
     compiled = compilation_events(sink, clock)
     sink(StateEntered("warming_up", "Compiling the fit's kernels, if need be", time=clock.now()))
-    warm_up(on_kernel=compiled)
+    warm_up(R2(finish=0), on_kernel=compiled)
     picture = options.target.live_picture
     message = (
         f"The live volume is ready for views. To watch it grow, open {picture}: drawn anew about every "

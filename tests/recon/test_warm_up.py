@@ -13,7 +13,7 @@ import pytest
 from recon import warm_up as module
 from recon.base.choices import KERNEL
 from recon.base.geometry import Geometry
-from recon.kernels.cpu import joseph, tv, voxelize
+from recon.kernels.cpu import activation, adam, footprints, joseph, losses, project, tv, voxelize
 from recon.voxels.view_weights import covers_the_circle
 from recon.warm_up import toy_of, warm_up, warm_up_rest
 
@@ -123,7 +123,11 @@ def test_it_counts_what_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("one_thread")
 def test_what_a_second_process_compiles_is_what_the_fit_calls() -> None:
-    kernels = (voxelize._FILL[KERNEL], voxelize._GATHER[KERNEL], joseph._forward, joseph._adjoint, tv._dual_step)
+    kernels = (
+        voxelize._near, voxelize._place, voxelize._FILL[KERNEL], voxelize._GATHER[KERNEL], adam._adam, adam.add_lengths,
+        activation.activation_backward, losses._total_variation, footprints._straight_footprints_backward,
+        project._MOMENTS[KERNEL], joseph._forward, joseph._adjoint, tv._dual_step, tv._primal, tv._total_variation,
+    )  # fmt: skip
     warm_up()
     known = [set(kernel.signatures) for kernel in kernels]
     warm_up_rest()

@@ -42,8 +42,8 @@ _f = np.float32
 ANCHOR = 16  # rows of one recurrence; its error stays below 1e-5 of the footprint's weight
 MANY = 512  # footprints in one sum
 # What a footprint is made of, a constant of each compiled kernel: exp(-q/2); of a compact kernel its image, t², or the
-# kernel itself, t^(3/2).
-GAUSSIAN, SHADOW, COMPACT = range(3)
+# kernel itself, t^(3/2). None, as numba leaves out what `is None` excludes before it compiles the rest.
+GAUSSIAN, SHADOW, COMPACT = None, 1, 2
 _PER = np.float32(1 / Kernel.COMPACT.radius**2)
 _SHADOW_SLOPE = np.float32(2 * (Kernel.COMPACT.exponent + 0.5) / Kernel.COMPACT.radius**2)  # 2 p / R²
 _COMPACT_SLOPE = np.float32(2 * Kernel.COMPACT.exponent / Kernel.COMPACT.radius**2)
@@ -82,7 +82,7 @@ def _at(table, i, first, dy, profile):
     dx = lanes.iota() + (_f(first) - table[i, U])
     across = dx - table[i, SHEAR] * dy
     square = across * across * table[i, K] + table[i, KV] * dy * dy
-    if profile == GAUSSIAN:
+    if profile is None:
         value = lanes.exp(square * _f(-0.5))
         return across, value, value
     value, slope = _compact(square * -_PER + _f(1), profile)
@@ -105,7 +105,7 @@ def _add_by_pixels(table, i, row0, row1, col0, col1, image, profile):
 @njit(inline="always", fastmath=True)
 def _store(moments, i, m0, d0, mt, mv, mtt, mtv, mvv, profile):
     """Fill moments [i] from the lanes' sums; with Σ g D as a seventh for a compact kernel in a slice."""
-    if profile == GAUSSIAN:
+    if profile is None:
         lanes.store_first(moments, i, 0, lanes.totals((m0, mt, mv, mtt, mtv, mvv)), 6)
     elif profile == SHADOW:
         s = _SHADOW_SLOPE
@@ -173,7 +173,7 @@ def add_footprint(table, i, rows, cols, image, profile):
     if is_upright(table, i, row0):
         for start in range(col0, col1, lanes.WIDTH):
             first = min(start, width - lanes.WIDTH)
-            if profile == GAUSSIAN:
+            if profile is None:
                 _add_gaussian(table, i, first, start - first, col1 - first, row0, row1, image)
             else:
                 _add_compact(table, i, first, start - first, col1 - first, row0, row1, image, profile)
@@ -234,7 +234,7 @@ def gather_footprint(table, i, rows, cols, gradient, moments, profile):
             first = min(start, width - lanes.WIDTH)
             low, high = start - first, col1 - first
             dx = lanes.iota() + (_f(first) - table[i, U])
-            if profile == GAUSSIAN:
+            if profile is None:
                 g0, s0, s1, s2 = _column_gaussian(table, i, dx, first, low, high, row0, row1, gradient)
             else:
                 g0, s0, s1, s2 = _column_compact(table, i, dx, first, low, high, row0, row1, gradient, profile)
@@ -258,7 +258,7 @@ def _join(fresh, image, row0, row1):
 
 
 # The profile is a constant of the compiled kernels, so that a Gaussian pays nothing for the others.
-def _renderer(profile: int) -> Any:
+def _renderer(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(table: F32, rows: int, cols: int, layers: F32) -> None:
         n, threads = table.shape[0], layers.shape[0] // 2
@@ -279,7 +279,7 @@ def _renderer(profile: int) -> Any:
     return kernel
 
 
-def _gatherer(profile: int) -> Any:
+def _gatherer(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(table: F32, gradient: F32, rows: int, cols: int, moments: F32) -> None:
         for i in prange(table.shape[0]):

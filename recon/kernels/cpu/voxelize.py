@@ -143,7 +143,7 @@ def _cut(table, j, z, weight, piece, profile):
     piece[0, V] = table[j, _Y] + table[j, _DRIFT_Y] * dz
     piece[0, HU], piece[0, HV] = reach * table[j, _WIDE_X], reach * table[j, _WIDE_Y]
     piece[0, SHEAR] = table[j, SHEAR]
-    if profile == GAUSSIAN:
+    if profile is None:
         piece[0, K], piece[0, KV] = table[j, K], table[j, KV]
         # numba's own exp is a call that clears the vector registers.
         piece[0, W] = weight * lanes.lowest(lanes.exp(lanes.zero() + _f(-0.5) * down))
@@ -155,8 +155,14 @@ def _cut(table, j, z, weight, piece, profile):
     return dz
 
 
+# Functions of their own, that LLVM copies into the loops: where numba copies them, it compiles them several times.
+_AS_FUNCTION = {"fastmath": True, "error_model": "numpy", "forceinline": True}
+_add_footprint = njit(**_AS_FUNCTION)(add_footprint.py_func)
+_gather_footprint = njit(**_AS_FUNCTION)(gather_footprint.py_func)
+
+
 # The profile is a constant of the compiled kernels, as in `cpu.project`.
-def _filler(profile: int) -> Any:
+def _filler(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(table: F32, slices: NDArray[np.int32], hits: NDArray[np.int64], densities: F32, volume: F32,
                ny: int, nx: int, pieces: F32) -> None:  # fmt: skip
@@ -168,12 +174,12 @@ def _filler(profile: int) -> Any:
             for j in range(hits.shape[0]):
                 for z in range(max(low, slices[j, 0]), min(high, slices[j, 1])):
                     _cut(table, j, z, densities[hits[j]], piece, profile)
-                    add_footprint(piece, 0, ny, nx, volume[z], profile)
+                    _add_footprint(piece, 0, ny, nx, volume[z], profile)
 
     return kernel
 
 
-def _gatherer(profile: int) -> Any:
+def _gatherer(profile: int | None) -> Any:
     @njit(**OPTIONS)
     def kernel(
         table: F32,
@@ -201,11 +207,11 @@ def _gatherer(profile: int) -> Any:
                 n0 = nt = nv = nz = tt = tv = vv = tz = vz = zz = _f(0)
                 for z in range(slices[j, 0], slices[j, 1]):
                     dz = _cut(table, j, z, _f(1), piece, profile)
-                    gather_footprint(piece, 0, ny, nx, gradient[z], found, profile)
+                    _gather_footprint(piece, 0, ny, nx, gradient[z], found, profile)
                     weight = piece[0, W]
                     m0 = weight * found[0, 0]
                     n0 += m0
-                    if profile != GAUSSIAN:
+                    if profile is not None:
                         weight = piece[0, _SLOPE]
                         m0 = weight * found[0, 6]
                     mt, mv = weight * found[0, 1], weight * found[0, 2]
