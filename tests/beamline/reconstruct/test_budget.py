@@ -81,7 +81,7 @@ def test_the_time_is_used_and_not_exceeded(
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))  # its seconds are not ticks
+    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
     done = _spend(prepared, budget, Ticking(0.01))
     assert done.choice.is_gaussian_fit
     assert 0.9 * budget < done.seconds <= budget
