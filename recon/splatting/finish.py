@@ -55,6 +55,8 @@ class _Watch:
         return self.ended
 
     def trial(self) -> bool:
+        if self._control.stop_trials is not None and self._control.stop_trials():
+            return True
         self._trials += 1
         return self.sweep(self._trials, 0, "sweeps of trials")
 

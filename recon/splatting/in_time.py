@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,25 +79,38 @@ def fill_seconds(gaussians: Gaussians, grid: Grid, now: Clock) -> float:
     return (now() - begin) * grid.shape[0] / slab.shape[0] * _GROWTH
 
 
-def finish_within(
-    seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock
-) -> tuple[int | None, float]:
-    """Sweeps of a fit's finish within `seconds`, at most `SWEEPS`, and the time that they will take.
+class FinishPlan(NamedTuple):
+    """What a finish may take.
 
-    None: as many as views held out prefer, if the seconds `beside_steps` suffice for the most sweeps and their trials.
-    A time for fewer than two sweeps gives 0, because the work before them takes as long.
+    Attributes:
+        sweeps: None: as many as views held out prefer.
+        seconds: that it will take.
+        trials: views held out choose its weight; else it is the one by the noise.
+    """
+
+    sweeps: int | None
+    seconds: float
+    trials: bool = True
+
+
+def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
+    """A fit's finish within `seconds`: at most `SWEEPS`, unless `beside_steps` suffice for the most and their trials.
+
+    Where time is short it goes without trials of its weight, which on few rows cost more than seven finishes. A time
+    for fewer than two sweeps gives 0, because the work before them takes as long.
     """
     if seconds <= 0:
-        return 0, 0.0
+        return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
     if geometry.is_cone:
         sweep *= 2  # voxels often cannot explain a cone's views: then the sweeps run twice
-    eigenvalue = _EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS)
-    before = (eigenvalue + _FIRST_SWEEPS + choice_sweeps(geometry)) * sweep
-    asking = sweeps_choice_cost(geometry)
-    if asking and (most := before + (asking + MOST_SWEEPS) * sweep) <= min(seconds, beside_steps):
-        return None, most
+    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
+    choice, asking = choice_sweeps(geometry) * sweep, sweeps_choice_cost(geometry)
+    if asking and (most := before + choice + (asking + MOST_SWEEPS) * sweep) <= min(seconds, beside_steps):
+        return FinishPlan(None, most)
+    trials = before + choice + SWEEPS * sweep <= seconds
+    before += choice if trials else 0.0
     if not before + 2 * sweep <= seconds:
-        return 0, 0.0
+        return FinishPlan(0, 0.0)
     sweeps = min(SWEEPS, int((seconds - before) / sweep)) if sweep > 0 else SWEEPS
-    return sweeps, before + sweeps * sweep
+    return FinishPlan(sweeps, before + sweeps * sweep, trials)

@@ -7,6 +7,7 @@ import operator
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from recon.assess.plans import best_steps
 from recon.base.arrays import F32
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
@@ -26,6 +28,7 @@ from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.in_time import (
     FINISH_SHARE,
+    FinishPlan,
     fill_seconds,
     finish_within,
     first_draw_seconds,
@@ -91,7 +94,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         ValueError: for a problem that the method cannot be fitted to.
     """
     now, settings, geometry = control.now, method.fit, problem.geometry
-    begin = now()
+    begin, decide = now(), control.decide or Decisions(problem.seed)
     sweeps = method.finish_sweeps(geometry)
     if sweeps and not geometry.is_straight:
         raise ValueError(
@@ -129,7 +132,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
     by_content = method.steps is None and method.seconds is None and sweeps > 0
-    wanted, planned, seconds = method.finish, sweeps == 0 or method.seconds is None, method.seconds
+    wanted, trials, planned, seconds = method.finish, True, sweeps == 0 or method.seconds is None, method.seconds
     if seconds is not None:
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
     schedule = Schedule(method.planned_steps, seconds, by_content)
@@ -158,7 +161,8 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         if not planned and done == _TIMED and schedule.seconds is not None:
             spent = now() - fit_begin
             left, step, planned = schedule.seconds - spent, spent / done, True
-            wanted, finishing = _finish_in_time(method, seen, problem.grid, now, left, step)
+            fitting = partial(_finish_in_time, method, seen, problem.grid, now, left, step)
+            wanted, finishing, trials = decide("finish", fitting)
             schedule.seconds = max(spent, schedule.seconds - finishing)
         schedule.look(state, fine)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
@@ -180,12 +184,13 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         state = state_from(tracker.kept, backend)
     volume, model = fit.volume_of(state, problem.grid, settings, backend), fit.gaussians_of(state, backend)
     if not planned:  # the fit has ended before
-        wanted, _ = _finish_in_time(method, seen, problem.grid, now, end - now(), 0.0)
+        wanted, _, trials = decide("finish", lambda: _finish_in_time(method, seen, problem.grid, now, end - now(), 0.0))
     if wanted == 0 or now() >= end or (control.should_stop is not None and control.should_stop()):
         sweeps = 0
     if sweeps:
         if method.seconds is not None:
             control = replace(control, should_stop=_until(control, end))
+        control = replace(control, stop_trials=None if trials else lambda: True)
         fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
         finished, sweeps = finish(volume, model, fitted, wanted, settings, control, not method.allow_negative)
         if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
@@ -229,12 +234,12 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
 
 def _finish_in_time(
     method: FitMethod, geometry: Geometry, grid: Grid, now: Callable[[], float], left: float, step: float
-) -> tuple[int | None, float]:
+) -> FinishPlan:
     """The sweeps of the finish and their seconds, if `left` seconds remain after first steps of `step` seconds each.
     `finish_within` gives the sweeps; if the time suffices for two, the method's own number is used."""
     room = FINISH_SHARE * left
-    sweeps, seconds = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
-    return (sweeps, seconds) if method.finish is None or sweeps == 0 else (method.finish, room)
+    plan = finish_within(room, left - best_steps(method.name) * step, geometry, grid, now)
+    return plan if method.finish is None or plan.sweeps == 0 else plan._replace(sweeps=method.finish, seconds=room)
 
 
 def _until(control: RunControl, end: float) -> Callable[[], bool]:

@@ -108,7 +108,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     `problem.trial_goes_on` ends the trials.
     """
     geometry = problem.projector.geometry
-    if not (_can_hold_out(geometry) and first > 0):
+    if not (_can_hold_out(geometry) and first > 0 and problem.trial_goes_on()):
         return None
     error = _Trial.of(problem)
     errors = {octave: error(first * 2.0**octave) for octave in (1, 0)}

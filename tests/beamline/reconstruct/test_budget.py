@@ -28,6 +28,7 @@ from recon.assess.plans import CURVES, PRESETS, Choice, Speeds
 from recon.base.geometry import Geometry
 from recon.base.method import Method, MethodResult, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
+from recon.splatting.in_time import FinishPlan
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
@@ -81,7 +82,7 @@ def test_the_time_is_used_and_not_exceeded(
 ) -> None:
     """Whatever was predicted, the fit gets what is left after placing, and ends before filling would be late."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: (0, 0.0))  # its seconds are not ticks
+    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))  # no ticks
     done = _spend(prepared, budget, Ticking(0.01))
     assert done.choice.is_gaussian_fit
     assert 0.9 * budget < done.seconds <= budget
@@ -162,7 +163,7 @@ def test_a_fit_with_much_time_ends_with_its_plan(
 ) -> None:
     """More steps than were best on other scans follow the noise."""
     _as_fast_as(monkeypatch, 0.1, 0.1, 0.01, 0.1, 0.01)
-    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: (0, 0.0))
+    monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_: FinishPlan(0, 0.0))
     monkeypatch.setattr("recon.splatting.r2.best_steps", lambda method: 7)
     done = _spend(prepared, 60.0, Ticking(0.1), methods=(R2(),))
     assert done.result.history[-1].step == 7 and done.seconds < 30

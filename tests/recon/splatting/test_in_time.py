@@ -9,7 +9,8 @@ import pytest
 
 import recon
 from recon import R2, Geometry, Grid, RunControl
-from recon.splatting.in_time import finish_within
+from recon.base.decisions import Decisions
+from recon.splatting.in_time import FinishPlan, finish_within
 from recon.voxels.projector import Projector
 
 VIEWS = Geometry.cone(np.deg2rad(np.arange(61) * 360 / 61), (24, 40), 0.2, 100.0, 150.0)
@@ -39,13 +40,14 @@ def data() -> np.ndarray:
 def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
     grid = Grid.matching(views)
-    # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6
-    # and four trials of 16 over seven of eight views.
-    found = [finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 316.0, 321.0, 340.0, 1e3)]
-    assert found == [(0, 0.0), (0, 0.0), (2, 320.0), (6, 340.0), (8, 350.0)]
+    # 24 views in two subsets, a look a tick: 3 ticks of views, 2 steps of total variation; before the first sweep 6,
+    # and four trials of 16 over seven of eight views where time is left for these.
+    found = [finish_within(s, 0.0, views, grid, Ticking(1.0)) for s in (0.0, 39.0, 40.0, 69.0, 349.0, 350.0, 1e3)]
+    none, trials = [(0, 0.0, True)] * 2, [(8, 350.0, True)] * 2
+    assert found == [*none, (2, 40.0, False), (7, 65.0, False), (8, 70.0, False), *trials]
     # As many as views held out prefer, where time is left for 24, for as many of a trial and for three trials of 16.
     found = [finish_within(1e3, spare, views, grid, Ticking(1.0)) for spare in (744.0, 745.0)]
-    assert found == [(8, 350.0), (None, 745.0)]
+    assert found == [(8, 350.0, True), (None, 745.0, True)]
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -67,3 +69,34 @@ def test_too_few_seconds_are_said_before_the_start_and_still_give_a_volume(data:
         )
     assert found.settings["steps"] == 1 and found.settings["finish"] == 0
     assert np.isfinite(found.volume.data).all() and found.volume.data.max() > 0
+
+
+@pytest.fixture(scope="module")
+def parallel() -> tuple[np.ndarray, Geometry]:
+    views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (2, 40))
+    truth = np.random.default_rng(0).random((2, 40, 40)).astype(np.float32)
+    return Projector(views, Grid.matching(views)).forward(truth), views
+
+
+def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
+    parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seconds do not suffice for the same finish in every slab; another one would show as a seam."""
+    decided = Decisions().made
+    for found in (3, 0):
+        monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
+        control = RunControl(now=Ticking(1e-3), decide=(decide := Decisions(followed=decided)))
+        done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
+        assert done.settings["finish"] == 3
+        decided = decide.made
+
+
+def test_a_finish_without_time_for_trials_has_the_weight_by_the_noise(
+    parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for trials in (True, False):
+        monkeypatch.setattr("recon.splatting.train.finish_within", lambda *_, t=trials: FinishPlan(2, 0.2, t))
+        control = RunControl(now=Ticking(1e-3), decide=Decisions(), stop_trials=lambda: True)
+        done = recon.reconstruct(*parallel, R2(seconds=0.3, gaussians=50), control=control)
+        assert done.settings["finish"] == 2 and control.decide is not None
+        assert len(control.decide.made["weight"][0]) == (1 if trials else 2)  # the weight, and the noise to follow
