@@ -32,7 +32,7 @@ class SampleChange:
     """The change from the view before."""
 
     gain: float  # relative change of the light, of all cells alike
-    # across, down: pixels of the frame by which the sample is displaced to the right, and downwards
+    # across, down: displacement of the sample in pixels of the frame, to the right and downwards
     across: float
     down: float
     turn: float  # excess rotation of the stage, in steps; NaN if nothing turns visibly

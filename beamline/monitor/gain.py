@@ -18,7 +18,7 @@ from drivers.base.frame import Frame
 
 SIGMAS = 8.0
 PARTS = 5  # of the field, from left to right
-ALIKE = 0.5  # share of the gain by which the parts may differ: a ghost is only in some of them
+ALIKE = 0.5  # allowed difference between parts, as a share of the gain: a ghost is only in some of them
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from recon.prep.defects import SHADOW_REACH, shadowed
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
-_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # by which a shadow is found, and rows at a time
+_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for the search of a shadow: views at least and at most, and rows at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class OpenBeam:
         photons: how pixels count photons; None: logarithms are taken.
         current_factor: float64 [frame], by how much its light grows to the median ring current; None: not asked for.
         n_references: darks and flats that the file had.
-        done: what the steps that ask for it did, by name.
+        done: results of its steps, by name of the step.
     """
 
     references: References
