@@ -9,7 +9,7 @@ import sys
 from typing import Any, TextIO
 
 _CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
-"""Errors of a pipe without a reader (EINVAL on Windows): whoever closed it knows."""
+"""Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
 
 
 class _Lasting(io.FileIO):

@@ -89,8 +89,8 @@ class ScanContext:
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
         spots: bright pixels of views and flats that the previous frame lacks.
-        follows: the previous view in the file is its neighbour in angle, or there is none. False for repeated views, at
-        a new pass, or after views of another file: checks that compare neighbours begin anew there.
+        follows: checks may compare it with the previous view, its neighbour in angle; True for the first view. False for
+            repeated views, at a new pass, and after views of another file: such checks begin anew there.
             True where `step` is not known.
         light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
             projection.

@@ -84,7 +84,7 @@ class CheckpointOptions:
         return self.path is not None or self.resume is not None
 
     def refuse_existing(self) -> None:
-        """Raises DataError before any work: the checkpoint exists, or there is none to resume from.
+        """Raises DataError before any work: the checkpoint to write exists, or the one to resume from is missing.
 
         The checkpoint may replace the one that the fit resumes from.
         """
