@@ -37,7 +37,11 @@ from recon.prep.defects import SHADOW_REACH, shadowed
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
-_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for the search of a shadow: views at least and at most, and rows at a time
+_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = (
+    8,
+    16,
+    64,
+)  # for the search of a shadow: views at least and at most, and rows at a time
 
 
 @dataclass(frozen=True, eq=False)
