@@ -155,10 +155,13 @@ def _cut(table, j, z, weight, piece, profile):
     return dz
 
 
-# Functions of their own, that LLVM copies into the loops: where numba copies them, it compiles them several times.
-_AS_FUNCTION = {"fastmath": True, "error_model": "numpy", "forceinline": True}
-_add_footprint = njit(**_AS_FUNCTION)(add_footprint.py_func)
-_gather_footprint = njit(**_AS_FUNCTION)(gather_footprint.py_func)
+def _as_function(inlined: Any) -> Any:
+    """A function of its own, that LLVM copies into the loops: where numba copies it, it compiles it several times."""
+    plain = getattr(inlined, "py_func", inlined)  # with NUMBA_DISABLE_JIT it is plain already
+    return njit(fastmath=True, error_model="numpy", forceinline=True)(plain)
+
+
+_add_footprint, _gather_footprint = _as_function(add_footprint), _as_function(gather_footprint)
 
 
 # The profile is a constant of the compiled kernels, as in `cpu.project`.
