@@ -146,7 +146,14 @@ class _Judge:
         volume = method.run(part, RunControl()).volume
         unseen = self.binned[self._unseen]
         left = unseen - Projector(views.select(self._unseen), grid).forward(volume.data)
-        return float(np.linalg.norm(left) / np.linalg.norm(unseen))
+        most = _norm(unseen)
+        if most == 0:
+            raise AxisError("the views held out show no matter, so that they tell nothing of the axis; give the axis")
+        return _norm(left) / most
+
+
+def _norm(values: F32) -> float:
+    return float(np.linalg.norm(values.astype(np.float64)))
 
 
 @dataclass(frozen=True)

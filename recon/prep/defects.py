@@ -54,9 +54,9 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
 def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     """Mask [row, col] of areas that no view lights though the flats do: a part of the instrument stands in the beam.
 
-    Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. A sample that turns
-    cannot darken these in all views; an opaque rod on the rotation axis darkens the middle. Two pixels beside an area
-    belong to it: its blurred edge.
+    Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. An opaque rod on the
+    rotation axis darkens the middle, and is none. Opaque matter that covers an edge in all views is taken for one: its
+    line integrals are not measured either way. Two pixels beside an area belong to it: its blurred edge.
 
     Args:
         light: float32 [view, row, col], transmission of views all around, three at least.

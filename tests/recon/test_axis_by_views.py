@@ -64,3 +64,13 @@ def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
 def test_few_views_are_refused() -> None:
     with pytest.raises(ValueError, match="11 views are too few to hold some out; 12 are needed"):
         axis_by_views(np.ones((11, ROWS, COLS), np.float32), Geometry.cone(ANGLES[:11], (ROWS, COLS), 1.0, SOD, SDD))
+
+
+def test_views_without_matter_are_refused() -> None:
+    """Where all of them are, or those that are held out."""
+    views = _views(29.2, SOD, SDD)
+    for empty in (range(VIEWS), range(1, VIEWS, 3)):
+        some = views.copy()
+        some[list(empty)] = 0
+        with pytest.raises((AxisError, ValueError), match="no matter|zero"):
+            axis_by_views(some, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, 29.2))
