@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from drivers.flat import flat_fields
 from drivers.plugins import plugins
 from simulators.wires.wire import Build
 
@@ -14,8 +15,14 @@ REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's modul
 }
 
 
+def _fitting(name: str, found: type[Build]) -> type[Build]:
+    """The class, if an option of it can be read."""
+    _ = flat_fields(found), found.matching
+    return found
+
+
 WIRES: dict[str, type[Build]] = {
     **{kind: getattr(import_module(f"simulators.wires.{kind}.wire"), name) for kind, name in REGISTRY.items()},
-    **plugins("wire", REGISTRY),
+    **plugins("wire", REGISTRY, _fitting),
 }
 """Kind -> how its simulated controller is built."""
