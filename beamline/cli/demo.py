@@ -45,6 +45,7 @@ def demo(output: Path | None, seconds: float | None, as_json: bool) -> None:
 
     The configuration is configs/demo.yaml. All results are in a new folder, named by UTC time and sample.
     """
+    _keep_bytecode()
     from beamline.config.load import config_folder, load
 
     overrides = () if seconds is None else (f"recon.seconds={seconds}",)
@@ -70,6 +71,15 @@ def _compiling() -> Iterator[None]:
 
 
 REPORT = "report.html"
+
+
+def _keep_bytecode() -> None:
+    """Write the bytecode of what is imported, also where the environment asks for none: README installs without it.
+
+    Else each later command would compile torch and scipy again, in 4 s.
+    """
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
 
 
 def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: StopRequest, command: str) -> None:
