@@ -89,9 +89,9 @@ class ScanContext:
         flat_exposure: s of these flats, which may have an exposure of their own.
         grid: the cells of the views; None before the first projection.
         spots: bright pixels of views and flats that the previous frame lacks.
-        follows: checks may compare it with the previous view, its neighbour in angle; True for the first view. False for
-            repeated views, at a new pass, and after views of another file: such checks begin anew there.
-            True where `step` is not known.
+        follows: checks may compare it with the previous view, its neighbour in angle. False for repeated views, at a
+            new pass, and after views of another file: such checks begin anew there. True for the first view, and where
+            `step` is not known.
         light_left: of this view, over the last good one, see beamline.monitor.view.light_left; 1 where it is no
             projection.
         view: the frame on this grid; None where it is no projection, or has no light.

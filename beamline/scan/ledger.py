@@ -91,12 +91,12 @@ class Ledger:
     extra: tuple[int, ...] = ()  # framestamps of frames that no trigger exposed
     beyond: int = 0  # of these, frames that came when a trigger after the last one would have come
     unconfirmed: int = 0  # of the extra frames, those exposed while the stage braked
-    # off: the largest distance of a matched frame from its trigger's expected time, in periods. The angle of a frame may
-    # be wrong by as many steps
+    # off: the largest distance of a matched frame from its trigger's expected time, in periods. The angle of a frame
+    # may be wrong by as many steps
     off: float = 0.0
-    # shift: of a settled ledger. All angles may be wrong by as many triggers. Triggers missing at one end may be missing
-    # at the other; an extra frame at the end may be one at the beginning. 0 without such frames, or if the time of the
-    # first trigger is known
+    # shift: of a settled ledger. All angles may be wrong by as many triggers. Triggers missing at one end may be
+    # missing at the other; an extra frame at the end may be one at the beginning. 0 without such frames, or if the
+    # time of the first trigger is known
     shift: int = 0
 
     @property
