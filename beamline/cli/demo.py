@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -166,8 +167,9 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
 def _look_ahead(truth: Callable[[Grid], Volume]) -> None:
     """Import and compile what the comparison needs, while the live reconstruction ends: the scan's process is idle."""
     with suppress(Exception):  # the comparison meets it again, and says it
-        import beamline.reconstruct.result  # noqa: F401
         from recon.base.volume import Grid
+
+        import_module("beamline.reconstruct.result")
 
         truth(Grid((2, 2, 2), 1.0))
 

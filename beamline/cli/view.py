@@ -30,14 +30,14 @@ def view(volume: Path, other: Path | None, port: int, bind: str, browse: bool) -
     Exit code: 0 ended by Ctrl-C, 2 no port, 5 no volume.
     """
     from beamline.page.serve import open_port, start  # these load HDF5 and the server
-    from beamline.page.viewed import ViewedVolume
     from beamline.page.viewer import viewer
+    from beamline.page.volume import ShownVolume
 
     with ExitStack() as opened, suppress(KeyboardInterrupt):
         with Terminal(sys.stderr) as terminal:
             progress = counting("slices", terminal, SystemClock())
             paths = [volume] if other is None else [volume, other]
-            volumes = [opened.enter_context(closing(ViewedVolume(path, progress))) for path in paths]
+            volumes = [opened.enter_context(closing(ShownVolume(path, progress))) for path in paths]
         server = start(lambda access: viewer(volumes, access), open_port(bind, port))
         click.echo(f"{LOOK:<8}{server.addresses.look}")
         sys.stdout.flush()

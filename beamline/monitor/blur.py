@@ -116,8 +116,11 @@ class BlurCheck:
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:
-    """Fine contrast over coarse, along the rows and along the columns; NaN where there is none. `lines`: counts [line,
-    col], STRIP neighbouring rows of the frame each, as `dark` and `flat`."""
+    """The ratio of fine to coarse contrast, along rows and along columns; NaN for frames without contrast.
+
+    Args:
+        lines: counts [line, col] of strips of `STRIP` neighbouring rows; `dark` and `flat` likewise.
+    """
     low = np.zeros_like(lines, np.float32) if dark is None else dark
     if flat is None:
         scale = np.full_like(low, 1 / max(float(lines.mean(dtype=np.float64)), 1e-9))

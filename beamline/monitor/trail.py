@@ -24,7 +24,7 @@ class Rules(NamedTuple):
     least: int  # views with a peak that it needs
     share: float  # of the views from its first to its last that have a peak
     total: float  # sum of the scores that it needs
-    rows: float  # cells by which a peak may lie beside the line
+    rows: float  # largest distance of a peak from the line, in cells
     cols: float  # likewise
     slack: float  # cells a view added to the sample's speed
 

@@ -31,6 +31,7 @@ from beamline.core.errors import BeamlineError, user_message
 from beamline.page.recording import Recording
 from beamline.page.run_files import PICTURE, Reader
 from beamline.page.tiles import TileRegion, pack
+from beamline.page.volume import ShownVolume
 from beamline.scan.control import Verb, tell
 
 COOKIE = "splatline_look"
@@ -95,10 +96,7 @@ def _same(given: str, expected: str) -> bool:
 def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
     """The application. `log`: takes a line for each verb that was sent, with the client's address."""
     server = _Server(reader, access, log)
-    static = files("beamline.page") / "static"
     routes = [
-        Route("/", lambda request: FileResponse(str(static / "index.html"))),
-        Mount("/static", StaticFiles(directory=str(static))),
         Route("/api/facts", server.facts),
         Route("/api/feed", server.feed),
         Route("/api/columns", server.columns),
@@ -111,12 +109,24 @@ def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlett
         Route("/api/model.png", server.model),
         Route("/api/verb/{verb}", server.verb, methods=["POST"]),
     ]
+    return guarded("index.html", routes, access)
+
+
+def guarded(start: str, routes: Sequence[Route], access: Access) -> Starlette:
+    """An application of these answers that begins with a page of `static`, behind the guard."""
+    static = files("beamline.page") / "static"
+    pages = [
+        Route("/", lambda request: FileResponse(str(static / start))),
+        Mount("/static", StaticFiles(directory=str(static))),
+    ]
     return Starlette(
-        routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers={BeamlineError: refused}
+        routes=[*pages, *routes],
+        middleware=[Middleware(Guard, access=access)],
+        exception_handlers={BeamlineError: _refused},
     )
 
 
-def refused(request: Request, error: Exception) -> Response:
+def _refused(request: Request, error: Exception) -> Response:
     """What no file gives, as a sentence."""
     return JSONResponse({"message": user_message(error)}, 404)
 
@@ -187,11 +197,11 @@ class _Server:
         return JSONResponse({"first": first, "values": values})
 
     def volume(self, request: Request) -> Response:
-        return JSONResponse(self._reader.on_volume(lambda volume: volume.facts))
+        return JSONResponse(self._reader.on_volume(ShownVolume.facts))
 
     def cut(self, request: Request) -> Response:
         axis, index = int(request.path_params["axis"]), int(request.path_params["index"])
-        values, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index))
+        values, _, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index, region_of(request)))
         return tile_of(values, {"axis": axis, "index": index, "bin": factor})
 
     def model(self, request: Request) -> Response:

@@ -15,7 +15,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import EVENTS, parts_of
 from beamline.core.process import json_object
 from beamline.page.recording import Recording
-from beamline.page.volume import ShownVolume, newest
+from beamline.page.volume import ShownVolume, VolumeFile, newest
 from beamline.scan.run_folder import RECON, SCAN
 from beamline.storage.hdf5 import NotReadyError
 
@@ -83,6 +83,7 @@ class Reader:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="reader")
         self._recording: Recording | None = None
         self._volume: ShownVolume | None = None
+        self._volume_file: VolumeFile | None = None
         self._seen = 0, time.time()
         self._lock = threading.Lock()
 
@@ -135,9 +136,9 @@ class Reader:
         file = newest(self.what.volumes)
         if file is None:
             raise DataError("There is no volume yet.")
-        if self._volume is None or self._volume.file != file:
+        if self._volume is None or self._volume_file != file:
             before, self._volume = self._volume, None
             if before is not None:
                 before.close()
-            self._volume = ShownVolume(file)
+            self._volume, self._volume_file = ShownVolume(file.path), file
         return self._volume

@@ -5,47 +5,40 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple
-from importlib.resources import files
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response
-from starlette.routing import Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 
-from beamline.core.errors import BeamlineError, DataError
-from beamline.page.app import Access, Guard, refused, region_of, tile_of
+from beamline.core.errors import DataError
+from beamline.page.app import Access, guarded, region_of, tile_of
 from beamline.page.tiles import TileRegion
-from beamline.page.viewed import ViewedVolume
+from beamline.page.volume import ShownVolume
 
 _Result = TypeVar("_Result")
 
 
-def viewer(volumes: Sequence[ViewedVolume], access: Access) -> Starlette:
+def viewer(volumes: Sequence[ShownVolume], access: Access) -> Starlette:
     """The application for one volume, or two to compare."""
-    server, static = _Viewer(volumes), files("beamline.page") / "static"
+    server = _Viewer(volumes)
     routes = [
-        Route("/", lambda request: FileResponse(str(static / "view.html"))),
-        Mount("/static", StaticFiles(directory=str(static))),
         Route("/api/volumes", server.facts),
         Route("/api/slice/{which:int}/{axis:int}/{index:int}", server.cut),
         Route("/api/difference/{axis:int}/{index:int}", server.difference),
         Route("/api/histogram/{which:int}", server.histogram),
         Route("/api/profile/{which:int}/{axis:int}/{index:int}", server.profile),
     ]
-    return Starlette(
-        routes=routes, middleware=[Middleware(Guard, access=access)], exception_handlers={BeamlineError: refused}
-    )
+    return guarded("view.html", routes, access)
 
 
 class _Viewer:
     """Each answer is computed in one thread, as HDF5 asks for."""
 
-    def __init__(self, volumes: Sequence[ViewedVolume]) -> None:
+    def __init__(self, volumes: Sequence[ShownVolume]) -> None:
         self._volumes, self._thread = volumes, ThreadPoolExecutor(1, thread_name_prefix="viewer")
 
     def facts(self, request: Request) -> Response:
@@ -76,7 +69,7 @@ class _Viewer:
             raise DataError("A profile is along a line: first row, first column, last row, last column.") from None
         return JSONResponse(self._do(lambda: volume.profile(axis, index, line)))
 
-    def _volume(self, request: Request) -> ViewedVolume:
+    def _volume(self, request: Request) -> ShownVolume:
         which = int(request.path_params["which"])
         if which >= len(self._volumes):
             raise DataError(f"Volume {which} is not shown here.")

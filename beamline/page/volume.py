@@ -1,23 +1,28 @@
-"""The volume on the page: the newest of a run, finished or so far, and its slices."""
+"""Volumes on the page: slices, histograms and profiles of volume files, also of files larger than the memory."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import math
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from beamline.core.errors import DataError
 from beamline.page.tiles import TileRegion, bin_mean
 from beamline.storage import hdf5
+from beamline.storage.volumes.files import opened_volume
 
-_DATA = "/entry/data/data"
-_HELD = 2**29
-"""Bytes of a volume that is read into memory as a whole: slices across its chunks take their time otherwise."""
+F32 = NDArray[np.float32]
+HELD = 2**29
+"""Bytes of a volume that is held as a whole. Of a larger one this is a copy with every n-th slice, binned by n."""
+BINS = 256
+_SAMPLE = 2_000_000  # values that show the histogram as well as all do
 
 
 @dataclass(frozen=True)
@@ -37,56 +42,108 @@ def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
 
 
 class ShownVolume:
-    """An open volume file; z, y or x slices of it. All calls come from one thread (HDF5).
+    """A volume file of any kind that is read here. All calls come from one thread (HDF5).
+
+    Of a volume above `held` bytes, slices across z are read from the file. One across y or x would read all of the
+    file, so it comes from the coarse copy.
+
+    Args:
+        progress: takes slices read and slices to read of the coarse copy.
 
     Raises:
-        DataError: no volume of this program, or one that cannot be read.
+        DataError: it cannot be read, or holds no volume.
     """
 
-    def __init__(self, file: VolumeFile) -> None:
-        self.file = file
-        self._file = hdf5.open_hdf5(file.path)
-        with hdf5.readable(file.path):
-            data = hdf5.dataset(self._file, _DATA)
-            if data is None or data.ndim != 3 or data.dtype.kind != "f":
-                raise DataError(f"{file.path} holds no volume at {_DATA}.")
-            self.shape: tuple[int, int, int] = data.shape
-            self._values: h5py.Dataset | NDArray[np.float32] = data[()] if data.nbytes <= _HELD else data
-            self.facts = self._facts()
+    def __init__(self, path: Path, progress: Callable[[int, int], None] = lambda n, of: None, held: int = HELD) -> None:
+        with ExitStack() as opened:
+            record = opened.enter_context(opened_volume(path))
+            self.path, self._values, self._grid = path, record.volume.data, record.volume.grid
+            self.shape: tuple[int, int, int] = self._values.shape
+            self.coarse_bin = math.ceil((4 * math.prod(self.shape) / held) ** (1 / 3))
+            self._coarse = self._copied(progress)
+            self._sample = self._sampled()
+            self._length_unit, self._parameters = record.length_unit, record.parameters
+            self._changed = path.stat().st_mtime
+            self._file = opened.pop_all()
 
     def close(self) -> None:
         self._file.close()
 
-    def cut(self, axis: int, index: int) -> tuple[NDArray[np.float32], int]:
-        """A slice across an axis (0 z, 1 y, 2 x), binned to at most 1024 pixels a side, and its binning."""
-        if not (0 <= axis < 3 and 0 <= index < self.shape[axis]):
-            raise DataError(f"Slice {index} across axis {axis} is not in a volume of {self.shape}.")
-        place: list[slice | int] = [slice(None)] * 3
-        place[axis] = index
-        with hdf5.readable(self.file.path):
-            values = np.asarray(self._values[tuple(place)], np.float32)
-        factor = TileRegion(0, values.shape[0], 0, values.shape[1]).binning()
-        return bin_mean(values, (factor, factor)), factor
-
-    def _facts(self) -> dict[str, Any]:
-        """Shape, mm of a voxel (null: unknown), unit of the values, views, method, and a grey window."""
-        parameters = "/entry/reconstruction/parameters"
-        z = hdf5.dataset(self._file, "/entry/data/z")
-        unit = "" if z is None else hdf5.attribute(z, "units")
-        x = hdf5.dataset(self._file, "/entry/data/x")
-        step = float(x[1] - x[0]) if x is not None and x.size > 1 else None
-        views = hdf5.dataset(self._file, f"{parameters}/n_views")
-        method = hdf5.dataset(self._file, f"{parameters}/method")
-        middle = np.asarray(self._values[self.shape[0] // 2], np.float32)
-        low, high = np.percentile(middle[np.isfinite(middle)], (0.5, 99.8)) if np.isfinite(middle).any() else (0, 1)
+    def facts(self) -> dict[str, Any]:
+        """Name, shape, length of a voxel along z, y, x and unit, unit of values, method, views, window."""
+        low, high = np.percentile(self._sample, (0.5, 99.8)) if self._sample.size else (0.0, 1.0)
+        unit = self._length_unit
         return {
-            "name": self.file.path.name,
-            "changed": self.file.changed_ns / 1e9,
+            "name": self.path.name,
+            "changed": self._changed,
             "shape": self.shape,
-            "voxel": step,
+            "voxel": [float(step) for step in self._grid.spacing],
             "length_unit": unit,
-            "unit": hdf5.attribute(self._file[_DATA], "units"),
-            "views": None if views is None else int(views[()]),
-            "method": "" if method is None else hdf5.text(method[()]),
+            "unit": "" if unit == "px" else f"1/{unit}",
+            "method": str(self._parameters.get("method", "")),
+            "views": None if (views := self._parameters.get("n_views")) is None else int(views),
+            "coarse_bin": self.coarse_bin,
             "window": [float(low), float(max(high, low + 1e-9))],
         }
+
+    def cut(self, axis: int, index: int, region: TileRegion) -> tuple[F32, TileRegion, int]:
+        """Part of a slice across an axis (0 z, 1 y, 2 x), binned to a tile; the part that it shows, and its binning.
+
+        Raises:
+            DataError: there is no such slice.
+        """
+        values, bin_ = self._slice(axis, index)
+        rows, cols = (n for i, n in enumerate(self.shape) if i != axis)
+        shown = region.inside((rows, cols))
+        if bin_ == 1:
+            values = values[shown.first_row : shown.last_row, shown.first_col : shown.last_col]
+        else:
+            shown = TileRegion(0, rows, 0, cols)
+        factor = TileRegion(0, values.shape[0], 0, values.shape[1]).binning()
+        return bin_mean(values, (factor, factor)), shown, factor * bin_
+
+    def histogram(self) -> dict[str, list[float]]:
+        """Centres of 256 bins over the values, and voxels in each (of a sample, where there are many)."""
+        counts, edges = np.histogram(self._sample, BINS)
+        return {"values": ((edges[1:] + edges[:-1]) / 2).tolist(), "voxels": counts.tolist()}
+
+    def profile(self, axis: int, index: int, line: Sequence[float]) -> dict[str, list[float]]:
+        """Distances and values along a line in a slice, linear between voxels, in steps of at most a voxel.
+
+        Args:
+            line: first row, first column, last row, last column; the first voxel's middle is at 0.5, 0.5.
+        """
+        values, bin_ = self._slice(axis, index)
+        r0, c0, r1, c1 = line
+        down, across = (step for i, step in enumerate(self._grid.spacing) if i != axis)
+        n = int(np.clip(math.ceil(max(abs(r1 - r0), abs(c1 - c0))), 1, 10_000)) + 1
+        rows, cols = np.linspace(r0, r1, n), np.linspace(c0, c1, n)
+        found = map_coordinates(values, (rows / bin_ - 0.5, cols / bin_ - 0.5), order=1, mode="nearest")
+        length = math.hypot((r1 - r0) * down, (c1 - c0) * across)
+        return {"distance": np.linspace(0, length, n).tolist(), "values": np.nan_to_num(found).tolist()}
+
+    def _slice(self, axis: int, index: int) -> tuple[F32, int]:
+        """A slice, and its binning."""
+        if not (0 <= axis < 3 and 0 <= index < self.shape[axis]):
+            raise DataError(f"Slice {index} across axis {axis} is not in a volume of {self.shape}.")
+        from_file = axis == 0 and self.coarse_bin > 1
+        source, bin_ = (self._values, 1) if from_file else (self._coarse, self.coarse_bin)
+        place: list[slice | int] = [slice(None)] * 3
+        place[axis] = min(index // bin_, source.shape[axis] - 1)
+        with hdf5.readable(self.path):
+            return np.asarray(source[tuple(place)], np.float32), bin_
+
+    def _copied(self, progress: Callable[[int, int], None]) -> F32:
+        chosen = range(0, self.shape[0], self.coarse_bin)
+        copy = []
+        for n, z in enumerate(chosen, 1):
+            with hdf5.readable(self.path):
+                values = np.asarray(self._values[z], np.float32)
+            copy.append(bin_mean(values, (self.coarse_bin, self.coarse_bin)))
+            progress(n, len(chosen))
+        return np.stack(copy)
+
+    def _sampled(self) -> F32:
+        flat = self._coarse.reshape(-1)
+        part = flat[:: max(1, flat.size // _SAMPLE)]
+        return part[np.isfinite(part)]

@@ -34,7 +34,7 @@ class PreparedProjections:
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
         left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
-        flags: of all frames of the scan; None where there are none.
+        flags: of all frames of the scan; None if the file has no flags.
         measured: bool [row, col], pixels that were measured, or interpolated well; None: all.
         shares: float32 [view, row, col], weights of rays in the regions of flags; None: all 1.
         done: what each step did, by name, in the order in which it did.

@@ -48,7 +48,7 @@ class Train:
     angles: NDArray[np.float64]  # float64 [trigger] radians
     period: float  # s between triggers
     first: float | None = None  # time of trigger 0, s since the Unix epoch; None if unknown
-    tolerance: float = 0.0  # s by which `first` may be wrong
+    tolerance: float = 0.0  # largest error of `first`, in s
 
     def __post_init__(self) -> None:
         if self.angles.ndim != 1 or self.angles.size == 0:

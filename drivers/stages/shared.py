@@ -83,7 +83,7 @@ def until_standing(clock: Clock, look: Callable[[], Status], moves: Callable[[St
 
 
 def longest_stop(limits: StageLimits) -> float:
-    """s after a stop by which every stage stands: it slows down from its full speed."""
+    """The time in s that every stage takes to stop from its full speed, at most."""
     return limits.max_speed / limits.acceleration + STOP_MARGIN
 
 
@@ -101,8 +101,8 @@ def while_it_moves(name: str, purpose: str, counts: int, reply: str = "") -> Dev
 class LineStage(RotationStage, Protocol):
     """A stage behind a serial line; its driver adds the commands of the controller.
 
-    `stop` returns when the stage stands, `abort` at once. A `wait` for a stopped move raises, whoever stopped it: no
-    thread takes the move as complete.
+    `stop` returns when the stage stands, `abort` at once. A `wait` for a move that any thread stopped raises, so that
+    no thread takes the move as complete.
     """
 
     _clock: Clock

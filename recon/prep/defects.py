@@ -55,7 +55,7 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     """Mask [row, col] of areas that no view lights though the flats do: a part of the instrument stands in the beam.
 
     Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. An opaque rod on the
-    rotation axis darkens the middle, and is none. Opaque matter that covers an edge in all views is taken for one: its
+    rotation axis darkens the middle, which does not count. Opaque matter that covers an edge in all views counts: its
     line integrals are not measured either way. Two pixels beside an area belong to it: its blurred edge.
 
     Args:

@@ -1,5 +1,5 @@
 // The page of a run: it follows the feed, and fetches pictures as they are needed.
-import { Picture, fetchTile, usualWindow, windowSliders } from "./picture.js";
+import { NAMES, PLANES, Picture, debounce, fetchTile, position, usualWindow, windowSliders } from "./picture.js";
 import { Timeline } from "./flags.js";
 
 const $ = (id) => document.getElementById(id);
@@ -111,7 +111,6 @@ function packLines(lines, cols) {
 $("sinogram-row").addEventListener("input", debounce(fetchSinogram, 100));
 
 // --- volume ------------------------------------------------------------------------------------------------------
-const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]];
 const setVolumeWindow = windowSliders($("volume-window"), (window) => slices.forEach((slice) => slice.setWindow(window)));
 const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
   point: (row, col, value) => { $("volume-value").textContent = row === null ? "" : `${place(axis, row, col)}: ${value.toPrecision(5)} ${volume.unit}`; },
@@ -120,10 +119,9 @@ const slices = [0, 1, 2].map((axis) => new Picture($(`slice${axis}`), {
 function place(axis, row, col) {
   const index = [0, 0, 0];
   index[axis] = Number($(`at${axis}`).value); index[PLANES[axis][0]] = row; index[PLANES[axis][1]] = col;
-  return index.map((value, i) => `${NAMES[i]} ${position(i, value)}`).join(", ");
+  return index.map((value, i) => `${NAMES[i]} ${position(volume, i, value)}`).join(", ");
 }
 
-const position = (axis, index) => volume.voxel ? `${((index - (volume.shape[axis] - 1) / 2) * volume.voxel).toFixed(3)} ${volume.length_unit}` : `${index}`;
 
 async function fetchVolume() {
   const answer = await fetch("/api/volume");
@@ -144,7 +142,7 @@ async function fetchVolume() {
 async function showSlice(axis) {
   if (!volume) return;
   const index = Number($(`at${axis}`).value);
-  $(`where${axis}`).textContent = position(axis, index);
+  $(`where${axis}`).textContent = position(volume, axis, index);
   try {
     const tile = await fetchTile(`/api/slice/${axis}/${index}`);
     if (Number($(`at${axis}`).value) === index) slices[axis].show(tile, [volume.shape[PLANES[axis][0]], volume.shape[PLANES[axis][1]]]);
@@ -289,6 +287,5 @@ setInterval(() => {
   if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; }
 }, 1000);
 
-function debounce(call, ms) { let timer = 0; return (...values) => { clearTimeout(timer); timer = setTimeout(() => call(...values), ms); }; }
 function element(name, text, kind = "") { const made = document.createElement(name); made.textContent = text; if (kind) made.className = kind; return made; }
 function duration(seconds) { return seconds < 90 ? `${seconds.toFixed(0)} s` : seconds < 5400 ? `${(seconds / 60).toFixed(0)} min` : `${(seconds / 3600).toFixed(1)} h`; }

@@ -201,3 +201,13 @@ export function windowSliders(row, changed) {
     write();
   };
 }
+
+/** Axes of a volume, and the axes down and across a slice across each. */
+export const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]];
+
+/** A voxel's place along an axis from the volume's middle, in its unit of length; its number where that is unknown. */
+export function position({ shape, voxel, length_unit: unit }, axis, index) {
+  return unit === "px" ? `${index}` : `${((index - (shape[axis] - 1) / 2) * voxel[axis]).toPrecision(4)} ${unit}`;
+}
+
+export function debounce(call, ms) { let timer = 0; return (...values) => { clearTimeout(timer); timer = setTimeout(() => call(...values), ms); }; }

@@ -1,10 +1,9 @@
 // One volume, or two with their difference: slices across z, y, x with one zoom each, grey window, profile, histogram.
-import { Picture, fetchTile, usualWindow, windowSliders } from "./picture.js";
+import { NAMES, PLANES, Picture, debounce, fetchTile, position, usualWindow, windowSliders } from "./picture.js";
 
 const $ = (name) => document.getElementById(name);
-const NAMES = ["z", "y", "x"], PLANES = [[1, 2], [0, 2], [0, 1]], COLOURS = ["#1f6feb", "#d29922"];
+const COLOURS = ["#1f6feb", "#d29922"];
 const json = async (url) => { const answer = await fetch(url), body = await answer.json(); if (!answer.ok) throw new Error(body.message); return body; };
-const debounce = (action, wait) => { let timer; return (...words) => { clearTimeout(timer); timer = setTimeout(() => action(...words), wait); }; };
 
 let volumes = [], rows = [], profiled = null, plots = {};
 
@@ -38,13 +37,11 @@ function addRow(title, facts, url) {
 
 /** Index in another volume at the same height of its field. */
 const indexIn = (facts, axis) => Math.min(facts.shape[axis] - 1, Math.floor((Number($(`at${axis}`).value) + 0.5) * facts.shape[axis] / volumes[0].shape[axis]));
-const length = (facts, axis, index) => ((index - (facts.shape[axis] - 1) / 2) * facts.voxel[axis]);
-const inUnits = (facts, axis, index) => facts.length_unit === "px" ? `${index}` : `${length(facts, axis, index).toPrecision(4)} ${facts.length_unit}`;
 
 function place({ facts }, axis, row, col) {
   const at = [0, 0, 0];
   at[axis] = indexIn(facts, axis); at[PLANES[axis][0]] = row; at[PLANES[axis][1]] = col;
-  return at.map((index, i) => `${NAMES[i]} ${inUnits(facts, i, index)}`).join(", ");
+  return at.map((index, i) => `${NAMES[i]} ${position(facts, i, index)}`).join(", ");
 }
 
 /** A bar of a round length in the lower left corner. */
@@ -81,7 +78,7 @@ async function showSlice(row, axis) {
 }
 
 async function showAxis(axis) {
-  $(`where${axis}`).textContent = inUnits(volumes[0], axis, Number($(`at${axis}`).value));
+  $(`where${axis}`).textContent = position(volumes[0], axis, Number($(`at${axis}`).value));
   await Promise.all(rows.map((row) => showSlice(row, axis)));
   if (profiled && profiled.axis === axis) showProfile();
 }

@@ -11,8 +11,8 @@ from pathlib import Path
 from beamline.page.app import page
 from beamline.page.run_files import Reader, watched
 from beamline.page.serve import Addresses, PageServer, open_port, start
-from beamline.page.viewed import HELD, ViewedVolume
 from beamline.page.viewer import viewer
+from beamline.page.volume import HELD, ShownVolume
 
 
 class Served:
@@ -40,7 +40,7 @@ class Served:
 def viewed(*paths: Path, held: int = HELD) -> Iterator[Served]:
     """The viewer of volumes."""
     with ExitStack() as opened:
-        volumes = [opened.enter_context(closing(ViewedVolume(path, held=held))) for path in paths]
+        volumes = [opened.enter_context(closing(ShownVolume(path, held=held))) for path in paths]
         yield opened.enter_context(_running(start(lambda access: viewer(volumes, access), open_port("127.0.0.1", 0))))
 
 

@@ -13,6 +13,8 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.check import Level
 from beamline.page.run_files import EventLog, watched
 from beamline.page.serve import open_port
+from beamline.storage.volumes.base import bare_record
+from beamline.storage.volumes.files import write_volume
 from tests.beamline.page.served import Served, served
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -151,3 +153,17 @@ def test_a_taken_port_gives_way_to_the_next(tmp_path: Path) -> None:
 def test_an_invalid_address_is_refused() -> None:
     with pytest.raises(ConfigError, match="expected an IP address"):
         open_port("somewhere", 0)
+
+
+def test_the_volume_of_a_run_is_shown_once_it_is_there(tmp_path: Path) -> None:
+    values = np.arange(60, dtype=np.float32).reshape(3, 4, 5)
+    (tmp_path / "events.jsonl").write_text("")
+    write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
+    write_volume(tmp_path / "recon.h5", bare_record(tmp_path / "scan.h5", values, (0.2, 0.1, 0.1)))
+    with served(tmp_path) as page:
+        facts = json.loads(page.ask("/api/volume")[2])
+        assert (facts["shape"], facts["length_unit"], facts["unit"]) == ([3, 4, 5], "mm", "1/mm")
+        assert facts["voxel"] == pytest.approx([0.2, 0.1, 0.1])
+        np.testing.assert_allclose(tile(page.ask("/api/slice/2/4")[2])[1], values[:, :, 4], atol=1e-3)
+        write_volume(tmp_path / "recon.h5", bare_record(tmp_path / "scan.h5", values[:2]), replace=True)
+        assert json.loads(page.ask("/api/volume")[2])["shape"] == [2, 4, 5]

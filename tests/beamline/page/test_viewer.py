@@ -9,7 +9,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.page.tiles import TileRegion
-from beamline.page.viewed import ViewedVolume
+from beamline.page.volume import ShownVolume
 from tests.beamline.page.served import Served, viewed
 from tests.beamline.page.test_app import tile
 
@@ -86,7 +86,7 @@ def test_nothing_is_answered_without_the_token(pair: Served) -> None:
 
 def test_a_large_volume_is_binned_across_y_and_x_alone(files: tuple[Path, Path, Path]) -> None:
     read: list[tuple[int, int]] = []
-    volume = ViewedVolume(files[0], lambda n, of: read.append((n, of)), held=RAMP.nbytes // 8)
+    volume = ShownVolume(files[0], lambda n, of: read.append((n, of)), held=RAMP.nbytes // 8)
     assert (volume.coarse_bin, read[-1]) == (2, (3, 3))
     np.testing.assert_array_equal(volume.cut(0, 5, ALL)[0], RAMP[5])
     values, shown, bin_ = volume.cut(1, 3, ALL)
@@ -98,7 +98,7 @@ def test_a_large_volume_is_binned_across_y_and_x_alone(files: tuple[Path, Path, 
 def test_a_constant_volume_and_one_without_numbers_are_shown(tmp_path: Path) -> None:
     for value in (3.0, np.nan):
         np.save(tmp_path / "v.npy", np.full(SHAPE, value, np.float32))
-        volume = ViewedVolume(tmp_path / "v.npy")
+        volume = ShownVolume(tmp_path / "v.npy")
         low, high = volume.facts()["window"]
         assert low < high
         assert sum(volume.histogram()["voxels"]) in (0, RAMP.size)
@@ -108,4 +108,4 @@ def test_a_constant_volume_and_one_without_numbers_are_shown(tmp_path: Path) -> 
 def test_what_is_no_volume_is_refused(tmp_path: Path) -> None:
     (tmp_path / "v.h5").write_text("no volume")
     with pytest.raises(DataError):
-        ViewedVolume(tmp_path / "v.h5")
+        ShownVolume(tmp_path / "v.h5")
