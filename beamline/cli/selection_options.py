@@ -134,6 +134,12 @@ _BEFORE = (
         help="Detector rows to use; the volume has one slice per row. Default: all.",
     ),
     click.option(
+        "--cols",
+        callback=parsed(span),
+        metavar="FIRST:END",
+        help="Detector columns to use, as if there were no others: --axis and messages count from FIRST. Default: all.",
+    ),
+    click.option(
         "--bin",
         "binning",
         type=click.IntRange(min=1),
@@ -147,7 +153,7 @@ _BEFORE = (
         metavar="PX|auto|try:A:B:STEP",
         default="auto",
         show_default=True,
-        help="Rotation axis: column of the unbinned detector (0: centre of the first column), or auto to find it. "
+        help="Rotation axis: column of the unbinned detector (0: centre of the first column used), or auto to find it. "
         "recon with try:80:90:0.5 draws one slice by each of these axes with its score (PNG), and ends.",
     ),
 )

@@ -47,6 +47,7 @@ class ScanFacts:
         remarks: faults during the scan, by the file.
         flagged: the worst of the flagged frames.
         references: mean darks and flats [row, col], binned, by title.
+        shape, first_col: of a frame, and the detector's column with which it begins.
     """
 
     path: Path
@@ -58,6 +59,12 @@ class ScanFacts:
     flagged: Sequence[FlaggedFrame] = ()
     references: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     shape: tuple[int, int] = (1, 1)
+    first_col: int = 0
+
+    @property
+    def columns(self) -> str:
+        """Columns of the detector, the last not included, as --cols takes them."""
+        return f"{self.first_col}:{self.first_col + self.shape[1]}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +164,8 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         "sample": sample or "not stated",
         "projections": str(counts[FrameKind.PROJECTION]),
         "flats, darks": f"{counts[FrameKind.FLAT]}, {counts[FrameKind.DARK]}",
-        "detector (rows × columns)": f"{source.shape[0]} × {source.shape[1]}",
+        "detector (rows × columns)": f"{source.shape[0]} × {source.shape[1]}"
+        + (f", from column {source.first_col}" if source.first_col else ""),
         "pixel size": "not known" if pitch is None else f"{pitch * 1e3:.4g} µm",
         "energy": "not known" if energy is None else f"{energy:g} keV",
         "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
@@ -172,7 +180,9 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     flagged = [] if flags is None else worst_frames(source, flags)
     frames = f"{n}/{n + missing}"
     images = reference_images(source)
-    return ScanFacts(source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape)
+    return ScanFacts(
+        source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape, source.first_col
+    )
 
 
 def compose(

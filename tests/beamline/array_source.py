@@ -21,6 +21,7 @@ class ArraySource:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
+    first_col = 0
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
     flags = None

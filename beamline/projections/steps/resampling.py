@@ -129,8 +129,10 @@ class TiltAndLens:
             raise ConfigError(f"--tilt is for a parallel beam; {source.path} is a cone. Leave it out.")
         if not self.tilt_deg and self.distortion is None:
             return None
-        height, width = source.shape
-        return Resampling((height, width), math.radians(self.tilt_deg), self.distortion, selection.binning)
+        lens = self.distortion
+        if lens is not None:
+            lens = replace(lens, col=lens.col - source.first_col)
+        return Resampling(source.shape, math.radians(self.tilt_deg), lens, selection.binning)
 
 
 def _plain(value: Any) -> float | str:

@@ -17,6 +17,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource
+from beamline.storage.readers.cropped import CroppedSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.parts_source import PartsSource
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
@@ -67,6 +68,7 @@ class SourceOptions:
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
         angles_unit: "deg" or "rad", of these, instead of what the file says.
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
+        cols: (first, end) columns of the detector; the scan is read as if it had no others.
     """
 
     path: Path | str
@@ -81,6 +83,7 @@ class SourceOptions:
     angles_path: str | None = None
     angles_unit: str | None = None
     earlier: tuple[Path, ...] = ()
+    cols: tuple[int, int] | None = None
 
     def open(self, *, follow: bool = False) -> ScanSource:
         """The scan with these replacements; see `open_scan`."""
@@ -96,6 +99,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
     Raises:
         DataError: not there, not a format that we read, or not consistent; the message says what was found.
+        ConfigError: columns outside the detector.
         NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
@@ -123,16 +127,16 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             table = select_rows(table, options.angle_rows)
         if table is not None and isinstance(base, StacksSource):
             _refuse_all_frames(base, table, angles_from)
-        if table is None and darks is None and flats is None and options.quantity is None:
-            return base
-        return OverlaidSource(
-            base,
-            angles=table,
-            angles_from=angles_from,
-            darks=None if darks is None else load_images(darks),
-            flats=None if flats is None else load_images(flats),
-            quantity=options.quantity,
-        )
+        if any(given is not None for given in (table, darks, flats, options.quantity)):
+            base = OverlaidSource(
+                base,
+                angles=table,
+                angles_from=angles_from,
+                darks=None if darks is None else load_images(darks),
+                flats=None if flats is None else load_images(flats),
+                quantity=options.quantity,
+            )
+        return base if options.cols is None else CroppedSource(base, options.cols)
     except BaseException:
         base.close()
         raise
