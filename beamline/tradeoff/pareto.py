@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 
@@ -16,16 +16,22 @@ def rounded(cost: float) -> float:
     return math.exp(round(math.log(cost) / step) * step)
 
 
-def front(costs: Sequence[float], qualities: Sequence[float]) -> list[int]:
+def front(
+    costs: Sequence[float], qualities: Sequence[float], better: Callable[[int, int], bool] | None = None
+) -> list[int]:
     """Positions of the points that no other point beats, by rising cost (and so by rising quality).
 
     A point is beaten by one with at most its cost and at least its quality, and better in one of the two. Of equal
     points the first stays. Points with a value that is not finite are left out.
+
+    Args:
+        better: whether the quality of the first point is clearly above that of the second, which costs less. Where it
+            is not, the second one beats the first. None: by any difference.
     """
     known = [i for i, pair in enumerate(zip(costs, qualities, strict=True)) if all(map(math.isfinite, pair))]
     kept: list[int] = []
     for i in sorted(known, key=lambda i: (costs[i], -qualities[i], i)):
-        if not kept or qualities[i] > qualities[kept[-1]]:
+        if not kept or (qualities[i] > qualities[kept[-1]] and (better is None or better(i, kept[-1]))):
             kept.append(i)
     return kept
 

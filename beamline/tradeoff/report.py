@@ -20,7 +20,7 @@ from beamline.report.metrics import METRICS
 from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff import pareto
 from beamline.tradeoff.figures import cost_curves, pareto_plot
-from beamline.tradeoff.table import MEMORY, TIME, TrialCost, TrialTable
+from beamline.tradeoff.table import LEAST_GAIN, MEMORY, TIME, TrialCost, TrialTable
 from beamline.tradeoff.trials import Outcome
 from recon.assess.time_model import duration_text
 
@@ -103,13 +103,29 @@ def conclusions(table: TrialTable) -> list[str]:
     first = compared[kept[0]]
     out.append(f"Fastest: {first.trial.label}: {qualities[kept[0]]:.2f} dB in {_duration(first.seconds)}.")
     for stretch in pareto.steps(kept, seconds, qualities):
+        chance = "" if table.by == "psnr" else f" ± {table.chance(stretch.end, stretch.start):.2f}"
         out.append(
-            f"+{stretch.gain:.2f} dB for {_duration(stretch.cost)} more ({_duration(stretch.per_decibel)} a dB): "
-            f"{compared[stretch.end].trial.label}."
+            f"+{stretch.gain:.2f}{chance} dB for {_duration(stretch.cost)} more "
+            f"({_duration(stretch.per_decibel)} a dB): {compared[stretch.end].trial.label}."
         )
+    out += _level(table, kept[-1])
     if any("resolution" in outcome.metrics for outcome in compared):
         out.append(_FSC)
     return out
+
+
+def _level(table: TrialTable, last: int) -> list[str]:
+    """A sentence where a trial that costs more seems better than the last one of the front, by chance."""
+    qualities = table.qualities
+    best = max(range(len(qualities)), key=lambda i: qualities[i] if math.isfinite(qualities[i]) else -math.inf)
+    gain, chance = qualities[best] - qualities[last], table.chance(best, last)
+    if best == last or gain < LEAST_GAIN:
+        return []
+    more = table.compared[best].seconds - table.compared[last].seconds
+    return [
+        f"There it ends: the best figure, +{gain:.2f} dB for {_duration(more)} more "
+        f"({table.compared[best].trial.label}), is within chance (± {chance:.2f} dB)."
+    ]
 
 
 def write_table(folder: Path, table: TrialTable) -> None:

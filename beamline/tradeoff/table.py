@@ -6,9 +6,15 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from beamline.core.events import TrialDone
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
+
+LEAST_GAIN = 0.01
+"""dB: the smallest difference that tables show."""
+_ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
 
 
 @dataclass(frozen=True)
@@ -83,9 +89,28 @@ class TrialTable:
     def front(self, cost: TrialCost) -> list[int]:
         """Positions in `compared` of the trials on the front of quality and `cost`.
 
-        Costs are compared to 1 %: smaller differences between two trials are chance.
+        Costs are compared to 1 %: smaller differences between two trials are chance. A trial that costs more is on the
+        front where its gain is above `chance`.
         """
-        return pareto.front([pareto.rounded(value) for value in self.costs(cost)], self.qualities)
+        qualities = self.qualities
+
+        def better(i: int, j: int) -> bool:
+            return qualities[i] - qualities[j] > self.chance(i, j)
+
+        return pareto.front([pareto.rounded(value) for value in self.costs(cost)], qualities, better)
+
+    def chance(self, i: int, j: int) -> float:
+        """dB between two trials in `compared` that chance may reach.
+
+        Without a truth: two standard errors of the mean difference of squared residuals over the views held out. The
+        noise of a view is in both of its residuals, and so not in their difference.
+        """
+        left = [np.asarray(self.compared[k].left) for k in (i, j)]
+        if self.by == "psnr" or min(each.size for each in left) < 2 or left[0].size != left[1].size:
+            return LEAST_GAIN
+        apart, level = left[0] - left[1], (left[0].mean() + left[1].mean()) / 2
+        error = apart.std(ddof=1) / math.sqrt(apart.size)
+        return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
     def event(self, index: int, outcome: Outcome) -> TrialDone:
         """The trial of this index, as an event; `gaussians` are those at its start, as in its settings."""

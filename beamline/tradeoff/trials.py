@@ -88,6 +88,7 @@ class Outcome:
         curve: (seconds, dB) of its own record of the residual.
         curve_of: which views that record is of, in words.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
+        left: squared residual of each view held out.
     """
 
     trial: Trial
@@ -100,6 +101,7 @@ class Outcome:
     curve_of: str = ""
     message: str = ""
     cpu_seconds: float = math.nan
+    left: Sequence[float] = ()
 
     def quality(self, by: str) -> float:
         """dB by "psnr", or by "residual_held_out" as -20 log10 of it; NaN where it is not known."""

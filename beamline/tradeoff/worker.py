@@ -38,7 +38,7 @@ from recon.base.method import DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
-from recon.voxels.projector import data_residual
+from recon.voxels.projector import data_residual, project
 from recon.warm_up import warm_up
 
 F32 = NDArray[np.float32]
@@ -82,8 +82,11 @@ def run(
     if data.truth is not None:
         found["psnr"] = metrics.psnr(data.truth, volume.data)
         found["ssim3d"] = metrics.ssim3d(data.truth, volume.data)
+    left: list[float] = []
     if data.held_out is not None:
         found["residual_held_out"] = data_residual(volume, *data.held_out)
+        unseen, views_of = data.held_out
+        left = ((project(volume, views_of) - unseen) ** 2).sum(axis=(1, 2), dtype=np.float64).tolist()
     if trial.halves and trial.views >= 4:
         found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed)
     return {
@@ -92,6 +95,7 @@ def run(
         "peak_bytes": peak,
         "metrics": {name: float(value) for name, value in found.items()},
         "gaussians": None if result.gaussians is None else result.gaussians.n,
+        "left": left,
         "curve": curve_of(result),
         "curve_of": "" if (judged := residual_curve(history_arrays(result.history))) is None else judged.views,
     }
