@@ -179,6 +179,12 @@ class ScanCorrection:
         more = count_references(self._source) != self._beam.n_references
         return more or self._columns != {self._stream.air_columns}
 
+    def finds_shadow(self, views: NDArray[np.int64]) -> bool:
+        """Something stands in the beam of all these views of a finished scan that `feed` took for matter."""
+        unknown = self._shadow is None
+        self._look_for_shadow(views)
+        return unknown and self._shadow is not None and bool(self._shadow.any())
+
     def renewed(self) -> ScanCorrection:
         """A correction of the same views by all references that are there now."""
         return ScanCorrection(self._source, self._selection, self._warn)

@@ -45,6 +45,7 @@ _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 _OUTDATED = "Flats or darks came after views, or air columns changed: all views are corrected again"
 _NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
 _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
+_SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
 
 
 class ScanFollower:
@@ -199,8 +200,8 @@ class ScanFollower:
     def _correct_again(self, usable: UsableViews, why: str) -> None:
         """Line integrals by all references and air columns, in place of those that the model has learnt from.
 
-        Does nothing if the views are of one part, and references and air columns are unchanged. `why` is reported,
-        unless views are unlearned.
+        Does nothing if the views are of one part, references and air columns are unchanged, and nothing stands in the
+        beam of all views. `why` is reported, unless views are unlearned.
 
         Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
         again. Then the model goes on without them, at the first rates.
@@ -209,8 +210,11 @@ class ScanFollower:
         fed = np.concatenate([batch.view_ids for batch in self._batches])
         frames = fed[np.isin(fed, usable.frames)]
         gone = fed.size - frames.size
-        if not (gone or self._correction.outdated or self.source.part_starts.size > 1):
+        shaded = self._correction.finds_shadow(frames)
+        if not (gone or shaded or self._correction.outdated or self.source.part_starts.size > 1):
             return
+        if shaded:
+            why = _SHADED
         if gone:
             why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
         self._sink(StateEntered("correcting", why, time=self._clock.now()))

@@ -90,6 +90,25 @@ def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, lat
     assert psnr(SCAN.truth(record.volume.grid), record.volume.data) > 20
 
 
+def test_what_stands_in_the_beam_of_all_views_counts_as_not_measured(tmp_path: Path) -> None:
+    """It cannot be told before the last view; the line integrals are then those of the finished scan."""
+    clock, events = ScanClock(), list[Event]()
+    frames = frames_of(replace(INTERLACED, shape=(16, 40)))
+    for frame in frames:
+        if frame.kind is FrameKind.PROJECTION:
+            frame.counts[:, :10] = DARK
+    schedule(clock, tmp_path / "scan.h5", frames)
+    selection = Selection(axis_col=SCAN.axis_col)
+    follow(options(tmp_path, selection=selection), events.append, clock, RHYTHM)
+    said = [str(event.data.get("message")) for event in events]
+    assert sum("stands in the beam of all views" in each for each in said) == 1
+    assert any("of the detector got no beam" in each for each in said)
+    followed = read_reconstruction(tmp_path / "recon.h5").parameters
+    with open_scan(tmp_path / "scan.h5") as source:
+        whole = prepare_projections(source, selection, lambda said: None)
+    assert followed["masked_fraction"] == whole.projections.masked.mean() > 0.2
+
+
 def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
     """The frames, and the flats once more at the end with another beam."""
     bright = [f for f in frames if f.kind is FrameKind.FLAT]
