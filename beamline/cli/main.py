@@ -50,6 +50,7 @@ _COMMANDS = {
     "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
     "runs": _Entry("runs", "List the runs in a folder: sample, frames, state, size, flags.", files=False),
     "watch": _Entry("watch", "Show a run in the browser while it goes on, and afterwards."),
+    "ioc": _Entry("ioc", "Serve the running scan as EPICS process variables.", files=False),
     "pause": _Entry("control", "Pause a running scan, from another terminal: no view is lost."),
     "resume": _Entry("control", "Let a paused scan go on."),
     "stop": _Entry("control", "Stop a running scan cleanly, from another terminal."),

@@ -1,0 +1,1 @@
+"""EPICS: the state of a run as process variables."""

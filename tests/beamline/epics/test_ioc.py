@@ -1,0 +1,105 @@
+"""A client of EPICS sees a run go on, and a next one, and ends it where it may."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.epics.ioc import RunServer
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+thread = pytest.importorskip("p4p.client.thread")
+WITHIN = 60.0  # s
+
+
+@contextmanager
+def _served(runs: Path, *, control: bool = False) -> Iterator[tuple[RunServer, Any]]:
+    """The server, and a client that finds it by its port alone."""
+    with closing(RunServer(runs, "T:", "127.0.0.1", control, lambda line: None)) as server:
+        port = server.configuration["EPICS_PVAS_SERVER_PORT"]
+        conf = {"EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{port}", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
+        with closing(thread.Context("pva", conf=conf, useenv=False)) as client:
+            yield server, client
+
+
+def _until(server: RunServer, met: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WITHIN
+    while not met():
+        assert time.monotonic() < deadline
+        server.look()
+        time.sleep(0.1)
+
+
+def test_without_a_run_it_is_idle_and_beats(tmp_path: Path) -> None:
+    with _served(tmp_path) as (server, client):
+        assert client.get("T:ScanStatus") == "idle" and client.get("T:ImagesPlanned") == -1
+        server.look()
+        first = int(client.get("T:Heartbeat"))
+        server.look()
+        assert int(client.get("T:Heartbeat")) == first + 1
+
+
+def test_a_finished_run_and_the_next_one(tmp_path: Path) -> None:
+    def run(name: str, sample: str, began: float) -> None:
+        (tmp_path / name).mkdir()
+        write_flagged(tmp_path / name / "scan.h5", frames_of(TwoCylinders()), {})
+        started = (
+            f'{{"event": "run_started", "time": {began}, "folder": "{name}", "path": "{name}/scan.h5", '
+            f'"sample": "{sample}", "n_frames": 98}}\n{{"event": "state", "time": {began}, "state": "done"}}\n'
+        )
+        (tmp_path / name / "events.jsonl").write_text(started, encoding="utf-8")
+
+    run("2026-01-01T000000_a", "first", 1.0)
+    with _served(tmp_path) as (server, client):
+        server.look()
+        assert (client.get("T:SampleName"), client.get("T:ScanStatus")) == ("first", "done")
+        assert client.get("T:ImagesSaved") == 49 and client.get("T:PercentComplete") == 50.0
+        run("2026-01-01T000001_b", "second", 2.0)
+        server.look()
+        assert client.get("T:SampleName") == "second"
+
+
+def test_without_control_there_is_no_verb(tmp_path: Path) -> None:
+    with _served(tmp_path) as (_, client), pytest.raises(TimeoutError):
+        client.put("T:AbortScan", True, timeout=1.0)
+
+
+def test_a_verb_without_a_scan_says_why(tmp_path: Path) -> None:
+    with _served(tmp_path, control=True) as (_, client), pytest.raises(thread.RemoteError, match="There is no run"):
+        client.put("T:StopScan", True, timeout=WITHIN)
+
+
+def test_a_scan_is_paused_resumed_and_stopped_by_a_client(tmp_path: Path) -> None:
+    command = [
+        sys.executable, "-m", "beamline.cli.main", "scan", "configs/simulated.yaml", "--no-live", "-o", str(tmp_path),
+        "--set", "scan.period_s=0.2", "--set", "scan.angles.views=2000",
+    ]  # fmt: skip
+    with _served(tmp_path, control=True) as (server, client):
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as scan:
+            assert scan.stderr is not None
+            _until(server, lambda: client.get("T:ScanStatus") == "acquiring" and client.get("T:ImagesSaved") > 6)
+            assert client.get("T:ImagesPlanned") > 2000 and client.get("T:FrameRate") > 0
+            client.put("T:PauseScan", True, timeout=WITHIN)
+            _until(server, lambda: client.get("T:ScanStatus") == "paused")
+            client.put("T:ResumeScan", True, timeout=WITHIN)
+            _until(server, lambda: client.get("T:ScanStatus") == "acquiring")
+            rate = client.get("T:FrameRate")
+            client.put("T:StopScan", True, timeout=WITHIN)
+            scan.stderr.read()
+            assert scan.wait(WITHIN) == 4
+        _until(server, lambda: client.get("T:ScanStatus") == "stopped")
+        assert rate == rate and client.get("T:FrameRate") != client.get("T:FrameRate")  # no rate when nothing moves
+
+
+def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "p4p.nt", None)
+    with pytest.raises(ConfigError, match=r"splatline\[epics\]"):
+        RunServer(tmp_path, "T:", "127.0.0.1", False, print)
