@@ -126,7 +126,7 @@ def prepare_projections(
 def _fill_unknown(found: PreparedProjections) -> None:
     """Fill, view by view, what `ray_weights` says weighs nothing, as `masked` does for all views."""
     data, geometry = found.projections.data, found.geometry
-    seen = seen_rays(geometry, Grid.matching(geometry)) if np.ptp(geometry.shifts[:, 1]) > 0 else None
+    seen = seen_rays(geometry, Grid.matching(geometry)) if found.leaves_slices else None
     for view in range(len(data)):
         known = np.ones(geometry.detector_shape, np.float32)
         if found.measured is not None:
@@ -135,7 +135,7 @@ def _fill_unknown(found: PreparedProjections) -> None:
             shares = found.shares_of(slice(view, view + 1), slice(0, len(known)))
             known *= 1 if shares is None else shares[0]
         if seen is not None:
-            known *= seen[view][:, None]
+            known *= seen[view]
         if not known.all():
             data[view] = masked(data[view : view + 1], known[None])[0][0]
 

@@ -14,7 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem
 from recon.trials import part_of
 from recon.voxels.odd_views import odd_views
-from recon.voxels.projector import data_residual
+from recon.voxels.projector import Projector, data_residual, seen_rays
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 
 AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])
@@ -71,6 +71,20 @@ def test_auto_tries_leaning_views_on_rows_and_all_slices_that_they_see() -> None
     assert part is not None and where.startswith("rows") and part.projections.shape[1] == 24
     truth = recon.Volume(smooth_ball(part.grid, axes, CENTRE), part.grid)
     assert part.grid.shape[0] < tall.shape[0] / 2 and data_residual(truth, part.projections, part.geometry) < 0.05
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1.5])
+def test_rays_that_leave_the_slices_are_not_seen(degrees: float) -> None:
+    """Of a long sample the slices in the box explain the rays that are said to be seen, and hardly others."""
+    geometry = leaning(False, degrees)
+    geometry = replace(geometry, shifts=5 * geometry.shifts)  # by up to 7.5 rows
+    grid, axes = recon.Grid((20, 32, 32), 0.04), AXES * (1, 1, 8)
+    data = ellipsoid_shadow(geometry, axes, CENTRE)
+    left = np.abs(Projector(geometry, grid).forward(smooth_ball(grid, axes, CENTRE)) - data)
+    seen = np.broadcast_to(seen_rays(geometry, grid), data.shape)
+    thick = data > 0.8 * data.max()
+    assert seen[thick].mean() > 0.3 and left[thick & seen].max() < 0.06 * data.max()
+    assert np.median(left[thick & ~seen]) > 0.1 * data.max()
 
 
 def test_auto_chooses_by_views_held_out() -> None:
