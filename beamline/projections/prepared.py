@@ -108,7 +108,9 @@ class PreparedProjections:
         if self.measured is not None:
             factors.append(self.measured.astype(np.float32)[None])
         if self.leaves_slices:
-            views = self.geometry if self.held_out is None or not others else self.geometry.followed_by(self.held_out[1])
+            views = (
+                self.geometry if self.held_out is None or not others else self.geometry.followed_by(self.held_out[1])
+            )
             factors.append(seen_rays(views, Grid.matching(self.geometry)).astype(np.float32))
         if self.shares is not None:
             factors.append(_and_ones(self.shares, others))

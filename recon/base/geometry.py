@@ -155,8 +155,9 @@ class Geometry:
     def period(self) -> float:
         """Angle, in radians, after which views repeat the same rays: π for a centred parallel beam, else 2π.
 
-        2π holds for a cone, and for an axis that leans along the beam by more than half a pixel of the field. It also holds for an axis more than a tenth of
-        the field off the detector's middle: views half a turn apart then see different parts.
+        2π holds for a cone, and for an axis that leans along the beam by more than half a pixel over the field. It also
+        holds for an axis more than a tenth of the field off the detector's middle: views half a turn apart then see
+        different parts.
         """
         leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
         return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi

@@ -202,7 +202,7 @@ def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
     """
     rows, cols = geometry.detector_shape
     down = np.arange(rows)[:, None] - geometry.axis_row - geometry.shifts[:, 1, None, None]
-    middle, climb = down, 0.0
+    middle, climb = down, np.zeros(1)
     if not geometry.is_straight:
         across = np.arange(cols) - geometry.axis_col - geometry.shifts[:, 0, None, None]
         lean = np.stack([geometry.axes(view)[:, 2] for view in range(geometry.n_views)])[:, :, None, None]
