@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,11 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
+from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
+_TALL = 0.25  # of the box's height: views that climb by more within the field keep rays that leave it
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 
 
@@ -34,30 +37,25 @@ class Projector:
     of voxels, bilinearly. The volume is 0 outside the box. In mm times the volume's unit, float32.
 
     Raises:
-        ValueError: for views that are rolled or tilted (Gaussians take these), or a box that reaches the source.
+        ValueError: for a box that reaches the source, or a wide cone seen under a large tilt (see `posed.ray_table`).
     """
 
     geometry: Geometry
     grid: Grid
     _rays: NDArray[np.float64] = field(init=False, repr=False)
-    _steep: NDArray[np.bool_] = field(init=False, repr=False)
+    _axes: NDArray[Any] = field(init=False, repr=False)  # of the planes that sample each ray, as the kernels count them
 
     def __post_init__(self) -> None:
-        if not self.geometry.is_straight:
-            worst = np.rad2deg(max(np.abs(self.geometry.roll).max(), np.abs(self.geometry.tilt).max()))
-            raise ValueError(
-                f"views are rolled or tilted by up to {worst:.3g} degrees; the voxel projector takes straight ones "
-                "only: rotate the images first, or fit Gaussians (method r2)"
-            )
         reach = float(np.hypot(*np.abs(self.grid.edges[:, :2]).max(0)))
         if self.geometry.is_cone and reach >= self.geometry.sod:
             raise ValueError(
                 f"the box reaches {reach:.4g} mm from the rotation axis, but the source stands at "
                 f"{self.geometry.sod:.4g} mm: give a smaller grid"
             )
-        rays, steep = joseph_cpu.ray_table(self.geometry, self.grid)
+        kernels = joseph_cpu if self.geometry.is_straight else posed_cpu
+        rays, axes = kernels.ray_table(self.geometry, self.grid)
         object.__setattr__(self, "_rays", rays)
-        object.__setattr__(self, "_steep", steep)
+        object.__setattr__(self, "_axes", axes)
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -81,13 +79,15 @@ class Projector:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
-        if self.geometry.is_cone:
-            cone_cpu.forward(volume, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
+        if not self.geometry.is_straight:
+            posed_cpu.forward(volume, self._rays, self._axes, result)
+        elif self.geometry.is_cone:
+            cone_cpu.forward(volume, self._rays, self._axes, *self._heights(), self.geometry.pixel_pitch, result)
         elif self._on_rows():
-            joseph_cpu.forward(volume, self._rays, self._steep, result)
+            joseph_cpu.forward(volume, self._rays, self._axes, result)
         else:
             slices = np.empty((views, cols, self.grid.shape[0]), np.float32)
-            joseph_cpu.forward(volume, self._rays, self._steep, slices)
+            joseph_cpu.forward(volume, self._rays, self._axes, slices)
             rows_from_slices(slices, *self._levels(), result)
         return result
 
@@ -95,14 +95,16 @@ class Projector:
         """Aᵀ p: projections [view, col, row] to a volume [y, x, z]."""
         nz, ny, nx = self.grid.shape
         result = np.empty((ny, nx, nz), np.float32) if out is None else out
-        if self.geometry.is_cone:
-            cone_cpu.adjoint(projections, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
+        if not self.geometry.is_straight:
+            posed_cpu.adjoint(projections, self._rays, self._axes, result)
+        elif self.geometry.is_cone:
+            cone_cpu.adjoint(projections, self._rays, self._axes, *self._heights(), self.geometry.pixel_pitch, result)
         elif self._on_rows():
-            joseph_cpu.adjoint(projections, self._rays, self._steep, result)
+            joseph_cpu.adjoint(projections, self._rays, self._axes, result)
         else:
             slices = np.empty((*projections.shape[:2], nz), np.float32)
             slices_from_rows(projections, *self._levels(), slices)
-            joseph_cpu.adjoint(slices, self._rays, self._steep, result)
+            joseph_cpu.adjoint(slices, self._rays, self._axes, result)
         return result
 
     def _heights(self) -> tuple[NDArray[np.float64], float]:
@@ -192,10 +194,23 @@ def residual_norms(
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
-    """[view, row] rays of a parallel beam between the outer slices of the grid, which the volume can explain."""
-    rows = np.arange(geometry.detector_shape[0]) - geometry.axis_row - geometry.shifts[:, 1:]
-    off = np.abs(rows * geometry.pixel_pitch - grid.centre[0]) / grid.spacing[0]
-    return np.asarray(off <= (grid.shape[0] - 1) / 2 + _EDGE_ROWS)
+    """[view, row, col] rays of a parallel beam between the outer slices of the grid, which the volume can explain.
+
+    One column stands for all where views are straight. A ray that roll or tilt takes beyond these slices within the
+    field is not among them; of views tilted by more than the field is high, where few rays stay, only its middle
+    counts.
+    """
+    rows, cols = geometry.detector_shape
+    down = np.arange(rows)[:, None] - geometry.axis_row - geometry.shifts[:, 1, None, None]
+    middle, climb = down, np.zeros(1)
+    if not geometry.is_straight:
+        across = np.arange(cols) - geometry.axis_col - geometry.shifts[:, 0, None, None]
+        lean = np.stack([geometry.axes(view)[:, 2] for view in range(geometry.n_views)])[:, :, None, None]
+        middle = across * lean[:, 0] + down * lean[:, 1]
+        climb = geometry.reach * np.abs(lean[:, 2])
+        climb = np.where(climb < _TALL * grid.shape[0] * grid.spacing[0], climb, 0.0)
+    off = np.abs(middle * geometry.pixel_pitch - grid.centre[0]) + climb
+    return np.asarray(off / grid.spacing[0] <= (grid.shape[0] - 1) / 2 + _EDGE_ROWS)
 
 
 def _plain(array: F32) -> F32:
