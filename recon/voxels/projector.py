@@ -4,26 +4,44 @@ Both directions run on lines along z: volumes [y, x, z], projections [view, col,
 that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
 and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
-A ray has no width: pixels should not be much larger than voxels, or voxels between the rays are not seen.
+Without `Geometry.width` a ray has no width. With it, a pixel takes from its neighbours what a square and a Gaussian of
+its variance would give it, and a view is the mean of views at angles within its arc. Both are linear and transposed
+exactly. Pixels should not be much larger than voxels, or voxels between the rays are not seen.
+
+With `Geometry.skew`, bands of slices are seen at the angles of their rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
+from recon.base.slabs import bands_of
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
+from recon.kernels.cpu.spread import spread
+from recon.kernels.cpu.vectors import combine
 
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
+_LOOK = 1.0  # px at the edge of the field from one angle within an exposure to the next
+_MOST_LOOKS = 16
+
+
+class _Rays(NamedTuple):
+    """Rays of all views at one moment of their exposures, through a band of slices; see `joseph.ray_table`."""
+
+    table: NDArray[np.float64]
+    steep: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +57,7 @@ class Projector:
 
     geometry: Geometry
     grid: Grid
-    _rays: NDArray[np.float64] = field(init=False, repr=False)
-    _steep: NDArray[np.bool_] = field(init=False, repr=False)
+    _bands: list[tuple[slice, list[_Rays]]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not self.geometry.is_straight:
@@ -55,9 +72,11 @@ class Projector:
                 f"the box reaches {reach:.4g} mm from the rotation axis, but the source stands at "
                 f"{self.geometry.sod:.4g} mm: give a smaller grid"
             )
-        rays, steep = joseph_cpu.ray_table(self.geometry, self.grid)
-        object.__setattr__(self, "_rays", rays)
-        object.__setattr__(self, "_steep", steep)
+        found = [
+            (band, [_Rays(*joseph_cpu.ray_table(at, self.grid)) for at in moments(views)])
+            for band, views in bands_of(self.geometry, self.grid)
+        ]
+        object.__setattr__(self, "_bands", found)
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -81,29 +100,60 @@ class Projector:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
-        if self.geometry.is_cone:
-            cone_cpu.forward(volume, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
-        elif self._on_rows():
-            joseph_cpu.forward(volume, self._rays, self._steep, result)
+        if self.geometry.is_cone or self._on_rows():
+            self._mean(volume, result, self._look)
         else:
             slices = np.empty((views, cols, self.grid.shape[0]), np.float32)
-            joseph_cpu.forward(volume, self._rays, self._steep, slices)
+            self._mean(volume, slices, self._look)
             rows_from_slices(slices, *self._levels(), result)
-        return result
+        return self._spread(result)
 
     def adjoint_lines(self, projections: F32, out: F32 | None = None) -> F32:
         """Aᵀ p: projections [view, col, row] to a volume [y, x, z]."""
         nz, ny, nx = self.grid.shape
         result = np.empty((ny, nx, nz), np.float32) if out is None else out
-        if self.geometry.is_cone:
-            cone_cpu.adjoint(projections, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
-        elif self._on_rows():
-            joseph_cpu.adjoint(projections, self._rays, self._steep, result)
-        else:
+        projections = self._spread(projections)
+        if not (self.geometry.is_cone or self._on_rows()):
             slices = np.empty((*projections.shape[:2], nz), np.float32)
             slices_from_rows(projections, *self._levels(), slices)
-            joseph_cpu.adjoint(slices, self._rays, self._steep, result)
+            projections = slices
+        self._mean(projections, result, self._look_back)
         return result
+
+    def _mean(self, source: F32, out: F32, look: Callable[[F32, _Rays, F32], None]) -> None:
+        """The mean over the moments of an exposure of `look`, band by band of slices, from `source` into `out`."""
+        for band, looks in self._bands:
+            whole = band == slice(0, self.grid.shape[0])
+            part = source if whole else np.ascontiguousarray(source[..., band])
+            found = out if whole else np.empty((*out.shape[:2], part.shape[2]), np.float32)
+            look(part, looks[0], found)
+            if len(looks) > 1:
+                more = np.empty_like(found)
+                for rays in looks[1:]:
+                    look(part, rays, more)
+                    combine(1.0, found, 1.0, more, found)
+                combine(1 / len(looks), found, 0.0, found, found)
+            if not whole:
+                out[..., band] = found
+
+    def _look(self, volume: F32, rays: _Rays, out: F32) -> None:
+        if self.geometry.is_cone:
+            cone_cpu.forward(volume, *rays, *self._heights(), self.geometry.pixel_pitch, out)
+        else:
+            joseph_cpu.forward(volume, *rays, out)
+
+    def _look_back(self, projections: F32, rays: _Rays, out: F32) -> None:
+        if self.geometry.is_cone:
+            cone_cpu.adjoint(projections, *rays, *self._heights(), self.geometry.pixel_pitch, out)
+        else:
+            joseph_cpu.adjoint(projections, *rays, out)
+
+    def _spread(self, lines: F32) -> F32:
+        """Lines [view, col, row] with the width of a pixel; its own transpose."""
+        variance = self.geometry.width.variance
+        if variance == 0:
+            return lines
+        return spread(lines, np.full(len(lines), variance), variance)
 
     def _heights(self) -> tuple[NDArray[np.float64], float]:
         """The row on which z = 0 falls in each view, and the slice at z = 0."""
@@ -123,6 +173,17 @@ class Projector:
         return nz == self.geometry.detector_shape[0] and bool(
             np.abs(first).max() < _ON_ROWS and abs(step - 1) * nz < _ON_ROWS
         )
+
+
+def moments(geometry: Geometry) -> list[Geometry]:
+    """The views at angles spread evenly over their exposures (midpoint rule); one where the stage stands."""
+    arc = geometry.width.arc
+    if arc == 0:
+        return [geometry]
+    travel = arc * geometry.reach / geometry.sample_pitch
+    count = min(max(2, math.ceil(travel / _LOOK)), _MOST_LOOKS)
+    turns = ((np.arange(count) + 0.5) / count - 0.5) * arc
+    return [replace(geometry, angles=geometry.angles + turn) for turn in turns]
 
 
 def volume_lines(volume: F32) -> F32:
