@@ -23,6 +23,7 @@ class ArraySource:
     axis_col: float | None = None
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
+    row_period: float | None = None
     flags = None
     currents: NDArray[np.float64] | None = None
     replaces = None
