@@ -13,7 +13,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 
 _ON_A_ROW = 1e-6  # rows
-_TURN = 0.1  # px at the edge of the field that a skew may turn a band of slices
+_TURN = 0.25  # px at the edge of the field that a skew may turn a band of slices; each band costs its samples anew
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geome
 
 
 def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
-    """Slices of the grid whose rows see the sample at one angle, to a tenth of a pixel, with their views without skew.
+    """Slices of the grid whose rows see one angle, to an eighth of a pixel, with their views without skew.
 
     Views that are shifted along the axis count as unshifted.
     """
@@ -75,7 +75,7 @@ def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
         return [(slice(0, nz), geometry)]
     rows = grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
     turned = abs(geometry.skew) * float(np.ptp(rows)) * geometry.reach / geometry.pixel_pitch
-    edges = np.linspace(0, nz, min(nz, math.ceil(turned / _TURN) + 1) + 1).astype(int).tolist()
+    edges = np.linspace(0, nz, min(nz, max(math.ceil(turned / _TURN), 1)) + 1).astype(int).tolist()
     parts = [slice(first, end) for first, end in pairwise(edges)]
     return [(part, geometry.at_row(float(rows[part].mean()))) for part in parts]
 

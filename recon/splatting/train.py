@@ -19,6 +19,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
+from recon.base.ray_width import NO_WIDTH
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
@@ -98,6 +99,12 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     now, settings, told, geometry = control.now, method.fit, problem.geometry, problem.geometry.at_row(0)
     if told.skew and isinstance(method.gaussians, Gaussians):
         raise ValueError("Gaussians to start from are not taken where rows see angles of their own: give their number")
+    if geometry.width and problem.device != "cpu":
+        warnings.warn(
+            f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows {geometry.width}",
+            stacklevel=2,
+        )
+        geometry = geometry.seen_with(NO_WIDTH)
     begin, decide = now(), control.decide or Decisions(problem.seed)
     sweeps = method.finish_sweeps(geometry)
     if sweeps and not geometry.is_straight:

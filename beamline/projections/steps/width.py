@@ -6,15 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from beamline.core.errors import ConfigError
 from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
-from drivers.base.frame import FrameKind
-from recon.base.ray_width import RayWidth
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.writers.recon_file import Value
@@ -97,6 +95,8 @@ class Width:
         Raises:
             ConfigError: rows of a cone, or of rolled or tilted views, that see angles of their own.
         """
+        from recon.base.ray_width import RayWidth
+
         blur = 0.0 if self.spread in ("none", "pixel") else float(self.spread)
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
         told, motion = self._motion(source), _Motion(0.0, 0.0)
@@ -134,10 +134,9 @@ class Width:
         """Asked for, or told by the file; None: the stage stood, or the file does not say."""
         if self.arc == "none":
             return None
-        angles = source.angles[source.image_key == FrameKind.PROJECTION]
         if self.arc != "auto":
             arc, skew = ([math.radians(float(part)) for part in self.arc.split(":")] + [0.0])[:2]
-            sense = -1.0 if _step(angles) < 0 else 1.0
+            sense = -1.0 if _step(_of_views(source, source.angles)) < 0 else 1.0
             return _Motion(sense * arc, sense * skew / max(source.shape[0] - 1, 1))
         return stated_motion(source)
 
@@ -147,19 +146,28 @@ def stated_motion(source: ScanSource) -> _Motion | None:
 
     The speed is that of the median step from view to view, so that passes and lost views do not count.
     """
+    import numpy as np
+
     plan, period = source.plan, source.attributes.get("period_s")
     if not (plan.get("mode") == "fly" or plan.get("fly") is True) or not isinstance(period, float) or period <= 0:
         return None
-    views = source.image_key == FrameKind.PROJECTION
-    exposures = source.exposures[views]
+    exposures = _of_views(source, source.exposures)
     if not np.isfinite(exposures).any():
         return None
-    speed = _step(source.angles[views]) / period
+    speed = _step(_of_views(source, source.angles)) / period
     return _Motion(speed * float(np.nanmedian(exposures)), speed * (source.row_period or 0.0))
+
+
+def _of_views(source: ScanSource, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    from drivers.base.frame import FrameKind
+
+    return values[source.image_key == FrameKind.PROJECTION]
 
 
 def _step(angles: NDArray[np.float64]) -> float:
     """The median step from view to view in radians."""
+    import numpy as np
+
     steps = np.diff(angles)
     steps = steps[np.isfinite(steps)]
     return float(np.median(steps)) if steps.size else 0.0
