@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import DataUse, Progress, RunControl
+from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
 from recon.methods import REGISTRY
 
@@ -64,6 +65,7 @@ __all__ = [
     "Projections",
     "Projector",
     "R2Published",
+    "RayWidth",
     "Reconstruction",
     "References",
     "RunControl",

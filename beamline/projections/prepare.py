@@ -18,7 +18,7 @@ from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import Places, PlaceStep, ScanStep
+from beamline.projections.steps.step import Places, PlaceStep, RayStep, ScanStep, StepDone
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
@@ -87,6 +87,7 @@ def prepare_projections(
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
     moved: dict[str, Places] = {}
+    rays: dict[str, StepDone] = {}
     for place_step in (step for step in selection.in_order if isinstance(step, PlaceStep)):
         phases.enter(place_step.name, "guesses")
         places = place_step.place(source, selection, usable, axis_col, phases.progress)
@@ -99,6 +100,8 @@ def prepare_projections(
         geometry = geometry_of(source, selection, axis_col, source.angles[view_ids])
         for places in moved.values():
             geometry = places.corrected(geometry, view_ids)
+        for ray_step in (step for step in selection.in_order if isinstance(step, RayStep)):
+            geometry, rays[ray_step.name] = ray_step.rays(source, selection, geometry)
         return geometry
 
     chosen = choose_views(source, usable.frames, selection, seen(usable.frames).period)
@@ -120,7 +123,7 @@ def prepare_projections(
     if others is not None:
         found = replace(found, held_out=(others.data, seen(others.view_ids)))
     done = {**correction.done, **({"tilt": selection.step(TiltAndLens).done(sought)} if sought else {})}
-    done |= {name: places.done for name, places in moved.items()}
+    done |= {name: places.done for name, places in moved.items()} | rays
     steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(found, source.angles[ids])

@@ -21,7 +21,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, geometry_of
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.jumps import Jumps
-from beamline.projections.steps.step import PlaceStep, ScanStep, StepDone
+from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
@@ -339,7 +339,7 @@ class ScanFollower:
         found = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
         done = self._correction.done
         for step in selection.in_order:
-            if isinstance(step, PlaceStep):
+            if isinstance(step, PlaceStep | RayStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:

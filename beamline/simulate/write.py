@@ -118,7 +118,13 @@ def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: 
 
 def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
     settings, beam = scene.scene.scan, scene.scene.beam
-    plan = {"views": scan.views, "range_deg": settings.range_deg, "fly": settings.fly, "seed": scan.seed}
+    shot, effects = scan.frame(0).shot, {effect.name for effect in scene.scene.chain.effects}
+    plan = {
+        "views": scan.views,
+        "range_deg": settings.range_deg,
+        "fly": settings.fly and "motion_blur" in effects,
+        "seed": scan.seed,
+    }
     magnification = 1.0 if beam.sod is None or beam.sdd is None else beam.sdd / beam.sod
     return ScanInfo(
         sample=scene.path.stem,
@@ -132,5 +138,11 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         axis_col=scan.detector.axis_col,
         plan=json.dumps(plan),
         config=scene.text,
-        devices={"simulator": {"seed": scan.seed, "electrons_per_count": scan.frame(0).shot.conversion}},
+        devices={
+            "simulator": {
+                "seed": scan.seed,
+                "electrons_per_count": shot.conversion,
+                "row_period": shot.row_period if "rolling_shutter" in effects else 0.0,
+            }
+        },
     )

@@ -10,7 +10,7 @@ from drivers.base.protocols import CameraSettings
 from drivers.dcam import codes
 from drivers.dcam.abi import DcamError
 from drivers.dcam.codes import Cooler, Error, Property, Text
-from drivers.dcam.options import DcamOptions
+from drivers.dcam.options import DcamOptions, GlobalExposure
 from drivers.dcam.properties import Properties
 from drivers.dcam.session import Session
 
@@ -30,7 +30,8 @@ def description(
     """Everything that this camera model reports of itself, by name.
 
     Number of electrons = (count - conversion_offset) * conversion_factor. Both depend on the readout; the entries are
-    missing for a camera that does not report them.
+    missing for a camera that does not report them. `row_period` (s) is by how much each row starts later than the one
+    above; it is missing where all rows start together and are read one after the other.
     """
     cooler = properties.find(Property.SENSORCOOLERSTATUS)
     repairs = properties.find(Property.DEFECTCORRECT_MODE) == codes.ON
@@ -42,6 +43,7 @@ def description(
         )
     }
     dcam, camera = session.dcam, session.camera
+    row_period = properties.get(Property.TIMING_READOUTTIME) / properties.get(Property.IMAGE_HEIGHT)
     texts = {which: _if_told(partial(dcam.dev_getstring, camera, which), "") for which in Text}
     return {
         **{which.name.lower(): text for which, text in texts.items() if text},
@@ -60,6 +62,7 @@ def description(
         "defect_correction": "on" if repairs else "off",
         "hot_pixels": str(options.hot_pixels) if repairs and options.hot_pixels else "as measured",
         **producers,
+        **({"row_period": row_period} if options.global_exposure is GlobalExposure.DELAYED else {}),
         **{name: value for name, prop in _OPTIONAL.items() if (value := properties.find(prop)) is not None},
     }
 

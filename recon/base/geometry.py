@@ -15,6 +15,9 @@ axis_col + (sdd / w) u / pixel_pitch and on row axis_row + (sdd / w) v / pixel_p
 
 A real set-up departs from this in three ways, each given for every view. `tilt` leans the rotation axis along the beam
 (laminography), `roll` turns the detector about the beam, `shifts` displace the image on the detector.
+
+Two more follow from the exposure. `width` says what a pixel sees beside its central ray. `skew` says how far the stage
+turns from the readout of one row to the next (rolling shutter): row j sees the angle θ + j skew.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import F64
 from recon.base.picture import fan, html
+from recon.base.ray_width import NO_WIDTH, RayWidth
 
 _OF_VIEWS = "angles", "shifts", "roll", "tilt"  # attributes with one value for each view
 _OFF_MIDDLE = 0.05  # share of the detector's width; beyond it, a tenth of the field lies on one side only
@@ -51,6 +55,8 @@ class Geometry:
         shifts: float64 [view, 2], displacement of each view in pixels (col, row).
         roll: float64 [view], radians; the detector turned about the beam: its columns run along u cos + v sin.
         tilt: float64 [view], radians; the rotation axis leaning along the beam: rows then run along v cos + d sin.
+        width: of every ray; see `seen_with`.
+        skew: radians from one row to the next, of a parallel beam; `angles` are those of the first row.
     """
 
     angles: F64
@@ -63,6 +69,8 @@ class Geometry:
     shifts: F64
     roll: F64
     tilt: F64
+    width: RayWidth = NO_WIDTH
+    skew: float = 0.0
 
     @classmethod
     def parallel(
@@ -116,6 +124,7 @@ class Geometry:
         low, high = np.rad2deg((self.angles.min(), self.angles.max()))
         beam = f"cone {self.sod:.6g}:{self.sdd:.6g}" if self.is_cone else "parallel"
         moved = [name for name in ("shifts", "roll", "tilt") if getattr(self, name).any()]
+        moved += [name for name in ("width", "skew") if getattr(self, name)]
         return (
             f"Geometry({beam}, {self.n_views} views from {low:.4g} to {high:.4g} degrees, detector "
             f"{self.detector_shape[0]} x {self.detector_shape[1]}, pitch {self.pixel_pitch:.4g}, axis_col "
@@ -242,7 +251,7 @@ class Geometry:
         return _checked(
             angles, self.detector_shape, self.pixel_pitch, self.axis_col, self.axis_row, self.sod, self.sdd,
             np.broadcast_to(self.shifts[0], (n, 2)), self.roll[0], self.tilt[0],
-        )  # fmt: skip
+        ).seen_with(self.width, self.skew)  # fmt: skip
 
     def followed_by(self, other: Geometry) -> Geometry:
         """The views of this geometry, then those of another one of the same set-up."""
@@ -254,6 +263,24 @@ class Geometry:
     def straightened(self) -> Geometry:
         """The same views without roll and tilt."""
         return replace(self, roll=_frozen(np.zeros(self.n_views)), tilt=_frozen(np.zeros(self.n_views)))
+
+    def seen_with(self, width: RayWidth, skew: float = 0.0) -> Geometry:
+        """The same views, whose rays have a width and whose rows were read one after the other.
+
+        Raises:
+            ValueError: a skew that is not finite, or of a cone, or of rolled or tilted views: slices of the volume then
+                belong to no row.
+        """
+        if not math.isfinite(skew) or (skew and not (self.is_straight and not self.is_cone)):
+            raise ValueError(
+                f"a skew of {skew:.3g} rad a row: expected a finite one, of straight views of a parallel beam. Leave "
+                "it at 0 for a cone, and for rolled or tilted views"
+            )
+        return replace(self, width=width, skew=float(skew))
+
+    def at_row(self, row: float) -> Geometry:
+        """The same without skew: all rows at the angle of this one."""
+        return replace(self, angles=_frozen(self.angles + row * self.skew), skew=0.0) if self.skew else self
 
     def rows(self, start: int, stop: int) -> Geometry:
         """The same geometry for detector rows start..stop.
@@ -267,7 +294,8 @@ class Geometry:
         off_middle = self.axis_row - (rows - 1) / 2
         keeps = self.is_cone or not self.is_straight
         axis_row = self.axis_row - start if keeps else off_middle + (stop - start - 1) / 2
-        return replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
+        found = replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
+        return replace(found, angles=_frozen(self.angles + start * self.skew)) if start * self.skew else found
 
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
@@ -287,6 +315,9 @@ class Geometry:
             axis_col=(whole.axis_col - (factor - 1) / 2) / factor,
             axis_row=(whole.axis_row - (factor - 1) / 2) / factor,
             shifts=_frozen(self.shifts / factor),
+            angles=_frozen(whole.angles + (factor - 1) / 2 * self.skew),
+            width=self.width.binned(factor),
+            skew=self.skew * factor,
         )
 
 

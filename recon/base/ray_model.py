@@ -50,5 +50,13 @@ class RayModel:
             raise ValueError("exact integrals are always rectified: leave exact_above at inf with rectified = False")
 
     def length(self, geometry: Geometry) -> float:
-        """mm used for the length of every ray in a Gaussian; 0 to use the true length."""
-        return 0.0 if self.rectified else geometry.detector_shape[1] * geometry.sample_pitch / 2
+        """mm used for the length of every ray in a Gaussian; 0 to use the true length.
+
+        Raises:
+            ValueError: the uncorrected factor for rays with a width, which would not keep a Gaussian's mass.
+        """
+        if self.rectified:
+            return 0.0
+        if geometry.width:
+            raise ValueError(f"rays with a width ({geometry.width}) need the corrected factor: leave rectified at True")
+        return geometry.detector_shape[1] * geometry.sample_pitch / 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 
 _ON_A_ROW = 1e-6  # rows
+_TURN = 0.25  # px at the edge of the field that a skew may turn a band of slices; each band costs its samples anew
 
 
 @dataclass(frozen=True)
@@ -61,3 +63,27 @@ def part_of(geometry: Geometry, grid: Grid, slices: slice) -> tuple[slice, Geome
     middle = grid.centre[0] + ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
     shape, centre = (slices.stop - slices.start, *grid.shape[1:]), (middle - moved, *grid.centre[1:])
     return slice(first, end), views, replace(grid, shape=shape, centre=centre)
+
+
+def bands_of(geometry: Geometry, grid: Grid) -> list[tuple[slice, Geometry]]:
+    """Slices of the grid whose rows see one angle, to an eighth of a pixel, with their views without skew.
+
+    Views that are shifted along the axis count as unshifted.
+    """
+    nz = grid.shape[0]
+    if not geometry.skew:
+        return [(slice(0, nz), geometry)]
+    rows = grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
+    turned = abs(geometry.skew) * float(np.ptp(rows)) * geometry.reach / geometry.pixel_pitch
+    edges = np.linspace(0, nz, min(nz, max(math.ceil(turned / _TURN), 1)) + 1).astype(int).tolist()
+    parts = [slice(first, end) for first, end in pairwise(edges)]
+    return [(part, geometry.at_row(float(rows[part].mean()))) for part in parts]
+
+
+def slices_of(grid: Grid, slices: slice) -> Grid:
+    """These slices of a grid, where they are."""
+    off = ((slices.start + slices.stop) - grid.shape[0]) / 2 * grid.spacing[0]
+    centre = (grid.centre[0] + off, *grid.centre[1:])
+    return replace(
+        grid, shape=(slices.stop - slices.start, *grid.shape[1:]), centre=centre, slice_pitch=grid.spacing[0]
+    )  # fmt: skip

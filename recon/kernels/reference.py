@@ -13,6 +13,7 @@ S⁻¹Rᵀ, δ from the source to the centre and D along the ray of a pixel,
 
     ∫ σ dt = Σ_i ρ_i sqrt(2π) |D| / |H D| exp(-1/2 |Hδ x HD|² / |HD|²)
 
+Where rays have a width, Σ₂ grows by it, and μ falls so that the mass stays (`cpu.wide_footprints`).
 Another `Kernel` replaces exp(-q/2) of the squared distance q in standard deviations, in an image by its line integral,
 and sqrt(2π) by its own length.
 Losses follow below. Everything is plain torch, so autograd gives the gradients to compare with.
@@ -159,12 +160,25 @@ def _affine(
     shaped = turn @ rotation_matrices(quaternions) * scales[:, None, :]
     lower = torch.linalg.qr(shaped.transpose(1, 2)).R.transpose(1, 2)  # L, up to signs of its columns
     factor = torch.full_like(densities, length) if length > 0 else kernel.length * lower[:, 2, 2].abs()
+    if geometry.width:
+        narrow, lower = lower, _widened(lower, jacobian, in_view, geometry, view)
+        factor = factor * (narrow[:, 0, 0] * narrow[:, 1, 1]).abs() / (lower[:, 0, 0] * lower[:, 1, 1])
     u, v = pixels(geometry, view, in_view)
     grid = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
     offset = grid[None] - centre[:, None, None, :]
     first = offset[..., 0] / lower[:, 0, 0, None, None]
     second = (offset[..., 1] - lower[:, 1, 0, None, None] * first) / lower[:, 1, 1, None, None]
     return torch.einsum("n,nrc->rc", densities * factor, shadow_profile(first * first + second * second, kernel))
+
+
+def _widened(lower: Tensor, jacobian: Tensor, in_view: Tensor, geometry: Geometry, view: int) -> Tensor:
+    """L [n, 2, 2] of the covariance on the detector, with that of the pixel and of the centre's path."""
+    axes = in_view.new_tensor(geometry.axes(view))
+    x, y, _ = (in_view @ axes).unbind(1)
+    path = jacobian[:, :2] @ (torch.stack((-y, x, torch.zeros_like(x)), 1) @ axes.T)[:, :, None]
+    flat, own = lower[:, :2, :2], torch.eye(2, dtype=lower.dtype) * geometry.width.variance
+    moved = geometry.width.arc**2 / 12 * path @ path.transpose(1, 2)
+    return torch.linalg.cholesky(flat @ flat.transpose(1, 2) + own + moved)
 
 
 def _along_rays(

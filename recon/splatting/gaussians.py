@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 
 _PARAMETERS = {"means": (3,), "log_scales": (3,), "quaternions": (4,), "raw_densities": ()}
@@ -109,6 +110,27 @@ class Gaussians:
         turned = torch.nn.functional.normalize(self.quaternions, dim=1)
         values = {"centres": self.means, "widths": self.scales, "rotations": turned, "densities": self.densities}
         return {name: value.detach().cpu().numpy() for name, value in values.items()}
+
+
+def turned_by_rows(gaussians: Gaussians, geometry: Geometry, sense: int) -> Gaussians:
+    """Each Gaussian turned about the axis by the skew up to its row; one that is many rows high does not bend.
+
+    Args:
+        sense: -1: from the object's frame to that which all rows see at the angle of the first; 1: back.
+    """
+    if not geometry.skew:
+        return gaussians
+    rows = gaussians.means[:, 2] / geometry.pixel_pitch + geometry.axis_row
+    turn = sense * geometry.skew * rows
+    c, s = torch.cos(turn), torch.sin(turn)
+    x, y, z = gaussians.means.unbind(1)
+    a, b = torch.cos(turn / 2), torch.sin(turn / 2)
+    qw, qx, qy, qz = gaussians.quaternions.unbind(1)
+    return replace(
+        gaussians,
+        means=torch.stack((c * x - s * y, s * x + c * y, z), 1),
+        quaternions=torch.stack((a * qw - b * qz, a * qx - b * qy, a * qy + b * qx, a * qz + b * qw), 1),
+    )
 
 
 def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from recon.base.ray_model import RayModel, Truncation
 from recon.base.volume import Grid
 from recon.kernels import reference
 from recon.splatting.backend import Backend, Cpu, Pass
-from recon.splatting.gaussians import Gaussians
+from recon.splatting.gaussians import Gaussians, turned_by_rows
 
 Implementation = Literal["auto", "cpu", "gpu", "reference"]
 
@@ -101,7 +101,8 @@ def project(
     """
     rays = model or RayModel()
     chosen = geometry if views is None else geometry.select(views)
-    g, which = gaussians, _chosen(gaussians, implementation)
+    g, which = turned_by_rows(gaussians, chosen, -1), _chosen(gaussians, implementation)
+    chosen = chosen.at_row(0)
     if which == "reference":
         parameters = (g.means, g.scales, g.quaternions, g.densities)
         length = rays.length(chosen)

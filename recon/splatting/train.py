@@ -19,13 +19,14 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, MethodResult, Progress, ReconProblem, RunControl
+from recon.base.ray_width import NO_WIDTH
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.finish import finish
 from recon.splatting.fit_method import FitMethod
-from recon.splatting.gaussians import Gaussians
+from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
     FINISH_SHARE,
     FinishPlan,
@@ -39,6 +40,7 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, binned_geometry, coarser
 from recon.splatting.schedule import Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
+from recon.splatting.splat import voxelize
 from recon.voxels.projector import data_residual
 
 _TIMED = 3  # steps after which a fit's seconds are planned
@@ -93,7 +95,16 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     Raises:
         ValueError: for a problem that the method cannot be fitted to.
     """
-    now, settings, geometry = control.now, method.fit, problem.geometry
+    # Slices that turn against each other are a twist of the model: the fit sees all rows at the angle of the first.
+    now, settings, told, geometry = control.now, method.fit, problem.geometry, problem.geometry.at_row(0)
+    if told.skew and isinstance(method.gaussians, Gaussians):
+        raise ValueError("Gaussians to start from are not taken where rows see angles of their own: give their number")
+    if geometry.width and problem.device != "cpu":
+        warnings.warn(
+            f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows {geometry.width}",
+            stacklevel=2,
+        )
+        geometry = geometry.seen_with(NO_WIDTH)
     begin, decide = now(), control.decide or Decisions(problem.seed)
     sweeps = method.finish_sweeps(geometry)
     held_out = tuple(problem.use.held_out)
@@ -178,7 +189,8 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     last = state
     if tracker.kept:
         state = state_from(tracker.kept, backend)
-    volume, model = fit.volume_of(state, problem.grid, settings, backend), fit.gaussians_of(state, backend)
+    model = turned_by_rows(fit.gaussians_of(state, backend), told, 1)
+    volume = Volume(voxelize(model, problem.grid, truncation=settings.truncation).numpy(), problem.grid)
     if not planned:  # the fit has ended before
         wanted, _, trials = decide("finish", lambda: _finish_in_time(method, seen, problem.grid, now, end - now(), 0.0))
     if wanted == 0 or now() >= end or (control.should_stop is not None and control.should_stop()):
@@ -187,9 +199,9 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         if method.seconds is not None:
             control = replace(control, should_stop=_until(control, end))
         control = replace(control, stop_trials=None if trials else lambda: True)
-        fitted = replace(problem, projections=data[used], geometry=seen, use=DataUse(known))
+        fitted = replace(problem, projections=data[used], geometry=told.select(used), use=DataUse(known))
         finished, sweeps = finish(volume, model, fitted, wanted, settings, control, not method.allow_negative)
-        if kept_back.size and _worse(finished, volume, data[kept_back], geometry.select(kept_back)):
+        if kept_back.size and _worse(finished, volume, data[kept_back], told.select(kept_back)):
             sweeps = 0
         else:
             volume = finished

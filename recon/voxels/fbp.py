@@ -21,6 +21,7 @@ from scipy import fft
 from recon.base.arrays import F32, F64
 from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry
+from recon.base.slabs import bands_of, slices_of
 from recon.base.volume import Grid
 from recon.voxels.back_project import (
     SLICES,
@@ -115,7 +116,7 @@ class FbpPlan:
 
 
 def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpPlan:
-    """The part of `fbp` that does not depend on the data.
+    """The part of `fbp` that does not depend on the data; with a skew all rows are at the angle of the middle one.
 
     Raises:
         ValueError: as `fbp`, for the filter and the geometry.
@@ -125,6 +126,7 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
         raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
     if not geometry.is_straight:
         raise ValueError("FBP takes straight views only; these are rolled or tilted: `direct` takes them")
+    geometry = geometry.at_row((geometry.detector_shape[0] - 1) / 2)
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)
     axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
@@ -241,10 +243,12 @@ def fbp(
         raise ValueError(
             f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
         )
-    plan = plan_fbp(geometry, Grid.matching(geometry) if grid is None else grid, filter)
+    grid = Grid.matching(geometry) if grid is None else grid
     if out is None:
-        out = np.empty(plan.grid.shape, np.float32)
-    for part in plan.blocks:
-        fbp_block(plan, projections, 0, part, out[part])
-        on_block(part.stop, len(out))
+        out = np.empty(grid.shape, np.float32)
+    for band, views in bands_of(geometry, grid):
+        plan = plan_fbp(views, slices_of(grid, band) if geometry.skew else grid, filter)
+        for part in plan.blocks:
+            fbp_block(plan, projections, 0, part, out[band][part])
+            on_block(band.start + part.stop, len(out))
     return out

@@ -4,29 +4,46 @@ Both directions run on lines along z: volumes [y, x, z], projections [view, col,
 that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
 and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
-A ray has no width: pixels should not be much larger than voxels, or voxels between the rays are not seen.
+Without `Geometry.width` a ray has no width. With it, a pixel takes from its neighbours what a square and a Gaussian of
+its variance would give it, and a view is the mean of views at angles within its arc. Both are linear and transposed
+exactly. Pixels should not be much larger than voxels, or voxels between the rays are not seen.
+
+With `Geometry.skew`, bands of slices are seen at the angles of their rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
+from recon.base.slabs import bands_of
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
 from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
+from recon.kernels.cpu.spread import spread
+from recon.kernels.cpu.vectors import combine
 
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
 _TALL = 0.25  # of the box's height: views that climb by more within the field keep rays that leave it
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
+_LOOK = 1.0  # px at the edge of the field from one angle within an exposure to the next
+_MOST_LOOKS = 16
+
+
+class _Rays(NamedTuple):
+    """Rays of all views at one moment of their exposures, through a band of slices: `joseph` or `posed.ray_table`."""
+
+    table: NDArray[np.float64]
+    axes: NDArray[Any]  # of the planes that sample each ray, as the kernels count them
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +59,7 @@ class Projector:
 
     geometry: Geometry
     grid: Grid
-    _rays: NDArray[np.float64] = field(init=False, repr=False)
-    _axes: NDArray[Any] = field(init=False, repr=False)  # of the planes that sample each ray, as the kernels count them
+    _bands: list[tuple[slice, list[_Rays]]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         reach = float(np.hypot(*np.abs(self.grid.edges[:, :2]).max(0)))
@@ -53,9 +69,11 @@ class Projector:
                 f"{self.geometry.sod:.4g} mm: give a smaller grid"
             )
         kernels = joseph_cpu if self.geometry.is_straight else posed_cpu
-        rays, axes = kernels.ray_table(self.geometry, self.grid)
-        object.__setattr__(self, "_rays", rays)
-        object.__setattr__(self, "_axes", axes)
+        found = [
+            (band, [_Rays(*kernels.ray_table(at, self.grid)) for at in moments(views)])
+            for band, views in bands_of(self.geometry, self.grid)
+        ]
+        object.__setattr__(self, "_bands", found)
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -79,33 +97,64 @@ class Projector:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
-        if not self.geometry.is_straight:
-            posed_cpu.forward(volume, self._rays, self._axes, result)
-        elif self.geometry.is_cone:
-            cone_cpu.forward(volume, self._rays, self._axes, *self._heights(), self.geometry.pixel_pitch, result)
-        elif self._on_rows():
-            joseph_cpu.forward(volume, self._rays, self._axes, result)
+        if self._to_rows():
+            self._mean(volume, result, self._look)
         else:
             slices = np.empty((views, cols, self.grid.shape[0]), np.float32)
-            joseph_cpu.forward(volume, self._rays, self._axes, slices)
+            self._mean(volume, slices, self._look)
             rows_from_slices(slices, *self._levels(), result)
-        return result
+        return self._spread(result)
 
     def adjoint_lines(self, projections: F32, out: F32 | None = None) -> F32:
         """Aᵀ p: projections [view, col, row] to a volume [y, x, z]."""
         nz, ny, nx = self.grid.shape
         result = np.empty((ny, nx, nz), np.float32) if out is None else out
-        if not self.geometry.is_straight:
-            posed_cpu.adjoint(projections, self._rays, self._axes, result)
-        elif self.geometry.is_cone:
-            cone_cpu.adjoint(projections, self._rays, self._axes, *self._heights(), self.geometry.pixel_pitch, result)
-        elif self._on_rows():
-            joseph_cpu.adjoint(projections, self._rays, self._axes, result)
-        else:
+        projections = self._spread(projections)
+        if not self._to_rows():
             slices = np.empty((*projections.shape[:2], nz), np.float32)
             slices_from_rows(projections, *self._levels(), slices)
-            joseph_cpu.adjoint(slices, self._rays, self._axes, result)
+            projections = slices
+        self._mean(projections, result, self._look_back)
         return result
+
+    def _mean(self, source: F32, out: F32, look: Callable[[F32, _Rays, F32], None]) -> None:
+        """The mean over the moments of an exposure of `look`, band by band of slices, from `source` into `out`."""
+        for band, looks in self._bands:
+            whole = band == slice(0, self.grid.shape[0])
+            part = source if whole else np.ascontiguousarray(source[..., band])
+            found = out if whole else np.empty((*out.shape[:2], part.shape[2]), np.float32)
+            look(part, looks[0], found)
+            if len(looks) > 1:
+                more = np.empty_like(found)
+                for rays in looks[1:]:
+                    look(part, rays, more)
+                    combine(1.0, found, 1.0, more, found)
+                combine(1 / len(looks), found, 0.0, found, found)
+            if not whole:
+                out[..., band] = found
+
+    def _look(self, volume: F32, rays: _Rays, out: F32) -> None:
+        if not self.geometry.is_straight:
+            posed_cpu.forward(volume, *rays, out)
+        elif self.geometry.is_cone:
+            cone_cpu.forward(volume, *rays, *self._heights(), self.geometry.pixel_pitch, out)
+        else:
+            joseph_cpu.forward(volume, *rays, out)
+
+    def _look_back(self, projections: F32, rays: _Rays, out: F32) -> None:
+        if not self.geometry.is_straight:
+            posed_cpu.adjoint(projections, *rays, out)
+        elif self.geometry.is_cone:
+            cone_cpu.adjoint(projections, *rays, *self._heights(), self.geometry.pixel_pitch, out)
+        else:
+            joseph_cpu.adjoint(projections, *rays, out)
+
+    def _spread(self, lines: F32) -> F32:
+        """Lines [view, col, row] with the width of a pixel; its own transpose."""
+        variance = self.geometry.width.variance
+        if variance == 0:
+            return lines
+        return spread(lines, np.full(len(lines), variance), variance)
 
     def _heights(self) -> tuple[NDArray[np.float64], float]:
         """The row on which z = 0 falls in each view, and the slice at z = 0."""
@@ -118,6 +167,11 @@ class Projector:
         step = self.geometry.pixel_pitch / self.grid.spacing[0]
         return middle - rows * step, step
 
+    def _to_rows(self) -> bool:
+        """The kernels give the rows of the detector, not lines of slices: slice k lies on row k of every view, or each
+        ray has a height of its own."""
+        return not self.geometry.is_straight or self.geometry.is_cone or self._on_rows()
+
     def _on_rows(self) -> bool:
         """Slice k lies on row k of every view."""
         first, step = self._levels()
@@ -125,6 +179,17 @@ class Projector:
         return nz == self.geometry.detector_shape[0] and bool(
             np.abs(first).max() < _ON_ROWS and abs(step - 1) * nz < _ON_ROWS
         )
+
+
+def moments(geometry: Geometry) -> list[Geometry]:
+    """The views at angles spread evenly over their exposures (midpoint rule); one where the stage stands."""
+    arc = geometry.width.arc
+    if arc == 0:
+        return [geometry]
+    travel = arc * geometry.reach / geometry.sample_pitch
+    count = min(max(2, math.ceil(travel / _LOOK)), _MOST_LOOKS)
+    turns = ((np.arange(count) + 0.5) / count - 0.5) * arc
+    return [replace(geometry, angles=geometry.angles + turn) for turn in turns]
 
 
 def volume_lines(volume: F32) -> F32:

@@ -122,6 +122,7 @@ def _fbp_of_each(residual: F32, signs: F32, views: Geometry) -> list[F32]:
     kinds = len(signs)
     if views.shifts[:, 1].any():
         return [fbp(np.asarray(residual * sign[:, None, None], np.float32), views, filter="hann") for sign in signs]
+    views = views.at_row((rows - 1) / 2)
     stacked = replace(views, detector_shape=(kinds * rows, cols), axis_row=(kinds * rows - 1) / 2)
     data = np.multiply(residual[:, None], signs.T[:, :, None, None], dtype=np.float32).reshape(-1, kinds * rows, cols)
     images = fbp(data, stacked, filter="hann")

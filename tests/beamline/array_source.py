@@ -24,6 +24,7 @@ class ArraySource:
     first_col = 0
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
+    row_period: float | None = None
     flags = None
     currents: NDArray[np.float64] | None = None
     replaces = None

@@ -8,7 +8,7 @@ from graphlib import TopologicalSorter
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from beamline.projections.steps.step import PlaceStep, PrepStep, ScanStep, StepDone, ViewStep, options_of
+from beamline.projections.steps.step import PlaceStep, PrepStep, RayStep, ScanStep, StepDone, ViewStep, options_of
 from drivers.plugins import plugins
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ REGISTRY: dict[str, str] = {
     "phase": "Phase",
     "jumps": "Jumps",
     "poses": "PosesOfFile",
+    "width": "Width",
     "rings": "Rings",
     "hardening": "Hardening",
 }
@@ -42,8 +43,10 @@ def registered() -> tuple[type[PrepStep], ...]:
 
     def fitting(name: str, step: type[PrepStep]) -> type[PrepStep]:
         own = {option.name for option in options_of(step).values()}
-        if step.name != name or not isinstance(step(), ViewStep | PlaceStep | ScanStep):
-            raise ValueError(f"{step.__name__} is no ViewStep, PlaceStep or ScanStep of the entry point's name")
+        if step.name != name or not isinstance(step(), ViewStep | PlaceStep | RayStep | ScanStep):
+            raise ValueError(
+                f"{step.__name__} is no ViewStep, PlaceStep, RayStep or ScanStep of the entry point's name"
+            )
         if own & taken or not names.issuperset(step.follows):
             raise ValueError(f"it has an option of another step ({own & taken}), or follows none of {sorted(names)}")
         taken.update(own)

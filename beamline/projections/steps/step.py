@@ -213,6 +213,18 @@ class PlaceStep(PrepStep, Protocol):
 
 
 @runtime_checkable
+class RayStep(PrepStep, Protocol):
+    """A step that says what the rays of each view saw beside their angle."""
+
+    def rays(self, source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, StepDone]:
+        """The geometry of these views with it, and what was done.
+
+        Raises:
+            ConfigError: the step does not fit the scan.
+        """
+
+
+@runtime_checkable
 class ScanStep(PrepStep, Protocol):
     """A step on all views of a scan."""
 

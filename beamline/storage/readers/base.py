@@ -59,6 +59,11 @@ class ScanSource(ABC):
     cone: tuple[float, float] | None = None
 
     @property
+    def row_period(self) -> float | None:
+        """s by which each row is exposed later than the one above; 0: all together, None: unknown."""
+        return None
+
+    @property
     def finished(self) -> bool:
         """No more frames will come. Ask before refresh(): refresh() then finds all frames."""
         return True

@@ -251,6 +251,13 @@ class NXtomoSource(ScanSource):
         return frozenset(self._altered)
 
     @property
+    def row_period(self) -> float | None:
+        devices = self._file.get("/entry/instrument/devices") if self._ours else None
+        with hdf5.readable(self.path):
+            said = [device["row_period"] for device in (devices or {}).values() if "row_period" in device]
+            return float(said[0][()]) if said else None
+
+    @property
     def plan(self) -> Mapping[str, Any]:
         try:
             plan = json.loads(hdf5.text_at(self._file, "/entry/record/plan") or "{}") if self._ours else {}

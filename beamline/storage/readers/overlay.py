@@ -132,6 +132,10 @@ class OverlaidSource(ScanSource):
         return out
 
     @property
+    def row_period(self) -> float | None:
+        return self._base.row_period
+
+    @property
     def plan(self) -> Mapping[str, Any]:
         return self._base.plan
 

@@ -89,6 +89,10 @@ class PartsSource(ScanSource):
         return self._sources[-1].finished
 
     @property
+    def row_period(self) -> float | None:
+        return self._sources[-1].row_period
+
+    @property
     def plan(self) -> Mapping[str, Any]:
         return self._sources[-1].plan
 

@@ -20,6 +20,7 @@ from recon.kernels.cpu.footprints import HU, INEXACT, RayCamera, footprint_table
 from recon.kernels.cpu.project import moments, render, render_layers
 from recon.kernels.cpu.rays import CpuRays
 from recon.kernels.cpu.voxelize import Layout
+from recon.kernels.cpu.wide_footprints import wide_footprints_backward, widen
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +69,11 @@ def camera(geometry: Geometry, view: int) -> RayCamera:
     """One view of a geometry as a camera of the kernels."""
     axes = geometry.axes(view).astype(np.float32)
     col, row = geometry.origin(view)
+    width = geometry.width.variance, geometry.width.arc / math.sqrt(12)
     if geometry.is_cone:
-        return RayCamera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, straight=False)
+        return RayCamera(axes, geometry.sdd / geometry.pixel_pitch, geometry.sod, col, row, False, *width)
     straight = bool(geometry.roll[view] == 0 and geometry.tilt[view] == 0)
-    return RayCamera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight)
+    return RayCamera(axes, 1 / geometry.pixel_pitch, 0.0, col, row, straight, *width)
 
 
 def view_table(active: Active, geometry: Geometry, view: int, faint: float, sigmas: float) -> F32:
@@ -128,11 +130,16 @@ class RenderedView:
     def backward(self, gradient: F32, into: Gradients, centres: F32) -> None:
         """Add an image gradient [row, col] to `into`; `centres` [n, 2] receives the gradient in pixels."""
         a, table = self.active, self.scratch.table
-        footprints_backward(
-            table, moments(table, gradient, self.scratch.moments, a.kernel), a.means, a.scales, a.rotations,
-            a.densities, self.camera, into.means, into.log_scales, into.rotations, into.densities, centres,
-            length=self.length, kernel=a.kernel,
-        )  # fmt: skip
+        under = moments(table, gradient, self.scratch.moments, a.kernel)
+        added = into.means, into.log_scales, into.rotations, into.densities
+        if self.camera.is_wide:
+            parameters = a.means, a.scales, a.rotations
+            wide_footprints_backward(table, under, parameters, self.camera, added, centres, a.kernel)
+        else:
+            footprints_backward(
+                table, under, a.means, a.scales, a.rotations, a.densities, self.camera, *added, centres,
+                length=self.length, kernel=a.kernel,
+            )  # fmt: skip
         if self.rays is None:
             return
         some, moved = Gradients.zeros(self.exact.size), np.empty((self.exact.size, 2), np.float32)
@@ -168,6 +175,8 @@ def render_view(
         a.means, a.scales, a.rotations, a.densities, projection, faint, sigmas, buffers.table,
         length=length, exact_above=chosen.exact_above, kernel=a.kernel,
     )  # fmt: skip
+    if projection.is_wide:
+        widen(buffers.table, a.means, projection, faint, sigmas, a.kernel)
     render(buffers.table, picture, buffers.layers, a.kernel)
     exact, rays = np.empty(0, np.intp), None
     if geometry.is_cone and chosen.exact_above < math.inf:

@@ -69,6 +69,8 @@ class RayCamera(NamedTuple):
         sod: mm from the source to the rotation axis; 0: parallel beam.
         col, row: pixel of the object's origin.
         straight: parallel beam without roll and tilt, which saves a third of the work.
+        spread: variance in px² along columns and rows, and
+        travel: radians, that `cpu.wide_footprints` adds to footprints; 0: rays without a width.
     """
 
     axes: F32
@@ -77,6 +79,12 @@ class RayCamera(NamedTuple):
     col: float
     row: float
     straight: bool
+    spread: float = 0.0
+    travel: float = 0.0
+
+    @property
+    def is_wide(self) -> bool:
+        return self.spread > 0 or self.travel > 0
 
 
 @njit(inline="always", fastmath=True)

@@ -57,6 +57,8 @@ class GpuView:
     """One rendered view: its image [row, col] and its backward pass."""
 
     def __init__(self, run: GpuPass, geometry: Geometry, view: int, faint: float, cut: float, model: RayModel) -> None:
+        if geometry.width:
+            raise ValueError(f"rays with a width ({geometry.width}) are projected on the CPU only: use device 'cpu'")
         self._run, self._geometry, self._view, self._length = run, geometry, view, model.length(geometry)
         self.footprints = footprints(
             *run.active, geometry, view, faint, cut, self._length, model.exact_above, run.kernel

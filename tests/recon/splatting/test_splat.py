@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.ray_model import RayModel, Truncation
+from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.kernels.cpu.engine import Active, Gradients, Scratch, render_view
 from recon.splatting.gaussians import Gaussians
@@ -33,6 +35,7 @@ TURNED = {
     "roll": (0.2, -0.1, 0.0, 0.05),
     "tilt": -0.3,
 }
+WIDE = RayWidth(pixel=1, blur=0.6, arc=0.3)
 # Every way to a projection: a beam and what a Gaussian gives a ray of it.
 STRAIGHT = Geometry.parallel(ANGLES, SHAPE, 0.5, 13.3)
 LEANING = Geometry.parallel(ANGLES, SHAPE, 0.5, 13.3, **TURNED)
@@ -45,6 +48,10 @@ PATHS = {
     "cone, all exact": (CONE, RayModel(exact_above=0.0)),
     "straight, plain": (STRAIGHT, RayModel(rectified=False)),
     "cone, plain": (CONE, RayModel(rectified=False)),
+    "straight, wide": (STRAIGHT.seen_with(WIDE), RayModel()),
+    "straight, pixels alone": (STRAIGHT.seen_with(RayWidth(pixel=1)), RayModel()),
+    "leaning, wide": (LEANING.seen_with(WIDE), RayModel()),
+    "cone, wide": (CONE.seen_with(WIDE), RayModel()),
 }
 
 
@@ -109,6 +116,28 @@ def test_cpu_projection_and_gradients_equal_the_reference(
     for name, gradient in gradients(double).items():
         off = (gradients(fast)[name] - gradient).abs().max()
         assert float(off) < 2e-5 * float(gradient.abs().max()), name
+
+
+@pytest.mark.parametrize("beam", [STRAIGHT, LEANING, CONE], ids=["straight", "leaning", "cone"])
+def test_a_width_is_the_mean_over_pixels_and_angles(beam: Geometry, random_gaussians: Make) -> None:
+    # Rays without a width, many within each pixel and within the exposure. What is left of their difference are moments
+    # beyond the second, and that a Gaussian itself turns.
+    g, width, n = in_double(random_gaussians()), RayWidth(pixel=1, arc=0.1), 6
+    fine = replace(
+        beam, detector_shape=(SHAPE[0] * n, SHAPE[1] * n), pixel_pitch=beam.pixel_pitch / n,
+        axis_col=(beam.axis_col + 0.5) * n - 0.5, axis_row=(beam.axis_row + 0.5) * n - 0.5, shifts=beam.shifts * n,
+    )  # fmt: skip
+    mean = torch.zeros((4, *SHAPE), dtype=torch.float64)
+    for turn in (np.arange(8) + 0.5) / 8 - 0.5:
+        images = project(g, replace(fine, angles=fine.angles + turn * width.arc))
+        mean += images.reshape(4, SHAPE[0], n, SHAPE[1], n).mean((2, 4)) / 8
+    sharp, found = project(g, beam), project(g, beam.seen_with(width))
+    assert float((found - mean).detach().norm()) < 0.15 * float((sharp - mean).detach().norm())
+
+
+def test_a_width_and_the_uncorrected_factor_are_refused(random_gaussians: Make) -> None:
+    with pytest.raises(ValueError, match="corrected factor"):
+        project(random_gaussians(), STRAIGHT.seen_with(RayWidth(pixel=1)), model=RayModel(rectified=False))
 
 
 def test_the_choice_of_exact_rays_is_a_choice(random_gaussians: Make) -> None:

@@ -1,0 +1,42 @@
+"""RayWidth: what one pixel sees beside its central ray, while one view is exposed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class RayWidth:
+    """How far a pixel's signal is spread on the detector, and how far the stage turns meanwhile; 0: a ray.
+
+    Attributes:
+        pixel: side in pixels of the square over which a pixel averages; 1: its own area.
+        blur: standard deviation in pixels of a Gaussian blur of the detector (scintillator, optics).
+        arc: radians that the stage turns during an exposure; a view's angle is that of the middle of its exposure.
+    """
+
+    pixel: float = 0.0
+    blur: float = 0.0
+    arc: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("pixel", "blur", "arc"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} of a ray's width must be finite and 0 or more, got {value}")
+
+    def __bool__(self) -> bool:
+        return self.variance > 0 or self.arc > 0
+
+    @property
+    def variance(self) -> float:
+        """Of the spread along columns, and along rows, in px²."""
+        return self.pixel**2 / 12 + self.blur**2
+
+    def binned(self, factor: int) -> RayWidth:
+        """The same in pixels of factor x factor; a pixel's own area becomes that of the binned one."""
+        return replace(self, blur=self.blur / factor)
+
+
+NO_WIDTH = RayWidth()

@@ -1,0 +1,121 @@
+"""The width of rays: asked for, or the motion that the file of a fly scan states."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.projections.selection import Selection, geometry_of
+from beamline.projections.steps.step import StepDone, options_of
+from beamline.projections.steps.width import Width
+from beamline.simulate.scene_file import Scan, open_scene
+from beamline.simulate.write import write_scan
+from beamline.storage.readers.open import open_scan
+from recon.base.geometry import Geometry
+from simulators.devices.clock import VirtualClock
+from tests.beamline.array_source import ArraySource
+
+SHAPE = (64, 200)
+STEP, PERIOD, EXPOSURE, ROW = math.radians(2), 0.5, 0.4, 1e-3
+ARC, SKEW = math.radians(1.6), math.radians(4e-3)  # in an exposure, and from row to row
+
+
+def _source(mode: str = "fly", sense: float = 1.0, row_period: float | None = ROW, exposure: float = EXPOSURE) -> Any:
+    keys = [2, 1, *[0] * 90]
+    angles = np.r_[np.nan, np.nan, sense * STEP * np.arange(90)]
+    angles[50] = np.nan  # of a view without an angle
+    source: Any = ArraySource(np.zeros((92, *SHAPE), np.uint16), keys, angles, np.r_[1.0, 1.0, np.full(90, exposure)])
+    source.plan, source.attributes, source.row_period = {"mode": mode}, {"period_s": PERIOD}, row_period
+    return source
+
+
+def _rays(step: Width, source: Any, selection: Selection | None = None) -> tuple[Geometry, Geometry, StepDone]:
+    chosen = selection or Selection()
+    before = geometry_of(source, chosen, 100.0, np.arange(0.0, 3.0, 0.1))
+    return before, *step.rays(source, chosen, before)
+
+
+def test_nothing_is_changed_by_default_where_the_stage_stood_or_hardly_moved() -> None:
+    unknown = _source()
+    unknown.exposures[:] = np.nan
+    for source in (_source("step"), _source(exposure=0.01), unknown):
+        before, after, done = _rays(Width(), source)
+        assert after is before and (done.said, done.parameters) == ("", {})
+    before, after, _ = _rays(Width(arc="none"), _source())
+    assert after is before
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_the_file_of_a_fly_scan_tells_its_motion(sense: float) -> None:
+    before, after, done = _rays(Width(), _source(sense=sense))
+    assert after.width.arc == pytest.approx(ARC) and after.width.variance == 0
+    assert after.skew == pytest.approx(sense * SKEW)
+    np.testing.assert_allclose(after.angles, before.angles + sense * ARC / 2)
+    assert done.said == (
+        "In the model of the views a view is the mean over 1.6 degrees (2.8 px at the edge of the field), the last row "
+        f"sees {sense * 0.25:.2g} degrees more than the first."
+    )
+    assert done.parameters == {
+        "ray_width": "none",
+        "exposure_arc_deg": pytest.approx(sense * 1.6),
+        "row_skew_deg": pytest.approx(sense * 0.252),
+    }
+
+
+def test_rows_and_bins_see_the_angles_of_their_rows() -> None:
+    whole = _rays(Width(), _source())[1]
+    part = _rays(Width(), _source(), Selection(rows=(10, 50), binning=4))[1]
+    np.testing.assert_allclose(part.angles, whole.rows(10, 50).binned(4).angles)
+    assert part.skew == pytest.approx(4 * SKEW)
+
+
+def test_a_motion_may_be_given_and_the_last_row_read_first() -> None:
+    before, after, _ = _rays(Width(arc="0.8:-0.63"), _source("step", row_period=None))
+    assert after.width.arc == pytest.approx(math.radians(0.8))
+    assert after.skew == pytest.approx(-math.radians(0.01))
+    np.testing.assert_allclose(after.angles, before.angles + math.radians(0.4))
+    backwards = _rays(Width(arc="0.8:-0.63"), _source("step", sense=-1))[1]  # the stage turned the other way
+    assert backwards.skew == pytest.approx(math.radians(0.01))
+
+
+def test_a_pixel_has_its_area_and_blur() -> None:
+    before, after, done = _rays(Width("0.6", "none"), _source(), Selection(binning=2))
+    assert (after.width.pixel, after.width.blur, after.skew) == (1, 0.3, 0)
+    np.testing.assert_array_equal(after.angles, before.angles)
+    assert done.said == "In the model of the views a pixel has its own area and a blur of 0.6 px."
+
+
+def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:
+    source = _source()
+    source.cone, source.pixel_size_mm = (100.0, 150.0), 0.01
+    _, after, _ = _rays(Width(), source)
+    assert after.width.arc > 0 and after.skew == 0
+    with pytest.raises(ConfigError, match="is a cone"):
+        _rays(Width(arc="1:0.1"), source)
+
+
+@pytest.mark.parametrize("words", [{"spread": "wide"}, {"spread": "-1"}, {"arc": "-1"}, {"arc": "1:2:3"}, {"arc": "x"}])
+def test_other_words_are_refused(words: dict[str, str]) -> None:
+    (field, text), options = *words.items(), options_of(Width)
+    with pytest.raises(ValueError, match="is neither"):
+        options[field].parse(text)
+
+
+@pytest.mark.parametrize("effects", [["motion_blur", "rolling_shutter"], []])
+def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: list[str]) -> None:
+    sizes = ["detector.shape=[4, 16]", "scan.views=6", "scan.darks=1", "scan.flats=1", "phantom.n_particles=5"]
+    scene = open_scene("fast_fly", [*sizes, f"effects={effects}"])
+    scan = Scan.of(scene.scene)
+    write_scan(scene, scan, tmp_path / "scan.h5", lambda _: None, VirtualClock(), lambda: False)
+    with open_scan(tmp_path / "scan.h5") as source:
+        geometry = geometry_of(source, Selection(), 7.5, source.angles[2:])
+        seen, done = Width(arc="auto").rays(source, Selection(), geometry)
+        assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
+    moved = math.radians(180) / 6 / scan.period * 0.012
+    assert seen.width.arc == pytest.approx(moved if effects else 0)
+    assert (done.said != "") == bool(effects)
