@@ -23,9 +23,7 @@ class RunValues:
     run: str = _pv("Run", "folder of the run", "")
     sample: str = _pv("SampleName", "name of the sample", "")
     file: str = _pv("FileName", "scan file", "")
-    state: str = _pv(
-        "ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done ...", "idle"
-    )
+    state: str = _pv("ScanStatus", "idle, preparing, darks, flats, acquiring, paused, done ...", "idle")
     message: str = _pv("Message", "what the scan said last", "")
     planned: int = _pv("ImagesPlanned", "frames that the scan takes in all", -1)
     exposed: int = _pv("ImagesCollected", "frames exposed", 0)
