@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.storage.writers.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from beamline.storage.writers.recon_file import Value
-from recon.base.geometry import Geometry
+from recon.base.geometry import arrays_of
 from recon.splatting.checkpoint import state_from
 from recon.splatting.optimise import FitState
 
@@ -38,7 +38,7 @@ def origin_of(prepared: PreparedProjections, settings: Any, others: Mapping[str,
         "n_views": prepared.geometry.n_views,
         "length_unit": prepared.length_unit,
     }
-    out |= {f.name: np.asarray(getattr(prepared.geometry, f.name)) for f in fields(Geometry)}
+    out |= arrays_of(prepared.geometry)
     out |= {f"setting {name}": str(value) for name, value in asdict(settings).items()}
     return out | {f"setting {name}": value for name, value in others.items()}
 

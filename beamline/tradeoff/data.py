@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.files import named_on_failure
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
 
 F32 = NDArray[np.float32]
 
@@ -71,11 +71,8 @@ def geometry_in(path: Path) -> Geometry:
 
 
 def _geometry_arrays(prefix: str, geometry: Geometry) -> dict[str, NDArray[Any]]:
-    return {f"{prefix}.{f.name}": np.asarray(getattr(geometry, f.name)) for f in fields(Geometry)}
+    return {f"{prefix}.{name}": array for name, array in arrays_of(geometry).items()}
 
 
 def _geometry(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Geometry:
-    values: dict[str, Any] = {f.name: arrays[f"{prefix}.{f.name}"] for f in fields(Geometry)}
-    rows, cols = values.pop("detector_shape").tolist()
-    plain = {name: value.item() if value.ndim == 0 else value for name, value in values.items()}
-    return Geometry(detector_shape=(rows, cols), **plain)
+    return geometry_of_arrays({f.name: arrays[f"{prefix}.{f.name}"] for f in fields(Geometry)})

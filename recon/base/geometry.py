@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -319,6 +319,20 @@ class Geometry:
             width=self.width.binned(factor),
             skew=self.skew * factor,
         )
+
+
+def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:
+    """All values of a geometry as arrays, by name; `geometry_of_arrays` makes it of them."""
+    values = {each.name: getattr(geometry, each.name) for each in fields(Geometry)}
+    return {name: np.asarray(astuple(v) if isinstance(v, RayWidth) else v) for name, v in values.items()}
+
+
+def geometry_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> Geometry:
+    """The geometry of `arrays_of`."""
+    values: dict[str, Any] = {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
+    rows, cols = values.pop("detector_shape").tolist()
+    width = RayWidth(*values.pop("width").tolist())
+    return Geometry(detector_shape=(rows, cols), width=width, **values)
 
 
 def _checked(

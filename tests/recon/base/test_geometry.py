@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.base.geometry import Geometry
+from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
+from recon.base.ray_width import NO_WIDTH, RayWidth
 from recon.base.volume import Grid, Volume
 from recon.splatting.problem import binned_geometry
 
@@ -282,3 +283,15 @@ def test_views_half_a_turn_apart_bring_nothing_new_only_where_they_see_the_same_
     beside, moved = parallel(axis_col=2.0), parallel(shifts=np.tile([12.0, 0.0], (12, 1)))
     for other in (beside, moved, parallel(tilt=0.1), Geometry.cone(angles, (4, 40), 1.0, 50.0, 100.0)):
         assert other.period == pytest.approx(2 * np.pi)
+
+
+def test_arrays_hold_all_of_a_geometry() -> None:
+    one = Geometry.cone([0.0, 1.0], (4, 6), 0.2, 50, 90, 2.2, shifts=[(1, 2), (3, 4)], roll=0.1, tilt=[0.2, 0.3])
+    for geometry in (
+        one.seen_with(RayWidth(1.0, 0.5, 0.01)),
+        Geometry.parallel([1.0], (3, 3)).seen_with(NO_WIDTH, 1e-4),
+    ):
+        found = geometry_of_arrays(arrays_of(geometry))
+        for name, value in arrays_of(found).items():
+            np.testing.assert_array_equal(value, arrays_of(geometry)[name])
+        assert found.width == geometry.width and all(array.dtype != object for array in arrays_of(found).values())
