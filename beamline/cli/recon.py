@@ -114,6 +114,12 @@ _SHEET = ".png"
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
 @heading(OUTPUT)
 @click.option(
+    "--uncertainty",
+    is_flag=True,
+    help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv and "
+    "fbp, into an .h5.",
+)
+@click.option(
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use."
 )
 @click.option(
@@ -206,6 +212,7 @@ def recon(
     ramp: Filter,
     max_residual: float | None,
     seed: int,
+    uncertainty: bool,
     truth: str | None,
     output: Path | None,
     report: bool,
@@ -263,6 +270,11 @@ def recon(
         (partial and follow, f"--resume {resume} holds slabs of a finished scan; it does not go with --follow."),
         (dry and whole, "--dry-run does not go with --follow or --budget, which says the time itself."),
         (cluster and whole, "--cluster does not go with --follow or --budget, which hold everything in memory."),
+        (
+            uncertainty and (whole or tries or settings["seconds"] is not None),
+            "--uncertainty does not go with --follow, --budget, --seconds or --axis try: refits need the whole scan "
+            "and time of their own.",
+        ),
         (roi and (follow or truth or tries), "--roi does not go with --follow, --truth or --axis try."),
         (tries and follow, "--axis try is for a finished scan: it needs all views."),
         (
@@ -295,6 +307,7 @@ def recon(
         region=roi,
         cluster=cluster,
         partial=partial,
+        uncertainty=uncertainty,
         command=repeating(context, file, output, () if partial is None else ("resume",)),
         recipe=recipe_text(context, method),
     )
