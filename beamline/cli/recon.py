@@ -29,7 +29,7 @@ from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done, Event, FitReached, VolumeDone
+from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
 from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
@@ -328,7 +328,8 @@ def recon(
 
     def made(event: Event) -> None:
         """From the first step or iteration on there is a volume; what has a unit is a trial, or slices."""
-        if isinstance(event, FitReached) and not event.unit:
+        of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
+        if of_bars or (isinstance(event, FitReached) and not event.unit):
             stop.ready = True
 
     with events_shown(as_json) as usual:

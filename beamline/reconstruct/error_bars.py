@@ -54,6 +54,8 @@ def deviation_of(
         ValueError: as `recon.error_bars.error_bars`.
     """
     found = _bars(method, prepared, options, volume, decided, control)
+    if control.should_stop is not None and control.should_stop():  # a direct method does not ask
+        return None
     return None if found is None else Volume(found.deviation, volume.grid)
 
 
@@ -82,7 +84,7 @@ def deviation_by_slabs(
             continue
         here = Volume(np.ascontiguousarray(volume.data[slab.slices]), box)
         found = _bars(method, part, options, here, decided, control)
-        if found is None:
+        if found is None or (control.should_stop is not None and control.should_stop()):
             return None
         decided = found.decided
         for z, share, values in zip(range(*slab.slices.indices(len(out))), slab.share, found.deviation, strict=True):

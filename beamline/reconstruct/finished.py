@@ -270,6 +270,8 @@ def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decid
     if "ended_early" in made.settings:
         job.warn("Left out, as the reconstruction was stopped: the error bars.")
         return made
+    said = "The volume is there; its error bars follow. Ctrl-C leaves them out."
+    job.sink(StateEntered("error_bars", said, time=job.clock.now()))
     method = made_by(job.options.method_for(job.prepared.geometry), made.method)
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
     given = made.volume, method, job.prepared, job.options
