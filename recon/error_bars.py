@@ -24,6 +24,7 @@ from recon.voxels.projector import Projector
 
 HALO = 8
 """Slices beside a slab, at least, that its error bars need."""
+LEAST_VIEWS = 8
 
 _TILT = 0.5  # half of the views weigh so much more, the others so much less
 _SHARE = 0.2  # of a method's iterations, in each of two refits: both take half the time of its iterations
@@ -81,10 +82,8 @@ def error_bars(
     if factors is None:
         known = ", ".join(with_trait("error_bars"))
         raise ValueError(f"the error bars of {method.name} are not calibrated; they are of {known}")
-    if geometry.n_views < 8:
-        raise ValueError(
-            f"error bars come from two halves of the views, four each at least; here are {geometry.n_views}"
-        )
+    if geometry.n_views < LEAST_VIEWS:
+        raise ValueError(f"error bars need {LEAST_VIEWS} views, in two halves; here are {geometry.n_views}")
     made: Mapping[str, Sequence[Any]] = {}
     if method.traits.direct:
         difference = _alternating(method, problem)
@@ -95,9 +94,10 @@ def error_bars(
         difference, made = found
     gradient = _gradient(volume.data)
     decide = Decisions(problem.seed, decided)
-    limits = decide(_LIMITS, lambda: _limits(gradient))
+    classes = 1 if method.traits.direct else _CLASSES  # the noise of FBP knows no edges
+    limits = decide(_LIMITS, lambda: _limits(gradient, classes))
     np.square(difference, out=difference)
-    variance = _averaged(difference, np.searchsorted(limits, gradient).astype(np.uint8))
+    variance = _averaged(difference, gradient, limits)
     variance *= np.float32(factors[0] ** 2)
     variance += np.square(np.multiply(gradient, np.float32(factors[1]), out=gradient), out=gradient)
     return ErrorBars(np.sqrt(variance, out=variance), {**made, **decide.made})
@@ -197,17 +197,19 @@ def _gradient(volume: F32) -> F32:
     return np.sqrt(total, out=total)
 
 
-def _limits(gradient: F32) -> list[float]:
+def _limits(gradient: F32, classes: int) -> list[float]:
     some = gradient.reshape(-1)[:: max(1, gradient.size // _SAMPLED)]
-    return [float(limit) for limit in np.percentile(some, np.linspace(0, 100, _CLASSES + 1)[1:-1])]
+    return [float(limit) for limit in np.percentile(some, np.linspace(0, 100, classes + 1)[1:-1])]
 
 
-def _averaged(squares: F32, classes: Any) -> F32:
-    """The mean of the squares over a window, of the voxels of the same class alone."""
-    out = np.empty_like(squares)
-    for k in range(_CLASSES):
-        here = classes == k
-        weight = uniform_filter(here.astype(np.float32), _WINDOW)
-        total = uniform_filter(np.where(here, squares, np.float32(0)), _WINDOW)
-        np.divide(total, weight, out=out, where=here)
+def _averaged(squares: F32, gradient: F32, limits: Sequence[float]) -> F32:
+    """The mean of the squares over a window, of the voxels between the same limits of the gradient alone."""
+    if not limits:
+        out = uniform_filter(squares, _WINDOW)
+    else:
+        out, classes = np.empty_like(squares), np.searchsorted(limits, gradient).astype(np.uint8)
+        for k in range(len(limits) + 1):
+            here = classes == k
+            total = uniform_filter(np.where(here, squares, np.float32(0)), _WINDOW)
+            np.divide(total, uniform_filter(here.astype(np.float32), _WINDOW), out=out, where=here)
     return np.maximum(out, 0, out=out)  # sums that run along a line end a little below zero

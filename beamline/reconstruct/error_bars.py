@@ -15,11 +15,13 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slab_run import busiest_first
 from beamline.storage.scratch import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
+from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of
 from recon.base.slabs import Slab, part_of, slabs_of
 from recon.base.volume import Grid, Volume
-from recon.error_bars import HALO, ErrorBars, error_bars
+from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
 from recon.methods import with_trait
+from recon.splatting.fit_method import FitMethod
 
 Made = Mapping[str, Sequence[Any]]
 
@@ -36,6 +38,20 @@ def refuse_impossible(options: ReconOptions) -> None:
         raise ConfigError(
             f"--uncertainty writes a second volume into the same file: give -o "
             f"{options.target.output.with_suffix('.h5')}, and export each of the two with --dataset."
+        )
+
+
+def refuse_views(method: Method, geometry: Geometry) -> None:
+    """Raise ConfigError before the work where these views allow no error bars."""
+    if geometry.n_views < LEAST_VIEWS:
+        raise ConfigError(
+            f"--uncertainty parts the views into two halves and needs {LEAST_VIEWS} at least; here are "
+            f"{geometry.n_views}. Leave it out, or take more views."
+        )
+    if isinstance(method, FitMethod) and method.finish_sweeps(geometry) == 0:
+        raise ConfigError(
+            f"--uncertainty refits on voxels, and {method.name} has no finish there with --finish 0, or with rolled or "
+            "tilted views. Leave one of them out."
         )
 
 

@@ -23,7 +23,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
-from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by, refuse_impossible
+from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by, refuse_impossible, refuse_views
 from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
@@ -83,6 +83,8 @@ def reconstruct_file(
         facts, options = facts_of(source), options.around_region(source)
         prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
     selection = options.selection
+    if options.uncertainty:
+        refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not slabs:
         warn("The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs.")
     if options.stops_early and prepared.held_out is None:
@@ -268,7 +270,7 @@ class _Job:
 def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decided: Decisions) -> ReconOutcome:
     """The outcome with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
     if "ended_early" in made.settings:
-        job.warn("Left out, as the reconstruction was stopped: the error bars.")
+        job.warn("The error bars were left out, as the reconstruction was stopped.")
         return made
     said = "The volume is there; its error bars follow. Ctrl-C leaves them out."
     job.sink(StateEntered("error_bars", said, time=job.clock.now()))
@@ -279,13 +281,16 @@ def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decid
     def say(text: str) -> None:
         job.sink(StateEntered("slab", text, time=job.clock.now()))
 
-    with job.refused(f" with error bars by {method.name}"):
+    why = "as they were stopped"
+    try:
         if slabs:
             found = deviation_by_slabs(*given, slabs, decided.made, control, say)
         else:
             found = deviation_of(*given, decided.made, control)
+    except ValueError as error:  # hours may be in the volume
+        found, why = None, str(error)
     if found is None:
-        job.warn("Left out, as it was stopped: the error bars. The volume is whole.")
+        job.warn(f"The error bars were left out: {why}. The volume is whole.")
         return made
     assert method.traits.error_bars is not None
     settings = dict(zip(("error_bars_spread", "error_bars_gradient"), method.traits.error_bars, strict=True))

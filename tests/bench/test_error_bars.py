@@ -31,9 +31,10 @@ from tests.bench.quality_cases import Case, dense_battery, slab
 pytestmark = pytest.mark.bench
 ROWS = 20
 METHODS: dict[str, recon.Method] = {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(), "r2": recon.R2()}
-# Sample, views, photons a pixel. The factors were chosen on the first four; the others have had no part in it.
+# Sample, views, photons a pixel. The first are of the twelve scans that the factors were chosen on (grains, thorax,
+# foam, shell, battery and kernel, 60 to 180 views); the others, with a sample more, had no part in it.
 CHOSEN = [("grains", 90, 5000), ("thorax", 90, 5000), ("foam", 120, 5000), ("shell", 60, 3000)]
-CHECKED = [("battery", 180, 3000), ("grains", 180, 1000), ("kernel", 120, 4000), ("thorax", 180, 2000)]
+CHECKED = [("battery", 180, 3000), ("teapot", 120, 5000), ("kernel", 120, 4000), ("thorax", 180, 2000)]
 
 
 def few_rows(case: Case) -> Case:
@@ -89,7 +90,7 @@ def test_voxels_of_the_truth_within_one_deviation(shared_data: Path, name: str, 
             f"\n{name:8s} {views:4d} views {photons:6.0f} photons {label:9s} {said}  time x {1 + bars / run:.2f}",
             end="",
         )
-        assert all(0.3 < share for share in shares.values())
+        assert all(share > 0.3 for share in shares.values())
         assert method.traits.direct or bars < run
 
 
@@ -118,7 +119,7 @@ def test_volumes_of_balls_within_their_intervals(seed: int, views: int, photons:
     clean = Projector(Geometry.parallel(angles, (80, 192), 0.5), Grid(truth.shape, 0.5)).forward(truth)
     counts = photons * np.exp(-2 / clean.max() * clean).reshape(views, 40, 2, 96, 2).mean(axis=(2, 4))
     geometry = Geometry.parallel(angles, (40, 96), 1.0)
-    box = slice(0, 40), slice(14, 82), slice(14, 82)
+    box, corner = (slice(0, 40), slice(14, 82), slice(14, 82)), np.array([0.5, 14.5, 14.5])
     for label, method in {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(tv_weight=3e-3)}.items():
         errors: list[float] = []
         for repeat in range(4):
@@ -138,7 +139,7 @@ def test_volumes_of_balls_within_their_intervals(seed: int, views: int, photons:
             for place, size, deviation, cut in zip(
                 particles.centroid, particles.volume, half, particles.cut, strict=True
             ):
-                away = [float(np.linalg.norm(place + (0.5, 14.5, 14.5) - centre)) for centre, _ in known]
+                away = [float(np.linalg.norm(place + corner - centre)) for centre, _ in known]
                 nearest = int(np.argmin(away))
                 if not cut and away[nearest] < 1.5:
                     errors.append(abs(size - 4 / 3 * np.pi * known[nearest][1] ** 3) / deviation)

@@ -100,7 +100,7 @@ def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: py
     monkeypatch.setattr("recon.error_bars.solve", interrupted)
     result = beamline(*FISTA, "-o", "out.h5")
     assert result.exit_code == 0, result.output
-    assert "Left out, as it was stopped: the error bars." in result.stderr
+    assert "The error bars were left out: as they were stopped." in result.stderr
     record = read_reconstruction(Path("out.h5"))
     assert record.deviation is None and record.volume.data.any() and "ended_early" not in record.parameters
 
@@ -118,10 +118,12 @@ def test_memory_of_the_dry_run_counts_it(folder: Path) -> None:
     [
         (("-m", "sirt"), "--uncertainty is calibrated for r2, fbp, fista-tv"),
         (("-m", "fbp", "-o", "out.tif"), "give -o out.h5"),
+        (("-m", "r2", "--finish", "0"), "r2 has no finish there with --finish 0"),
+        (("-m", "fbp", "--views", "fixed:6"), "needs 8 at least; here are 6"),
         (("-m", "r2", "--seconds", "5"), "--uncertainty does not go with"),
         (("-m", "r2", "--follow"), "--uncertainty does not go with"),
     ],
-    ids=["sirt", "tif", "seconds", "follow"],
+    ids=["sirt", "tif", "finish", "views", "seconds", "follow"],
 )
 def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options: tuple[str, ...], why: str) -> None:
     result = beamline("recon", "scan.h5", "--uncertainty", *options)
