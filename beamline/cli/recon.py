@@ -29,7 +29,7 @@ from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
-from beamline.core.events import Done, Event, FitReached, VolumeDone
+from beamline.core.events import Done, Event, FitReached, StateEntered, VolumeDone
 from beamline.core.files import write_whole
 from beamline.core.signals import StopOnSignal
 from beamline.core.sinks import fan_out
@@ -113,6 +113,12 @@ _SHEET = ".png"
 @heading(METHOD)
 @click.option("--seed", type=SEED, default=0, show_default=True, help="Seed of all random numbers.")
 @heading(OUTPUT)
+@click.option(
+    "--uncertainty",
+    is_flag=True,
+    help="Write the standard deviation of each voxel, too, from two refits of halves of the views; by r2, fista-tv and "
+    "fbp, into an .h5.",
+)
 @click.option(
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use."
 )
@@ -206,6 +212,7 @@ def recon(
     ramp: Filter,
     max_residual: float | None,
     seed: int,
+    uncertainty: bool,
     truth: str | None,
     output: Path | None,
     report: bool,
@@ -263,6 +270,11 @@ def recon(
         (partial and follow, f"--resume {resume} holds slabs of a finished scan; it does not go with --follow."),
         (dry and whole, "--dry-run does not go with --follow or --budget, which says the time itself."),
         (cluster and whole, "--cluster does not go with --follow or --budget, which hold everything in memory."),
+        (
+            uncertainty and (whole or tries or settings["seconds"] is not None),
+            "--uncertainty does not go with --follow, --budget, --seconds or --axis try: refits need the whole scan "
+            "and time of their own.",
+        ),
         (roi and (follow or truth or tries), "--roi does not go with --follow, --truth or --axis try."),
         (tries and follow, "--axis try is for a finished scan: it needs all views."),
         (
@@ -295,6 +307,7 @@ def recon(
         region=roi,
         cluster=cluster,
         partial=partial,
+        uncertainty=uncertainty,
         command=repeating(context, file, output, () if partial is None else ("resume",)),
         recipe=recipe_text(context, method),
     )
@@ -315,7 +328,8 @@ def recon(
 
     def made(event: Event) -> None:
         """From the first step or iteration on there is a volume; what has a unit is a trial, or slices."""
-        if isinstance(event, FitReached) and not event.unit:
+        of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
+        if of_bars or (isinstance(event, FitReached) and not event.unit):
             stop.ready = True
 
     with events_shown(as_json) as usual:

@@ -98,6 +98,7 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     heights = [slab.slices.stop - slab.slices.start for slab in left]
     extent = Extent(needs.geometry.n_views, shape[2], heights, decided=options.partial is not None)
     seconds = run_seconds(needs.method, extent, clock.now) if left else 0.0
+    seconds *= 1 + options.uncertainty  # error bars take at most as long as the volume
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in left)
     height = slabs[0].own.stop
     return Estimate(

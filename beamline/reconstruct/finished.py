@@ -23,6 +23,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.budget import within
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.cluster import connected, refuse_unusable
+from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, made_by, refuse_impossible, refuse_views
 from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
@@ -33,6 +34,7 @@ from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
 from drivers.base.clock import Clock
+from recon.base.decisions import Decisions
 from recon.base.method import CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
@@ -63,6 +65,8 @@ def reconstruct_file(
     options.checkpoints.refuse_existing()
     check_device(options.device)
     _refuse_foreign(options)
+    if options.uncertainty:
+        refuse_impossible(options)
     if options.cluster is not None:
         refuse_unusable(options.cluster)  # now, before the correction of the scan
     wanted = None if options.truth is None else read_truth(options.truth)
@@ -79,6 +83,8 @@ def reconstruct_file(
         facts, options = facts_of(source), options.around_region(source)
         prepared, slabs = prepare_within(source, options, sink, clock, warn, phases)
     selection = options.selection
+    if options.uncertainty:
+        refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not slabs:
         warn("The volume fits into the memory and is made here, without --cluster; a smaller --memory makes slabs.")
     if options.stops_early and prepared.held_out is None:
@@ -87,7 +93,8 @@ def reconstruct_file(
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
         sink(StateEntered("held_out", message, time=clock.now()))
     volume = 4 * math.prod(Grid.matching(prepared.geometry).shape)
-    options.target.require_room(*(options.disk_needs(volume) if slabs else (volume * options.target.written, 0)))
+    volumes = volume * options.target.written * (1 + options.uncertainty)
+    options.target.require_room(*(options.disk_needs(volume) if slabs else (volumes, 0)))
     if wanted is not None:  # before the work
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
@@ -104,13 +111,18 @@ def reconstruct_file(
             options = replace(options, method=method)
         # A direct method and a slab have no volume so far: a signal interrupts them.
         stopping = never_stopped if options.method.traits.direct or slabs else stop_scope
+        decided = Decisions(options.seed)
         with stopping() as stopped, warnings_told(warn):
             job = _Job(options, prepared, sink, clock, StopLatch(stopped), warn, region)
             if options.budget is not None:
                 outcome, prepared, factor = _within_budget(job, options.budget)
                 selection = replace(selection, binning=selection.binning * factor)
             else:
-                outcome = _by_slabs(job, slabs) if slabs else _at_once(job)
+                outcome = _by_slabs(job, slabs, decided) if slabs else _at_once(job, decided)
+        if options.uncertainty:
+            phases.enter("error bars")
+            with stop_scope() as stopped, warnings_told(warn):
+                outcome = _with_error_bars(replace(job, stop_latch=StopLatch(stopped)), outcome, slabs, decided)
         if slabs and options.method.traits.direct and prepared.view_weights is not None:
             # For the record: FBP takes all rays alike, and so do its figures.
             outcome = replace(outcome, settings={**outcome.settings, "view_weights": prepared.view_weights})
@@ -255,7 +267,37 @@ class _Job:
         )
 
 
-def _at_once(job: _Job) -> ReconOutcome:
+def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decided: Decisions) -> ReconOutcome:
+    """The outcome with the standard deviation of each voxel; without it, and with a warning, where it was stopped."""
+    if "ended_early" in made.settings:
+        job.warn("The error bars were left out, as the reconstruction was stopped.")
+        return made
+    said = "The volume is there; its error bars follow. Ctrl-C leaves them out."
+    job.sink(StateEntered("error_bars", said, time=job.clock.now()))
+    method = made_by(job.options.method_for(job.prepared.geometry), made.method)
+    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
+    given = made.volume, method, job.prepared, job.options
+
+    def say(text: str) -> None:
+        job.sink(StateEntered("slab", text, time=job.clock.now()))
+
+    why = "as they were stopped"
+    try:
+        if slabs:
+            found = deviation_by_slabs(*given, slabs, decided.made, control, say)
+        else:
+            found = deviation_of(*given, decided.made, control)
+    except ValueError as error:  # hours may be in the volume
+        found, why = None, str(error)
+    if found is None:
+        job.warn(f"The error bars were left out: {why}. The volume is whole.")
+        return made
+    assert method.traits.error_bars is not None
+    settings = dict(zip(("error_bars_spread", "error_bars_gradient"), method.traits.error_bars, strict=True))
+    return replace(made, deviation=found, settings={**made.settings, **settings})
+
+
+def _at_once(job: _Job, decided: Decisions) -> ReconOutcome:
     """Run a method on the whole volume; save checkpoints and continue from one if asked to."""
     options, prepared, checkpoints = job.options, job.prepared, job.options.checkpoints
     method = options.method_for(prepared.geometry)
@@ -275,6 +317,7 @@ def _at_once(job: _Job) -> ReconOutcome:
         on_progress=job.listener(getattr(method, "seconds", None)),
         on_checkpoint=None if checkpoints.path is None else keep,
         resume=resume,
+        decide=decided if options.uncertainty else None,
     )
     result = job.run(method, control)
     if result.checkpoint is not None:
@@ -295,10 +338,10 @@ def _at_once(job: _Job) -> ReconOutcome:
     return job.outcome(result, early, chosen, **said, **({"checkpoint_lost": lost} if lost else {}))
 
 
-def _by_slabs(job: _Job, slabs: Sequence[Slab]) -> ReconOutcome:
+def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> ReconOutcome:
     """Run a method slab by slab."""
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
-    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
+    control = RunControl(job.stop_latch, job.listener(), now=job.clock.now, decide=decided)
 
     def say(text: str) -> None:
         job.sink(StateEntered("slab", text, time=job.clock.now()))

@@ -40,6 +40,7 @@ class ReconOptions:
         memory: bytes that the reconstruction may use; None: 70 % of the free memory.
         cluster: whose workers reconstruct slabs, see `cluster.connected`; None: this process does.
         partial: volume whose missing slabs are reconstructed; None begins anew.
+        uncertainty: make the standard deviation of each voxel, too, see `recon.error_bars`.
         command: that repeats this, for the record.
         recipe: its options that hold for any scan, as YAML, for the record.
     """
@@ -61,23 +62,26 @@ class ReconOptions:
     region: Region | None = None
     cluster: str | None = None
     partial: Path | None = None
+    uncertainty: bool = False
     command: str = ""
     recipe: str = ""
 
     @property
     def becomes_output(self) -> bool:
         """Whether a volume made in slabs becomes the output without a copy."""
-        return self.region is None and self.target.written and can_become(self.target.output)
+        alone = self.region is None and not self.uncertainty
+        return alone and self.target.written and can_become(self.target.output)
 
     def disk_needs(self, volume: int) -> tuple[int, int]:
         """Bytes on the disk for the result, and for temporary files, of a volume of so many bytes in slabs."""
         compared = self.target.report is not None and not self.method.traits.direct
         slabs = self.partial is None  # else they are there
+        bars = self.uncertainty
         if not self.target.written:
-            return 0, (slabs + compared) * volume
+            return 0, (slabs + compared + bars) * volume
         if self.becomes_output:
             return slabs * volume, compared * volume
-        return volume, (slabs + compared) * volume
+        return (1 + bars) * volume, (slabs + compared + bars) * volume
 
     def around_region(self, source: ScanSource) -> ReconOptions:
         """The same with the rows that show the region; the same options where all of the volume is wanted.

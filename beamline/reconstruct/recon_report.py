@@ -78,6 +78,7 @@ class ReconOutcome:
         psnr: (seconds, dB) of snapshots, where there was a truth to compare them with.
         chosen: what a budget or a preset chose, in a line; empty where the settings were given.
         gaussians: the model behind the volume, before its finish on voxels; None where there is none.
+        deviation: the standard deviation of each voxel; None where it was not asked for, or not finished.
     """
 
     volume: Volume
@@ -89,6 +90,7 @@ class ReconOutcome:
     psnr: Sequence[tuple[float, float]] = ()
     chosen: str = ""
     gaussians: Gaussians | None = None
+    deviation: Volume | None = None
 
     @property
     def next_decibel(self) -> NextDecibel | None:
@@ -311,6 +313,15 @@ def _pictures(
                 f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
                 + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
                 figures.differences(shown, unit),
+            )
+        )
+    if made.deviation is not None:
+        pictures.append(
+            Picture(
+                "Error bars",
+                "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
+                "within one deviation of the volume. Fine texture that the method has smoothed away may lie outside.",
+                figures.error_bars(made.volume, made.deviation, unit),
             )
         )
     if left is not None:

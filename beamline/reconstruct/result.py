@@ -181,8 +181,10 @@ def write_result(
     own = metrics[made.method]
     phases.enter("report")
     parameters = parameters_of(made, prepared, context)
+    deviation = made.deviation
     if region is not None:
         volumes = {method: region.cut(volume) for method, volume in volumes.items()}
+        deviation = None if deviation is None else region.cut(deviation)
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
@@ -194,6 +196,7 @@ def write_result(
         metrics=own,
         history=history_arrays(made.history),
         model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
+        deviation=None if deviation is None else deviation.data,
     )
     page: Path | None = None
     try:

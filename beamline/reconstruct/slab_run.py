@@ -65,7 +65,7 @@ def in_slabs(
     stopped and resumed is equal to the bit.
 
     Args:
-        control: of all slabs together.
+        control: of all slabs together; `decide`, if given, gets the decisions that they follow.
         warn: is told of slices that are not by the method.
         workers: reconstruct all slabs but the first, many at a time; this thread alone writes.
 
@@ -128,6 +128,8 @@ def in_slabs(
             if (listen := control.on_progress) is not None:
                 seconds, views = control.now() - begin, prepared.geometry.n_views
                 listen(Progress(partial.n_slices_done, grid.shape[0], seconds, nan, nan, 0, views, unit="slices"))
+    if control.decide is not None:
+        control.decide.made.update(decided)
     return _whole(partial, grid, options, control.now() - begin)
 
 

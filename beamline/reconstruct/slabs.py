@@ -31,9 +31,10 @@ from beamline.storage.writers.partial_volume import slabs_of_partial
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
-from recon.base.method import DividedMethod, Method
+from recon.base.method import DividedMethod, Method, candidates_of
 from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
+from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
 from recon.voxels.odd_views import odd_views_memory
 from recon.voxels.unexplained import unexplained_memory
@@ -57,6 +58,7 @@ class Needs:
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
         steps: bytes that the steps of the correction take.
+        bars: error bars are made, too.
     """
 
     method: Method
@@ -64,6 +66,7 @@ class Needs:
     raw: int
     weighted: bool
     steps: StepMemory = _NO_STEPS
+    bars: bool = False
 
     @classmethod
     def of(
@@ -88,7 +91,7 @@ class Needs:
     @property
     def at_once(self) -> int:
         """With everything in memory."""
-        work = self.method.memory(self.geometry, self._grid(self.rows), self.weighted)
+        work = self._work(self.method, self.geometry, self._grid(self.rows))
         return self.raw + self.line_integrals + max(work, self.steps.correcting, self._alone)
 
     @property
@@ -103,10 +106,19 @@ class Needs:
 
     def slab(self, height: int) -> int:
         """A slab of so many slices of its own, with its views and weights; figures of the volume need less."""
-        seen = min(height + 2 * self.method.traits.halo, self.rows)
+        halo = self.method.traits.halo
+        seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        return rays + self._for_part(seen).memory(part, self._grid(seen), self.weighted)
+        return rays + self._work(self._for_part(seen), part, self._grid(seen))
+
+    def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
+        """The method, or its error bars beside its volume."""
+        work = method.memory(geometry, grid, self.weighted)
+        if not self.bars:
+            return work
+        bars = max(error_bars_memory(one, geometry, grid) for one in candidates_of(method))
+        return max(work, 4 * math.prod(grid.shape) + bars)
 
     @property
     def figures(self) -> int:
@@ -156,7 +168,7 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
     part = ScanPart(source, selection, needs.geometry)
     steps = StepMemory.of_all(step.memory(part) for step in selection.in_order)
-    return replace(needs, method=options.method_for(needs.geometry), steps=steps)
+    return replace(needs, method=options.method_for(needs.geometry), steps=steps, bars=options.uncertainty)
 
 
 def spill_of(
@@ -266,12 +278,13 @@ def prepare_within(
     if spill is None:
         if options.partial is not None:
             raise DataError(f"{options.partial} holds slabs, and {source.path} is a cone, which is not made in slabs.")
-        _refuse_wider(source, prepared, Needs(method, geometry, 0, not method.traits.direct), memory)
+        needs = Needs(method, geometry, 0, not method.traits.direct, bars=options.uncertainty)
+        _refuse_wider(source, prepared, needs, memory)
         return prepared, []
     if not geometry.is_straight:
         raise DataError(f"{source.path}: its views are rolled or tilted, which needs the whole scan in memory.")
     weighted = not method.traits.direct and (prepared.ray_factors() is not None or prepared.shares_of is not None)
-    needs = Needs(method, geometry, 0, weighted)
+    needs = Needs(method, geometry, 0, weighted, bars=options.uncertainty)
     refuse_smallest(source, needs, memory, options.selection.binning)
     if options.partial is None:
         return prepared, slabs_of(Grid.matching(geometry).shape[0], needs.height(memory), method.traits.halo)

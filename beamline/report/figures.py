@@ -214,6 +214,35 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
     return png(figure)
 
 
+def error_bars(volume: Volume, deviation: Volume, unit: str) -> bytes:
+    """A slice through the bright voxels, and its standard deviation, each with its colour bar and a scale bar."""
+    at = bright_centre(volume.data)[0]
+    grid = volume.grid
+    figure = Figure(figsize=(WIDTH, 4.4), dpi=dpi_for(grid.shape[2], WIDTH / 2.4), layout="constrained")
+    extent = (
+        *_edges(grid.centre[2], grid.shape[2], grid.voxel_size),
+        *_edges(grid.centre[1], grid.shape[1], grid.voxel_size)[::-1],
+    )
+    length = _round_length(grid.shape[2] * grid.voxel_size / 5)
+    panels = ((volume, "attenuation", "gray"), (deviation, "standard deviation", "magma"))
+    for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
+        image = shown.data[at]
+        low, high = grey_window([image], 0.5, 99.5)
+        drawn = axes.imshow(image, cmap=colours, extent=extent, norm=Normalize(low, high), interpolation="nearest")
+        left, top = extent[0] + length / 4, extent[3] + length / 4
+        axes.plot([left, left + length], [top, top], color="white", lw=3, solid_capstyle="butt")
+        axes.text(left, top + length / 8, f"{length:g} {unit}", color="white", fontsize=8, va="top")
+        axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
+        figure.colorbar(drawn, ax=axes, label=f"{label} (1/{unit})", shrink=0.8)
+    return png(figure)
+
+
+def _round_length(length: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not longer."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(power * max(n for n in (1, 2, 5) if n * power <= length * (1 + 1e-9)))
+
+
 def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], value: float, confident: bool) -> bytes:
     """The mismatch of the views against the candidate columns of the rotation axis, with the chosen one."""
     figure, axes = _figure((WIDTH, 2.8))

@@ -22,10 +22,11 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import read_volume
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
-from recon.post.enhance import Box, enhanced, inscribed_box, sample_circle
-from recon.post.particles import NECK, Particles, cleaned, measured, parted
+from recon.post.enhance import Box, enhanced, enhanced_deviation, inscribed_box, sample_circle
+from recon.post.particles import NECK, Particles, cleaned, measured, parted, volume_deviation
 
 _SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
+_DEVIATION = "entry/data/data_errors"  # where `beamline recon --uncertainty` has its standard deviation
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class Segmented:
         labels: int32 [z, y, x] of the same shape; 0: no particle.
         clusters: of the enhanced grey values.
         particles: of the labels.
+        volume_deviation: of each particle's volume; None where the file has no error bars.
     """
 
     box: Box
@@ -84,6 +86,7 @@ class Segmented:
     labels: NDArray[np.int32]
     clusters: Clusters
     particles: Particles
+    volume_deviation: NDArray[np.float64] | None = None
 
 
 def segment(options: SegmentOptions) -> Segmented:
@@ -123,8 +126,21 @@ def _segmented(volume: Volume, unit: str, options: SegmentOptions) -> Segmented:
     grey = enhanced(volume.data, options.percentiles, options.gamma, options.sigma)
     found = clusters(grey, options.n_clusters, options.seed)
     labels = parted(cleaned(grey > found.threshold, options.radius, options.smallest), options.neck)
-    particles = measured(labels, volume.grid.spacing, volume.grid.first)
-    return Segmented(box, volume, unit, labels, found, particles)
+    particles, bars = measured(labels, volume.grid.spacing, volume.grid.first), None
+    deviation = _deviation(options, box)
+    if deviation is not None and deviation.shape == volume.data.shape:
+        of_grey = enhanced_deviation(volume.data, deviation, options.percentiles, options.gamma)
+        bars = volume_deviation(labels, grey, of_grey, found.threshold) * np.prod(volume.grid.spacing)
+    return Segmented(box, volume, unit, labels, found, particles, bars)
+
+
+def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
+    """The standard deviation of the voxels in the box, beside the volume of a reconstruction; None without it."""
+    if options.dataset not in (None, _SIGNAL) or not h5py.is_hdf5(options.volume):
+        return None
+    with hdf5.open_hdf5(options.volume) as file:
+        found = file.get(_DEVIATION)
+        return np.asarray(found[box], np.float32) if isinstance(found, h5py.Dataset) else None
 
 
 def _read(options: SegmentOptions) -> tuple[Volume, str]:
@@ -190,10 +206,14 @@ def table_of(found: Segmented) -> str:
     unit, particles, out = found.unit, found.particles, io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     heading = [f"volume_{unit}3", f"equivalent_diameter_{unit}", f"z_{unit}", f"y_{unit}", f"x_{unit}", "cut"]
-    writer.writerow(["label", *heading])
+    bars = found.volume_deviation
+    interval = [] if bars is None else [f"volume_low_{unit}3", f"volume_high_{unit}3"]
+    writer.writerow(["label", *heading, *interval])
     for i in np.argsort(-particles.volume, kind="stable").tolist():
         sizes = (particles.volume[i], particles.diameter[i], *particles.centroid[i])
-        writer.writerow([particles.label[i], *(f"{value:.6g}" for value in sizes), int(particles.cut[i])])
+        ends = () if bars is None else (max(particles.volume[i] - bars[i], 0.0), particles.volume[i] + bars[i])
+        row = [particles.label[i], *(f"{value:.6g}" for value in sizes), int(particles.cut[i])]
+        writer.writerow([*row, *(f"{value:.6g}" for value in ends)])
     return out.getvalue()
 
 

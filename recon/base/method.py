@@ -135,6 +135,7 @@ class Traits:
             the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
         halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
+        error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
     """
 
     direct: bool = False
@@ -146,6 +147,7 @@ class Traits:
     any_grid: bool = False
     needs_matter: bool = False
     halo: int = 0
+    error_bars: tuple[float, float] | None = None
 
 
 class Method(Protocol):

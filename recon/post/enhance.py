@@ -66,11 +66,16 @@ def rescaled(volume: F32, low: float = 0.5, high: float = 99.5) -> F32:
     """
     if not 0 <= low < high <= 100:
         raise ValueError(f"percentiles must rise within 0 to 100, got {low} and {high}")
+    bottom, top = _range(volume, low, high)
+    return np.clip((volume - np.float32(bottom)) / np.float32(top - bottom), 0, 1)
+
+
+def _range(volume: F32, low: float, high: float) -> tuple[float, float]:
     values = volume.ravel()
     bottom, top = np.percentile(values[:: max(1, values.size // _SAMPLE)], [low, high])
     if not top > bottom:
         raise ValueError(f"grey values are {bottom:g} at both percentiles ({low:g} and {high:g}): nothing to rescale")
-    return np.clip((volume - np.float32(bottom)) / np.float32(top - bottom), 0, 1)
+    return float(bottom), float(top)
 
 
 def enhanced(
@@ -93,3 +98,18 @@ def enhanced(
     if gamma != 1:
         out **= np.float32(gamma)
     return ndimage.gaussian_filter(out, sigma) if sigma > 0 else out
+
+
+def enhanced_deviation(
+    volume: F32, deviation: F32, percentiles: tuple[float, float] = (0.5, 99.5), gamma: float = 1.0
+) -> F32:
+    """The standard deviation of the grey values of `enhanced`, of that of the voxels; the smoothing lowers it no more.
+
+    Args:
+        volume, deviation: [z, y, x] of the same unit.
+    """
+    bottom, top = _range(volume, *percentiles)
+    scaled = deviation / np.float32(top - bottom)
+    if gamma != 1:
+        scaled *= np.float32(gamma) * np.maximum(rescaled(volume, *percentiles), 0.01) ** np.float32(gamma - 1)
+    return scaled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,9 @@ from recon.base.arrays import F32, Mask
 from recon.base.choices import NECK as NECK
 
 Labels = NDArray[np.int32]
+
+_MARGIN = 3  # voxels around a particle that are looked at for its boundary
+_TOGETHER, _PLACED = 1.2, 0.07  # voxels, see `volume_deviation`
 
 _GRID = 0.5
 """Error of a distance on the grid, in voxels. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
@@ -130,6 +134,36 @@ def measured(
     return Particles(
         found.astype(np.int32), counts[found] * np.float64(np.prod(spacing)), centroid, np.isin(found, touched)
     )
+
+
+def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float) -> NDArray[np.float64]:
+    """The standard deviation of each particle's volume, in voxels, in the order of `measured`.
+
+    An error e of the grey value moves the boundary by e / |gradient|. Two parts are added in squares. The errors by the
+    `deviation` of the grey values at a distance d have the correlation exp(-d² / (2 · 1.2²)), d in voxels. And the
+    whole surface may lie off by 0.07 voxels, the same everywhere: the threshold, the blur and the opening place it so.
+    Both numbers are from balls of radius 2.5 to 7 voxels in six simulated volumes, by FBP and FISTA-TV: of the true
+    volumes about 68 % are within one deviation. Particles of a few voxels lose more to the opening.
+
+    Args:
+        labels, grey, deviation: [z, y, x]; the particles are `grey` above `threshold`.
+    """
+    found = []
+    for number, box in enumerate(ndimage.find_objects(labels), 1):
+        if box is None:
+            continue
+        box = tuple(slice(max(part.start - _MARGIN, 0), part.stop + _MARGIN) for part in box)
+        own, others, values = labels[box] == number, labels[box] > 0, grey[box].astype(np.float64)
+        near = ndimage.binary_dilation(own, iterations=2) & (own | ~others)
+        steps = [np.gradient(values, axis=axis) for axis, n in enumerate(values.shape) if n > 1]
+        slope = np.maximum(np.sqrt(sum(np.square(step) for step in steps)), 1e-9)
+        filled = [np.clip((values - threshold + sign * deviation[box]) / slope + 0.5, 0, 1) for sign in (1, -1)]
+        moved = (filled[0] - filled[1]) / 2 * near
+        together = (math.sqrt(2 * math.pi) * _TOGETHER) ** 3
+        noise = together * float((moved * ndimage.gaussian_filter(moved, _TOGETHER)).sum())
+        faces = sum(np.count_nonzero(np.diff(own, axis=axis)) for axis in range(3))
+        found.append(math.sqrt(noise + (_PLACED * 2 / 3 * faces) ** 2))  # a ball has 3/2 faces per unit of its surface
+    return np.array(found)
 
 
 def _basins(inside: Mask) -> tuple[Labels, F32]:

@@ -61,6 +61,7 @@ class R2:
         any_grid=True,
         needs_matter=True,
         halo=16,
+        error_bars=(2.2, 0.1),
     )
 
     steps: int | None = None

@@ -28,7 +28,7 @@ class Fbp:
 
     name: ClassVar[str] = "fbp"
     label: ClassVar[str] = "FBP"
-    traits: ClassVar[Traits] = Traits(direct=True)
+    traits: ClassVar[Traits] = Traits(direct=True, error_bars=(1.0, 0.7))
 
     filter: Filter = "hann"
 

@@ -43,6 +43,7 @@ class ReconRecord:
         parameters: every setting used, by name; numbers, strings and arrays.
         metrics: figures of merit, by name.
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
+        deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
     """
 
@@ -56,6 +57,7 @@ class ReconRecord:
     metrics: Mapping[str, float] = field(default_factory=dict)
     history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     model: Mapping[str, Any] = field(default_factory=dict)
+    deviation: NDArray[np.float32] | None = None
 
 
 def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
@@ -103,6 +105,13 @@ def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
         stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
         file.require_taken()
+    if record.deviation is not None and not empty:
+        errors = data.create_dataset("data_errors", shape, np.float32, chunks=(1, *shape[1:]))
+        for first in range(0, shape[0], _SLAB):
+            errors[first : first + _SLAB] = record.deviation[first : first + _SLAB]
+            file.require_taken()
+        errors.attrs["units"] = f"1/{record.length_unit}"
+        errors.attrs["long_name"] = f"standard deviation of each voxel (1/{record.length_unit})"
     data["data"].attrs["units"] = f"1/{record.length_unit}"
     data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
@@ -150,7 +159,8 @@ def read_reconstruction(path: Path) -> ReconRecord:
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
         values = np.asarray(record.volume.data[:], dtype=np.float32)
-        return replace(record, volume=Volume(values, record.volume.grid))
+        deviation = None if record.deviation is None else np.asarray(record.deviation[:], dtype=np.float32)
+        return replace(record, volume=Volume(values, record.volume.grid), deviation=deviation)
 
 
 @contextmanager
@@ -191,6 +201,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         metrics={name: float(node[()]) for name, node in process["metrics"].items()},
         history={name: np.asarray(node[()]) for name, node in process["history"].items()},
         model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
+        deviation=data.get("data_errors"),
     )
 
 

@@ -38,7 +38,7 @@ class FistaTv:
 
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
-    traits: ClassVar[Traits] = Traits(budget=True, halo=12)
+    traits: ClassVar[Traits] = Traits(budget=True, halo=12, error_bars=(2.2, 0.1))
 
     iterations: int = 20
     tv_weight: float | None = None

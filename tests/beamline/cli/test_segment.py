@@ -6,6 +6,7 @@ import csv
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -80,6 +81,29 @@ def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> Non
 
 
 @pytest.mark.usefixtures("undrawn")
+@pytest.mark.usefixtures("undrawn")
+def test_error_bars_in_the_file_give_each_volume_an_interval(here: Path) -> None:
+    data = can(noise=0.02)
+    record = ReconRecord(Volume(data, Grid(data.shape, VOXEL)), "mm", "scan.h5", "t", "s", 0.0, {})  # type: ignore[arg-type]
+    rows = []
+    for deviation in (None, np.full_like(data, 0.05), np.full_like(data, 0.4)):
+        write_reconstruction(here / "v.h5", replace(record, deviation=deviation), replace=True)
+        assert beamline("segment", "v.h5", *MARGIN, "-o", "p.h5").exit_code == 0
+        rows.append(_rows(here / "p.csv"))
+        for name in ("p.h5", "p.csv", "p.png"):
+            (here / name).unlink()
+    without, sure, unsure = rows
+    assert "volume_low_mm3" not in without[0]
+    for a, b, c in zip(without, sure, unsure, strict=True):
+        assert a["volume_mm3"] == b["volume_mm3"] == c["volume_mm3"]
+        assert c["volume_low_mm3"] < b["volume_low_mm3"] < b["volume_mm3"] < b["volume_high_mm3"] < c["volume_high_mm3"]
+    true = sorted((4 / 3 * np.pi * (radius * VOXEL) ** 3 for _, radius in WHOLE), reverse=True)
+    within = [
+        row["volume_low_mm3"] <= volume <= row["volume_high_mm3"] for row, volume in zip(unsure, true, strict=True)
+    ]
+    assert sum(within) >= len(true) - 2
+
+
 def test_lengths_are_voxels_where_nobody_knows_them(here: Path) -> None:
     np.save(here / "can.npy", can())
     result = beamline("segment", "can.npy", *MARGIN, "-o", "a.h5", "--json")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.measure import regionprops
 
 from recon.post.clusters import clusters
 from recon.post.enhance import enhanced, inscribed_box
-from recon.post.particles import ball, cleaned, measured, parted
+from recon.post.particles import ball, cleaned, measured, parted, volume_deviation
 from tests.recon.post.phantom import BALLS, CIRCLE, SHAPE, can, inside
 
 
@@ -97,3 +98,43 @@ def test_the_structuring_element_is_round() -> None:
     assert [int(ball(radius).sum()) for radius in (0, 1, 2)] == [1, 7, 33]
     with pytest.raises(ValueError, match="0 or more"):
         cleaned(np.ones((3, 3, 3), bool), -1)
+
+
+def soft_balls(shape: tuple[int, int, int], radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values of nine balls in a slab, one at a place off the grid, that are 1/2 at their surfaces, and labels."""
+    rng, grey = np.random.default_rng(3), np.zeros(shape)
+    z, y, x = np.indices(shape)
+    labels = np.zeros(shape, np.int32)
+    for number in range(9):
+        centre = np.array([shape[0] / 2, 10 + 20 * (number // 3), 10 + 20 * (number % 3)]) + rng.uniform(-0.5, 0.5, 3)
+        away = radius - np.sqrt((z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2)
+        grey = np.maximum(grey, np.clip(0.5 + away / 4, 0, 1))
+        labels[away > 0] = number + 1
+    return grey.astype(np.float32), labels
+
+
+def test_the_deviation_of_a_volume_is_that_of_repeated_noise() -> None:
+    """Noise that is correlated over 1.2 voxels moves the volumes by their deviation, beside that of placement."""
+    grey, labels = soft_balls((20, 60, 60), 6)
+    sigma, volumes = 0.06, []
+    for seed in range(60):
+        noise = ndimage.gaussian_filter(np.random.default_rng(seed).normal(size=grey.shape), 1.2 / np.sqrt(2))
+        noisy = grey + sigma * noise / noise.std()
+        volumes.append(np.bincount(ndimage.label(ndimage.binary_opening(noisy > 0.5))[0].ravel())[1:])
+    scatter = np.std([v for v in volumes if len(v) == 9], axis=0).mean()
+    assert len([v for v in volumes if len(v) == 9]) > 50
+    by_noise = volume_deviation(labels, grey, np.full_like(grey, sigma), 0.5)
+    placed = volume_deviation(labels, grey, np.zeros_like(grey), 0.5)
+    assert np.sqrt(by_noise**2 - placed**2).mean() == pytest.approx(scatter, rel=0.25)
+    np.testing.assert_allclose(placed, 0.07 * 4 * np.pi * 6**2, rtol=0.1)  # 0.07 voxels times the surface
+
+
+def test_twice_the_deviation_and_half_the_slope_move_a_surface_twice_as_far() -> None:
+    grey, labels = soft_balls((20, 60, 60), 6)
+    once, twice, shallow = (
+        volume_deviation(labels, values, np.full_like(grey, sigma), 0.5) ** 2
+        - volume_deviation(labels, grey, np.zeros_like(grey), 0.5) ** 2
+        for values, sigma in ((grey, 0.02), (grey, 0.04), ((grey + 0.5) / 2, 0.02))
+    )
+    np.testing.assert_allclose(twice, 4 * once, rtol=0.15)
+    np.testing.assert_allclose(shallow, 4 * once, rtol=0.15)

@@ -1,0 +1,138 @@
+"""`recon --uncertainty`: a second volume in the file, also in slabs and of a box; left out where it is stopped."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.storage.writers.recon_file import read_reconstruction
+from recon.voxels import iterative
+from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.scans import TwoCylinders, write_exchange
+
+FISTA = (
+    "recon",
+    "scan.h5",
+    "--uncertainty",
+    "--no-report",
+    "-m",
+    "fista-tv",
+    "--iterations",
+    "5",
+    "--tv-weight",
+    "0.002",
+)
+FBP = ("recon", "scan.h5", "--uncertainty", "--no-report", "-m", "fbp")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> Path:
+    """A noisy scan of 64 rows, scan.h5."""
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 4.0)), shape=(64, 32), axis_col=15.7)
+    counts = 100 + rng.poisson((scan.counts().astype(float) - 100) / 10) * 10
+    write_exchange(Path("scan.h5"), scan, {"data": counts.astype(np.uint16)})
+    return tmp_path
+
+
+def deviation(*options: str) -> np.ndarray:
+    """Of the volume that these options give."""
+    output = Path("out.h5")
+    result = beamline(*options, "-o", str(output))
+    assert result.exit_code == 0, result.output
+    found = read_reconstruction(output).deviation
+    output.unlink()
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("options", [FISTA, FBP], ids=["fista-tv", "fbp"])
+def test_the_file_holds_a_second_volume_with_its_unit(folder: Path, options: tuple[str, ...]) -> None:
+    alone = tuple(option for option in options if option != "--uncertainty")
+    assert beamline(*options, "-o", "with.h5").exit_code == 0
+    assert beamline(*alone, "-o", "without.h5").exit_code == 0
+    with h5py.File("with.h5") as file, h5py.File("without.h5") as other:
+        data, errors = file["entry/data/data"], file["entry/data/data_errors"]
+        assert errors.shape == data.shape and errors.attrs["units"] == data.attrs["units"] == "1/mm"
+        assert np.isfinite(errors).all() and np.median(errors) > 0
+        np.testing.assert_array_equal(data, other["entry/data/data"])
+        assert "data_errors" not in other["entry/data"]
+    assert read_reconstruction(Path("with.h5")).parameters["error_bars_spread"] > 0
+    assert beamline("validate", "with.h5").exit_code == 0
+
+
+def test_about_two_of_three_voxels_of_the_truth_are_within(folder: Path) -> None:
+    assert beamline(*FISTA, "-o", "out.h5").exit_code == 0
+    record = read_reconstruction(Path("out.h5"))
+    truth = TwoCylinders(shape=(64, 32), axis_col=15.7).truth(record.volume.grid)
+    matter = truth > 0
+    assert record.deviation is not None
+    within = np.abs(record.volume.data - truth)[matter] <= record.deviation[matter]
+    assert 0.5 < within.mean() < 0.9
+
+
+@pytest.mark.parametrize(("options", "memory"), [(FISTA, "6.5M"), (FBP, "4.1M")], ids=["fista-tv", "fbp"])
+def test_in_slabs_it_is_the_same(folder: Path, options: tuple[str, ...], memory: str) -> None:
+    whole = deviation(*options)
+    slabs = deviation(*options, "--memory", memory)
+    assert np.abs(slabs - whole).mean() < 0.1 * whole.mean()
+    assert left(folder) == {"scan.h5"}
+
+
+def test_of_a_box_it_is_the_box(folder: Path) -> None:
+    whole, box = deviation(*FISTA), deviation(*FISTA, "--roi", "20:30,4:20,6:22")
+    assert box.shape == (10, 16, 16)
+    assert np.abs(box - whole[20:30, 4:20, 6:22]).mean() < 0.05 * whole.mean()
+
+
+def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    solve: Any = iterative.solve
+
+    def interrupted(*arguments: Any, **named: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return solve(*arguments, **named)
+
+    monkeypatch.setattr("recon.error_bars.solve", interrupted)
+    result = beamline(*FISTA, "-o", "out.h5")
+    assert result.exit_code == 0, result.output
+    assert "The error bars were left out: as they were stopped." in result.stderr
+    record = read_reconstruction(Path("out.h5"))
+    assert record.deviation is None and record.volume.data.any() and "ended_early" not in record.parameters
+
+
+def test_memory_of_the_dry_run_counts_it(folder: Path) -> None:
+    def needed(*options: str) -> str:
+        return next(line for line in beamline(*options, "--dry-run").stdout.splitlines() if line.startswith("memory"))
+
+    alone = tuple(option for option in FBP if option != "--uncertainty")
+    assert needed(*FBP) != needed(*alone)
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("-m", "sirt"), "--uncertainty is calibrated for r2, fbp, fista-tv"),
+        (("-m", "fbp", "-o", "out.tif"), "give -o out.h5"),
+        (("-m", "r2", "--finish", "0"), "r2 has no finish there with --finish 0"),
+        (("-m", "fbp", "--views", "fixed:6"), "needs 8 at least; here are 6"),
+        (("-m", "r2", "--seconds", "5"), "--uncertainty does not go with"),
+        (("-m", "r2", "--follow"), "--uncertainty does not go with"),
+    ],
+    ids=["sirt", "tif", "finish", "views", "seconds", "follow"],
+)
+def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options: tuple[str, ...], why: str) -> None:
+    result = beamline("recon", "scan.h5", "--uncertainty", *options)
+    assert result.exit_code == 2, result.output
+    assert why in " ".join(result.stderr.split())
+    assert left(folder) == {"scan.h5"}
+
+
+@pytest.mark.usefixtures("real_pictures")
+def test_the_report_draws_it(folder: Path) -> None:
+    assert beamline("recon", "scan.h5", "--uncertainty", "-m", "fbp", "-o", "out.h5").exit_code == 0
+    assert "Error bars" in Path("out.html").read_text(encoding="utf-8")
