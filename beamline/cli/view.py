@@ -23,7 +23,8 @@ from drivers.base.clock import SystemClock
 def view(volume: Path, other: Path | None, port: int, bind: str, browse: bool) -> None:
     """Show VOLUME as a page in the browser: slices, zoom, grey window, histogram, profile along a line.
 
-    OTHER is shown below it at the same places, and the difference where both have the same shape. Of a volume above
+    OTHER is shown below it at the same places, and the difference where both have the same shape. Without OTHER the FBP
+    is, where `beamline recon` kept one beside a doubtful volume. Of a volume above
     512 MB slices across y and x are binned. The page is served to this machine alone: from elsewhere use an ssh
     tunnel, or --bind (not encrypted).
 
@@ -38,6 +39,8 @@ def view(volume: Path, other: Path | None, port: int, bind: str, browse: bool) -
             progress = counting("slices", terminal, SystemClock())
             paths = [volume] if other is None else [volume, other]
             volumes = [opened.enter_context(closing(ShownVolume(path, progress))) for path in paths]
+            if other is None and volumes[0].has_fbp:
+                volumes.append(opened.enter_context(closing(ShownVolume(volume, progress, fbp=True))))
         server = start(lambda access: viewer(volumes, access), open_port(bind, port))
         click.echo(f"{LOOK:<8}{server.addresses.look}")
         sys.stdout.flush()

@@ -17,6 +17,7 @@ from beamline.core.errors import DataError
 from beamline.page.tiles import TileRegion, bin_mean
 from beamline.storage import hdf5
 from beamline.storage.volumes.files import opened_volume
+from beamline.storage.writers.recon_file import ReconRecord
 
 F32 = NDArray[np.float32]
 HELD = 2**29
@@ -41,6 +42,12 @@ def newest(candidates: tuple[Path, ...]) -> VolumeFile | None:
     return None
 
 
+def _fbp_of(path: Path, record: ReconRecord) -> Any:
+    if record.fbp is None:
+        raise DataError(f"{path} keeps no FBP beside its volume.")
+    return record.fbp
+
+
 class ShownVolume:
     """A volume file of any kind that is read here. All calls come from one thread (HDF5).
 
@@ -49,15 +56,26 @@ class ShownVolume:
 
     Args:
         progress: takes slices read and slices to read of the coarse copy.
+        fbp: the FBP that is kept beside a volume (`has_fbp`), instead of the volume.
 
     Raises:
         DataError: it cannot be read, or holds no volume.
     """
 
-    def __init__(self, path: Path, progress: Callable[[int, int], None] = lambda n, of: None, held: int = HELD) -> None:
+    def __init__(
+        self,
+        path: Path,
+        progress: Callable[[int, int], None] = lambda n, of: None,
+        held: int = HELD,
+        fbp: bool = False,
+    ) -> None:
         with ExitStack() as opened:
             record = opened.enter_context(opened_volume(path))
-            self.path, self._values, self._grid = path, record.volume.data, record.volume.grid
+            self.path, self._grid, self.has_fbp = path, record.volume.grid, record.fbp is not None
+            self._values: Any = record.volume.data
+            self._name = path.name
+            if fbp:
+                self._values, self._name = _fbp_of(path, record), f"{path.name}, FBP"
             self.shape: tuple[int, int, int] = self._values.shape
             self.coarse_bin = math.ceil((4 * math.prod(self.shape) / held) ** (1 / 3))
             self._coarse = self._copied(progress)
@@ -74,7 +92,7 @@ class ShownVolume:
         low, high = np.percentile(self._sample, (0.5, 99.8)) if self._sample.size else (0.0, 1.0)
         unit = self._length_unit
         return {
-            "name": self.path.name,
+            "name": self._name,
             "changed": self._changed,
             "shape": self.shape,
             "voxel": [float(step) for step in self._grid.spacing],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import tempfile
@@ -27,6 +28,7 @@ from beamline.report.record import history_arrays
 from beamline.storage.scratch import scratch_array
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.partial_volume import complete
+from beamline.storage.writers.recon_file import SUFFIXES as RECON_SUFFIXES
 from beamline.storage.writers.recon_file import ReconRecord, Value
 from drivers.base.clock import Clock
 from recon.assess.lost_mass import compare
@@ -37,6 +39,7 @@ from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
 # Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+_ROOM = 3.0  # times a volume: free disk from which on a second one is kept
 _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # settings of an outcome that its event tells
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
 
@@ -90,6 +93,11 @@ class OutputPaths:
                 "-o. Nothing was read."
             ) from error
 
+    def takes_a_second(self, grid: Grid) -> bool:
+        """The output is a file of ours, and its disk has room for a second volume of this size."""
+        room = shutil.disk_usage(self.output.parent).free > _ROOM * 4 * math.prod(grid.shape)
+        return self.written and room and self.output.suffix.lower() in RECON_SUFFIXES
+
     def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
         """Raise DataError before the work if the disk has no room for a volume of so many bytes and temporary files of
         `meanwhile` bytes."""
@@ -138,7 +146,7 @@ def write_result(
     all_rays = (clock.now() - before) / residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
     waited_for, direct_method = "ended_early" in made.settings, by_name(made.method).traits.direct
     left_out = []
-    remarks, hiding = list(context.warnings), ""
+    remarks, hiding, doubtful = list(context.warnings), "", False
 
     def warn(said: str) -> None:
         if said:
@@ -148,6 +156,7 @@ def write_result(
     if left is not None:
         metrics[made.method]["unexplained"] = left.share
         warn(hiding := hiding_warning(made, left))
+        doubtful = bool(hiding)
     if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
         left_out.append("the look for views that do not fit the volume")
     else:
@@ -171,7 +180,11 @@ def write_result(
             if beside_fbp is None:
                 break  # it shows no air
             metrics[name]["air"] = beside_fbp.air
-            warn(lost_mass_warning(made, beside_fbp))
+            warn(lost := lost_mass_warning(made, beside_fbp))
+            doubtful = doubtful or bool(lost)
+    keeps_fbp = doubtful and compared and BASELINE in volumes and partial_volume is None
+    if keeps_fbp := keeps_fbp and target.takes_a_second(made.volume.grid):
+        warn(f"FBP of the same views is kept beside the volume: `beamline view {target.output.name}` shows both.")
     if left_out:
         why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
         remark = f"Left out, as {why}: {', '.join(left_out)}."
@@ -197,11 +210,13 @@ def write_result(
         history=history_arrays(made.history),
         model={} if made.gaussians is None else arrays_of_model(made.gaussians, prepared.geometry),
         deviation=None if deviation is None else deviation.data,
+        fbp=volumes[BASELINE].data if keeps_fbp else None,
     )
     page: Path | None = None
     try:
         if target.report is not None:
             report = compose(made, prepared, truth, volumes, metrics, parameters, context, left)
+            report = replace(report, volume=target.output.name if target.written else "")
             write_report(target.report, report, replace=target.replace)
             page = target.report
         phases.enter("writing the volume")

@@ -38,6 +38,7 @@ class Report:
         flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
         recipe: its options that hold for other scans; empty: none are shown.
         footnotes: definitions that the metrics need.
+        volume: name of the volume's file, in the folder of the page; empty: it was not written.
         live_picture: name of the picture of the growing volume, in the folder of the page; empty: no picture.
     """
 
@@ -52,6 +53,7 @@ class Report:
     command: str
     footnotes: Sequence[str] = ()
     recipe: str = ""
+    volume: str = ""
     live_picture: str = ""
 
 

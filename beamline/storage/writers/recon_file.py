@@ -22,6 +22,8 @@ from beamline.storage.structure import require_harmless
 from recon.base.volume import Grid, Volume
 
 DEFINITION = "NXtomoproc"
+FBP = "fbp"
+"""Dataset beside the volume, with filtered back-projection of the same views."""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
 _UNITS_OF_MODEL = {
@@ -44,6 +46,7 @@ class ReconRecord:
         metrics: figures of merit, by name.
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
+        fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
         model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
     """
 
@@ -58,6 +61,7 @@ class ReconRecord:
     history: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     model: Mapping[str, Any] = field(default_factory=dict)
     deviation: NDArray[np.float32] | None = None
+    fbp: NDArray[np.float32] | None = None
 
 
 def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
@@ -105,13 +109,19 @@ def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
         stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
         file.require_taken()
-    if record.deviation is not None and not empty:
-        errors = data.create_dataset("data_errors", shape, np.float32, chunks=(1, *shape[1:]))
+    beside = {
+        "data_errors": (record.deviation, "standard deviation of each voxel"),
+        FBP: (record.fbp, "filtered back-projection of the same views"),
+    }
+    for name, (values, meaning) in beside.items():
+        if values is None or empty:
+            continue
+        other = data.create_dataset(name, shape, np.float32, chunks=(1, *shape[1:]))
         for first in range(0, shape[0], _SLAB):
-            errors[first : first + _SLAB] = record.deviation[first : first + _SLAB]
+            other[first : first + _SLAB] = values[first : first + _SLAB]
             file.require_taken()
-        errors.attrs["units"] = f"1/{record.length_unit}"
-        errors.attrs["long_name"] = f"standard deviation of each voxel (1/{record.length_unit})"
+        other.attrs["units"] = f"1/{record.length_unit}"
+        other.attrs["long_name"] = f"{meaning} (1/{record.length_unit})"
     data["data"].attrs["units"] = f"1/{record.length_unit}"
     data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
@@ -159,8 +169,9 @@ def read_reconstruction(path: Path) -> ReconRecord:
     """
     with opened_reconstruction(path) as record, hdf5.readable(path):
         values = np.asarray(record.volume.data[:], dtype=np.float32)
-        deviation = None if record.deviation is None else np.asarray(record.deviation[:], dtype=np.float32)
-        return replace(record, volume=Volume(values, record.volume.grid), deviation=deviation)
+        beside = record.deviation, record.fbp
+        deviation, fbp = (None if other is None else np.asarray(other[:], dtype=np.float32) for other in beside)
+        return replace(record, volume=Volume(values, record.volume.grid), deviation=deviation, fbp=fbp)
 
 
 @contextmanager
@@ -202,6 +213,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         history={name: np.asarray(node[()]) for name, node in process["history"].items()},
         model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
         deviation=data.get("data_errors"),
+        fbp=data.get(FBP),
     )
 
 

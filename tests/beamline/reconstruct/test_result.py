@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.ndimage import gaussian_filter
 
 import recon
+from beamline.core.errors import DataError
 from beamline.core.events import Event
+from beamline.page.tiles import TileRegion
+from beamline.page.volume import ShownVolume
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
@@ -18,9 +23,11 @@ from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts
 from beamline.reconstruct.result import OutputPaths, write_result
 from beamline.report import figures
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -64,6 +71,38 @@ def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, 
     if compared:
         assert done["fbp"]["residual"] < 0.3
     assert (tmp_path / "out.html").exists()
+
+
+@pytest.mark.parametrize("doubtful", [True, False])
+def test_fbp_is_kept_beside_a_volume_that_hides_something(tmp_path: Path, doubtful: bool) -> None:
+    scan = replace(SCAN, shape=(12, 40))
+    write_exchange(tmp_path / "scan.h5", scan)
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        facts, selection = facts_of(source), Selection(axis_col=SCAN.axis_col)
+        prepared = prepare_projections(source, selection, lambda said: None)
+    volume = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.FistaTv(iterations=15)).volume
+    if doubtful:
+        volume = replace(volume, data=gaussian_filter(volume.data, (0, 2, 2)))
+    events: list[Event] = []
+    target = OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")
+    made = ReconOutcome(volume, "fista-tv", 1.0, (), {})
+    context = ReportContext(facts, selection, "beamline recon scan.h5", 0)
+    write_result(made, prepared, None, target, context, events.append, SystemClock())
+    record = read_reconstruction(target.output)
+    np.testing.assert_array_equal(record.volume.data, volume.data)
+    said = [str(event.data.get("message")) for event in events]
+    assert any("`beamline view out.h5` shows both" in each for each in said) is doubtful
+    with closing(ShownVolume(target.output)) as shown:
+        assert shown.has_fbp is doubtful is (record.fbp is not None)
+    if record.fbp is None:
+        with pytest.raises(DataError, match="keeps no FBP"):
+            ShownVolume(target.output, fbp=True)
+        return
+    expected = direct(prepared.projections.data, prepared.geometry, volume.grid, "hann")
+    np.testing.assert_allclose(record.fbp, expected, atol=1e-6)
+    with closing(ShownVolume(target.output, fbp=True)) as fbp:
+        assert fbp.facts()["name"] == "out.h5, FBP"
+        np.testing.assert_array_equal(fbp.cut(0, 5, TileRegion(0, 40, 0, 40))[0], record.fbp[5])
 
 
 def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.MonkeyPatch) -> None:
