@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from tests.beamline.projections.test_poses import AXIS, COLUMNS, N, PITCH, SHIFTS, TURNS, every, posed, scan, table
+from tests.beamline.projections.test_poses import AXIS, COLUMNS, PITCH, SHIFTS, TURNS, N, every, posed, scan, table
 
 FEW = ["--axis", str(AXIS), "--method", "sirt", "--iterations", "4"]
 
