@@ -108,10 +108,13 @@ class PreparedProjections:
         if self.measured is not None:
             factors.append(self.measured.astype(np.float32)[None])
         if self.leaves_slices:
-            views = (
-                self.geometry if self.held_out is None or not others else self.geometry.followed_by(self.held_out[1])
-            )
-            factors.append(seen_rays(views, Grid.matching(self.geometry)).astype(np.float32))
+            seen = seen_rays(self.geometry, grid := Grid.matching(self.geometry))
+            held = np.ones((others, 1, 1), np.bool_)
+            if self.held_out is not None and others == self.held_out[1].n_views:
+                held = seen_rays(self.held_out[1], grid)
+            rays = np.broadcast_shapes(seen.shape[1:], held.shape[1:])
+            factors.append(np.concatenate([np.broadcast_to(part, (len(part), *rays)) for part in (seen, held)]))
+            factors[-1] = factors[-1].astype(np.float32)
         if self.shares is not None:
             factors.append(_and_ones(self.shares, others))
         if not factors:

@@ -373,8 +373,8 @@ def _pictures(
         pictures.append(
             Picture(
                 "Poses of the views",
-                "Displacement of each view as the sample's, and its roll and tilt, against the angle of the stage: "
-                "runout and wobble of the axis, drift and jumps. `beamline export --poses` writes them as a table.",
+                "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
+                "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
                 figures.pose_curves(np.degrees(geometry.angles), geometry.shifts * pitch, turns, unit),
             )
         )

@@ -262,8 +262,7 @@ def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
     """[view, row, col] rays of a parallel beam between the outer slices of the grid, which the volume can explain.
 
     One column stands for all where views are straight. A ray that roll or tilt takes beyond these slices within the
-    field is not among them; of views tilted by more than the field is high, where few rays stay, only its middle
-    counts.
+    field is not among them. Of views that climb by a quarter of the box or more, the middle of each ray decides.
     """
     rows, cols = geometry.detector_shape
     down = np.arange(rows)[:, None] - geometry.axis_row - geometry.shifts[:, 1, None, None]

@@ -34,9 +34,9 @@ class PosesOfFile:
     table: PoseTable | None = option(
         "--poses",
         None,
-        "Displacement, roll and tilt of each view, as geometry (no view is resampled): a CSV with view or angle_deg "
-        "and shift_col_px, shift_row_px, roll_deg, tilt_deg; a volume of ours; or an NXtomo file with FILE:x,-y "
-        "(columns grow with x_translation, rows against y_translation).",
+        "Displacement, roll and tilt of each view; no view is resampled. A CSV with view or angle_deg, and "
+        "shift_col_px, shift_row_px, roll_deg, tilt_deg. Or a volume that keeps poses. Or an NXtomo file as FILE:x,-y: "
+        "columns grow with x_translation, rows against y_translation.",
         parse=_table,
         metavar="FILE",
     )

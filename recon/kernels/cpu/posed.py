@@ -31,9 +31,9 @@ Axes = NDArray[np.int8]
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     """The path of the rays of every column: float64 [view, col, 12], and the axis across its planes, int8 [view, col].
 
-    The axis is 0 for planes of constant y, 1 for x, 2 for z. In plane j the ray to a row meets the other two axes, in
-    the order (x, z), (y, z) or (y, x), at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row), and t4 to t7 for the
-    second. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
+    The axis is 0 for planes of constant y, 1 for x, 2 for z. The other two axes have the order (x, z), (y, z) or (y, x).
+    In plane j the ray to a row is at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row) of the first one. Of the second
+    one t4 to t7 say the same. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
 
     Raises:
         ValueError: if rays of one column differ so much that they share no planes.
@@ -67,8 +67,8 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     last = 1 + narrow * (rows - 1)
     if (np.minimum(last, 1) < _LEAST * (1 + last) / 2).any():
         raise ValueError(
-            "rays of one detector column differ in direction by almost a right angle: views tilted or rolled as far "
-            "as these need a narrower cone or fewer rows"
+            "rays of one detector column differ in direction by almost a right angle: views that lean this far need "
+            "a narrower cone or fewer rows"
         )
     table = np.empty((views, cols, 12))
     for part, axis in ((0, np.where(across == 2, 1, np.where(across == 1, 2, 1))), (4, np.where(across == 0, 2, 0))):
