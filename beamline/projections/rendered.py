@@ -34,17 +34,15 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             axis, pitch = (float(file[f"{PARAMETERS}/{name}"][()]) for name in ("axis_col", "pixel_pitch"))
             taken_off = file.get(f"{PARAMETERS}/background_terms")
             terms = None if taken_off is None else taken_off[()]
-            columns = file[f"{PARAMETERS}/columns"].asstr()[()]
+            cropped = f"{PARAMETERS}/columns" in file
         except KeyError as error:
             raise DataError(
                 f"{path} is no volume of `beamline recon`: {error.args[0]}. Nothing was looked at."
             ) from None
     if source.cone is not None:
         raise DataError(f"{source.path} is a cone-beam scan; views are compared with volumes of parallel beams only.")
-    if columns != f"0:{source.shape[1]}":
-        raise DataError(
-            f"{path} is made of columns {columns}; frames have {source.shape[1]}. Reconstruct all columns of this scan."
-        )
+    if cropped:
+        raise DataError(f"{path} is made of some columns of the detector. Reconstruct all columns of this scan.")
     pixel = source.pixel_size_mm or 1.0
     binning = max(1, round(pitch / pixel))
     rows = source.shape[0] // binning

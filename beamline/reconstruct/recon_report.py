@@ -47,7 +47,8 @@ class ScanFacts:
         remarks: faults during the scan, by the file.
         flagged: the worst of the flagged frames.
         references: mean darks and flats [row, col], binned, by title.
-        shape, first_col: of a frame, and the detector's column with which it begins.
+        shape: of a frame.
+        columns: of the detector that are used, the last not included, as --cols takes them; empty: all.
     """
 
     path: Path
@@ -59,12 +60,7 @@ class ScanFacts:
     flagged: Sequence[FlaggedFrame] = ()
     references: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     shape: tuple[int, int] = (1, 1)
-    first_col: int = 0
-
-    @property
-    def columns(self) -> str:
-        """Columns of the detector, the last not included, as --cols takes them."""
-        return f"{self.first_col}:{self.first_col + self.shape[1]}"
+    columns: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +155,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
     pitch, energy = source.pixel_size_mm, source.energy_kev
+    columns = "" if source.cols is None else f"{source.cols[0]}:{source.cols[1]}"
     missing, flags = int(attributes.get("missing_triggers", 0)), source.flags if flags is None else flags
     table = {
         "file": source.path.name,
@@ -167,7 +164,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         "projections": str(counts[FrameKind.PROJECTION]),
         "flats, darks": f"{counts[FrameKind.FLAT]}, {counts[FrameKind.DARK]}",
         "detector (rows × columns)": f"{source.shape[0]} × {source.shape[1]}"
-        + (f", from column {source.first_col}" if source.first_col else ""),
+        + (f", columns {columns}" if columns else ""),
         "pixel size": "not known" if pitch is None else f"{pitch * 1e3:.4g} µm",
         "energy": "not known" if energy is None else f"{energy:g} keV",
         "axis in the file": "not stated" if source.axis_col is None else f"column {source.axis_col:.2f}",
@@ -183,7 +180,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     frames = f"{n}/{n + missing}"
     images = reference_images(source)
     return ScanFacts(
-        source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape, source.first_col
+        source.path, source.path.name, sample, table, frames, remarks, flagged, images, source.shape, columns
     )
 
 

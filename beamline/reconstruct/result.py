@@ -272,7 +272,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         **({} if prepared.view_weights is None else {"view_weights": prepared.view_weights}),
         "rows": "all" if rows is None else f"{rows[0]}:{rows[1]}",
         **({} if context.region is None else {"roi": str(context.region.region)}),
-        "columns": context.facts.columns,
+        **({"columns": context.facts.columns} if context.facts.columns else {}),
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,

@@ -21,7 +21,7 @@ class ArraySource:
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
-    first_col = 0
+    cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
     attributes: dict[str, Any] = {}  # noqa: RUF012
     row_period: float | None = None

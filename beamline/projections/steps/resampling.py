@@ -130,8 +130,8 @@ class TiltAndLens:
         if not self.tilt_deg and self.distortion is None:
             return None
         lens = self.distortion
-        if lens is not None:
-            lens = replace(lens, col=lens.col - source.first_col)
+        if lens is not None and source.cols is not None:
+            lens = replace(lens, col=lens.col - source.cols[0])
         return Resampling(source.shape, math.radians(self.tilt_deg), lens, selection.binning)
 
 

@@ -39,7 +39,7 @@ class ScanSource(ABC):
         facts: `attributes` of a format in which they do not change.
         pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
-        first_col: column of the detector with which a frame begins.
+        cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
     """
 
@@ -55,7 +55,7 @@ class ScanSource(ABC):
     pixel_size_mm: float | None = None
     energy_kev: float | None = None
     axis_col: float | None = None
-    first_col: int = 0
+    cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
 
     @property

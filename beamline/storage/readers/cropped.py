@@ -27,12 +27,17 @@ class CroppedSource(ScanSource):
         first, end = cols
         if not 0 <= first < end <= base.shape[1]:
             raise ConfigError(f"--cols {first}:{end} do not lie in the detector's 0:{base.shape[1]}.")
-        self._base, self._cols, self.first_col = base, slice(first, end), first
+        self._base, self.cols = base, cols
         self.path, self.format, self.dtype = base.path, base.format, base.dtype
         self.shape = base.shape[0], end - first
         self.quantity, self.pixel_size_mm, self.energy_kev = base.quantity, base.pixel_size_mm, base.energy_kev
         self.cone, self.axis_col = base.cone, None if base.axis_col is None else base.axis_col - first
         self._update()
+
+    @property
+    def _cols(self) -> slice:
+        assert self.cols is not None
+        return slice(*self.cols)
 
     def _update(self) -> None:
         base = self._base
@@ -44,7 +49,7 @@ class CroppedSource(ScanSource):
         if flags is None or flags.regions is None:
             return flags
         regions = flags.regions.copy()
-        regions[..., 2:] -= np.where(regions[..., :1] < 0, 0, self.first_col)  # below 0: no region
+        regions[..., 2:] -= np.where(regions[..., :1] < 0, 0, self._cols.start)  # below 0: no region
         return replace(flags, regions=regions)
 
     @property

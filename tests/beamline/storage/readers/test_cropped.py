@@ -29,7 +29,7 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 def test_pixels_are_those_of_the_columns(path: Path) -> None:
     with open_scan(SourceOptions(path, cols=(1, 4))) as source:
-        assert source.shape == (4, 3) and source.first_col == 1
+        assert source.shape == (4, 3) and source.cols == (1, 4)
         np.testing.assert_array_equal(source.read(slice(None)), FRAMES[..., 1:4])
         np.testing.assert_array_equal(source.read([2, 0], slice(1, 3)), FRAMES[[2, 0], 1:3, 1:4])
         np.testing.assert_array_equal([frame.counts for frame in source.frames(1)], FRAMES[1:, :, 1:4])
