@@ -50,11 +50,11 @@ def posed(turns: np.ndarray = TURNS) -> Geometry:
 
 
 def scan(folder: Path, geometry: Geometry, axes: np.ndarray = AXES) -> Path:
-    counts = 100 + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE))
-    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
+    counts, shape = 100 + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE)), geometry.detector_shape
+    images = [np.full(shape, level) + np.eye(*shape) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
     kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
     angles = [np.nan] * 4 + geometry.angles.tolist()
-    with NXtomoWriter(folder / "scan.h5", ScanInfo("poses", pixel_size_mm=PITCH), SHAPE, clock=SystemClock()) as writer:
+    with NXtomoWriter(folder / "scan.h5", ScanInfo("poses", pixel_size_mm=PITCH), shape, clock=SystemClock()) as writer:
         for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
             frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
             writer.append(frame, digest(frame.counts), [])
