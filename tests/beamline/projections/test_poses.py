@@ -239,3 +239,26 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
         prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
     with pytest.raises(ValueError, match="no sample/x_translation"):
         read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
+
+
+def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> None:
+    roll, tilt = np.radians(TURNS.T)
+    angles, shift = 2 * np.radians(DEGREES), 6 * np.linspace(-1, 1, N)
+    geometry = Geometry.cone(
+        angles,
+        SHAPE,
+        1.5 * PITCH,
+        10.0,
+        15.0,
+        AXIS,
+        shifts=np.stack((shift, SHIFTS[:, 1]), axis=1),
+        roll=roll,
+        tilt=tilt,
+    )
+    poses = table(tmp_path, f"view,{COLUMNS}", np.arange(N), shift, SHIFTS[:, 1], *TURNS.T)
+    found = prepared(
+        scan(tmp_path, geometry), poses, cone=(10.0, 15.0), pixel_size_mm=1.5 * PITCH, axis_col=None, rows=(2, 22)
+    )
+    assert found.axis_col == pytest.approx(AXIS, abs=0.15)
+    left = found.projections.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
+    assert np.abs(left).max() < 0.02
