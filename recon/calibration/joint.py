@@ -1,0 +1,146 @@
+"""Joint steps: the volume and the geometry together, by least squares on the views.
+
+    min over (y, c)  ‖ p - A(g) x - A(g) y - J c ‖²_W        J: what a change c of the geometry does to the images of x
+
+An alternation of volume and geometry would be slow where the volume can hide an error: a slow drift looks like a
+slightly blurred sample. Here both are unknowns of one system, which conjugate gradients solve (Gauss-Newton; the
+geometry's part of bundle adjustment). W is the ramp of filtered back-projection along the columns, so that AᵀWA is near
+the identity and ten steps suffice. CG starts from no change. So it does not move along what the views cannot tell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numba import get_num_threads
+from numpy.typing import NDArray
+from scipy import fft
+
+from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.calibration.freedom import moved, slopes
+from recon.voxels.fbp import _transfer
+from recon.voxels.projector import Projector, projection_lines
+
+_TRIAL = 0.25  # pixels at an image's edge, for the derivative by tilt
+_FLOOR = 0.05  # of the typical view's information: a view without matter does not move
+
+
+@dataclass(eq=False)
+class JointFit:
+    """A volume [y, x, z] and the geometry of some views, improved together step by step.
+
+    Attributes:
+        data: [view, col, row], line integrals.
+        known: [view, col, row] weights of rays; None: one for all.
+        terms: of `freedom.TERMS`, which may change.
+    """
+
+    data: F32
+    geometry: Geometry
+    terms: frozenset[str]
+    grid: Grid
+    known: F32 | None = None
+    volume: F32 = field(init=False)
+
+    def __post_init__(self) -> None:
+        nz, ny, nx = self.grid.shape
+        self.volume = np.zeros((ny, nx, nz), np.float32)
+
+    @classmethod
+    def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None, margin: int = 2) -> JointFit:
+        """Of views [view, row, col]; so many slices more than rows at either end."""
+        grid = Grid.matching(geometry)
+        tall = replace(grid, shape=(grid.shape[0] + 2 * margin, *grid.shape[1:]))
+        rays = None if known is None else projection_lines(known)
+        return cls(projection_lines(data), geometry, terms, tall, rays)
+
+    def weighed(self, images: F32) -> F32:
+        """W images."""
+        if self.known is None:
+            return _ramp(images)
+        return self.known * _ramp(self.known * images)
+
+    def step(self, rounds: int, farthest: float) -> None:
+        """One step of Gauss-Newton on the volume, and on the geometry where the volume is not zero.
+
+        Args:
+            rounds: of conjugate gradients.
+            farthest: pixels that anything may move.
+        """
+        projector = Projector(self.geometry, self.grid)
+        images = projector.forward_lines(self.volume)
+        free: dict[str, F32] = {}
+        if self.terms and self.volume.any():
+            free = slopes(images, self.geometry, self._by_tilt(), self.terms)
+        y, c = _solved(projector, free, self.weighed, self.data - images, rounds)
+        self.volume += y
+        np.maximum(self.volume, 0, out=self.volume)
+        if free:
+            self.geometry = moved(self.geometry, c, farthest)
+
+    def _by_tilt(self) -> F32 | None:
+        """The derivative of the volume's images by tilt, a radian."""
+        if "tilt" not in self.terms:
+            return None
+        trial = _TRIAL / max(self.geometry.detector_shape)
+        ahead, behind = (replace(self.geometry, tilt=self.geometry.tilt + s * trial) for s in (1, -1))
+        there, back = (Projector(each, self.grid).forward_lines(self.volume) for each in (ahead, behind))
+        return (there - back) / np.float32(2 * trial)
+
+
+def _ramp(images: F32) -> F32:
+    cols = images.shape[1]
+    n = fft.next_fast_len(2 * cols, real=True)
+    spectrum = fft.rfft(images, n, axis=1, workers=get_num_threads())
+    spectrum *= _transfer(n, 1.0, "hann")[:, None]
+    return np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
+
+
+def _solved(projector: Projector, free: dict[str, F32], weighed: object, left: F32, rounds: int) -> tuple[F32, dict[str, F64]]:
+    """The change of the volume, and of each free quantity: [view] for the places of views, [1] for the others."""
+    assert callable(weighed)
+    first = projector.adjoint_lines(weighed(left))
+    seen = projector.forward_lines(first)
+    typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))
+    scale: dict[str, NDArray[np.float64]] = {}
+    for name, slope in free.items():
+        told = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
+        told = np.maximum(told, _FLOOR * np.median(told)) if name in ("col", "row") else told.sum(keepdims=True)
+        scale[name] = np.sqrt(typical / np.maximum(told, 1e-30))
+
+    def back(images: F32) -> tuple[F32, dict[str, F64]]:
+        found = {}
+        for name, slope in free.items():
+            each = np.einsum("vcr,vcr->v", slope, images).astype(np.float64)
+            found[name] = scale[name] * (each if scale[name].size > 1 else each.sum(keepdims=True))
+        return projector.adjoint_lines(images), found
+
+    def dot(a: tuple[F32, dict[str, F64]]) -> float:
+        return float(np.vdot(a[0], a[0])) + sum(float(v @ v) for v in a[1].values())
+
+    y, c = np.zeros_like(first), {name: np.zeros(s.size) for name, s in scale.items()}
+    gradient = back(weighed(left))
+    along = gradient[0].copy(), {name: v.copy() for name, v in gradient[1].items()}
+    size = dot(gradient)
+    for _ in range(rounds):
+        if size == 0:
+            break
+        image = projector.forward_lines(along[0])
+        for name, slope in free.items():
+            image += slope * (scale[name] * along[1][name]).astype(np.float32)[:, None, None]
+        pulled = weighed(image)
+        far = size / max(float(np.vdot(image, pulled)), 1e-30)
+        y += np.float32(far) * along[0]
+        change = back(pulled)
+        for name in c:
+            c[name] += far * along[1][name]
+            gradient[1][name] -= far * change[1][name]
+        gradient = gradient[0] - np.float32(far) * change[0], gradient[1]
+        before, size = size, dot(gradient)
+        along = gradient[0] + np.float32(size / before) * along[0], {
+            name: gradient[1][name] + size / before * along[1][name] for name in c
+        }
+    return y, {name: scale[name] * value for name, value in c.items()}
