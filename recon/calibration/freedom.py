@@ -95,9 +95,9 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
         u = np.arange(cols) - geometry.axis_col - geometry.shifts[:, :1]
         v = np.arange(rows) - geometry.axis_row - geometry.shifts[:, 1:]
         turned = across * v[:, None, :].astype(np.float32) - down * u[:, :, None].astype(np.float32)
-        found["roll"] = turned / np.float32(reach(geometry))
+        found["roll"] = np.asarray(turned / reach(geometry), np.float32)
     if tilted is not None:
-        found["tilt"] = tilted / np.float32(reach(geometry))
+        found["tilt"] = np.asarray(tilted / reach(geometry), np.float32)
     return found
 
 

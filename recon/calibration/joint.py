@@ -50,7 +50,9 @@ class JointFit:
         self.volume = np.zeros((ny, nx, nz), np.float32)
 
     @classmethod
-    def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None, margin: int = 2) -> JointFit:
+    def of(
+        cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None, margin: int = 2
+    ) -> JointFit:
         """Of views [view, row, col]; so many slices more than rows at either end."""
         grid = Grid.matching(geometry)
         tall = replace(grid, shape=(grid.shape[0] + 2 * margin, *grid.shape[1:]))
@@ -99,7 +101,9 @@ def _ramp(images: F32) -> F32:
     return np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
 
 
-def _solved(projector: Projector, free: dict[str, F32], weighed: object, left: F32, rounds: int) -> tuple[F32, dict[str, F64]]:
+def _solved(
+    projector: Projector, free: dict[str, F32], weighed: object, left: F32, rounds: int
+) -> tuple[F32, dict[str, F64]]:
     """The change of the volume, and of each free quantity: [view] for the places of views, [1] for the others."""
     assert callable(weighed)
     first = projector.adjoint_lines(weighed(left))
@@ -140,7 +144,8 @@ def _solved(projector: Projector, free: dict[str, F32], weighed: object, left: F
             gradient[1][name] -= far * change[1][name]
         gradient = gradient[0] - np.float32(far) * change[0], gradient[1]
         before, size = size, dot(gradient)
-        along = gradient[0] + np.float32(size / before) * along[0], {
-            name: gradient[1][name] + size / before * along[1][name] for name in c
-        }
+        along = (
+            gradient[0] + np.float32(size / before) * along[0],
+            {name: gradient[1][name] + size / before * along[1][name] for name in c},
+        )
     return y, {name: scale[name] * value for name, value in c.items()}
