@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
+from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
@@ -34,30 +36,25 @@ class Projector:
     of voxels, bilinearly. The volume is 0 outside the box. In mm times the volume's unit, float32.
 
     Raises:
-        ValueError: for views that are rolled or tilted (Gaussians take these), or a box that reaches the source.
+        ValueError: for a box that reaches the source, or a wide cone seen under a large tilt (see `posed.ray_table`).
     """
 
     geometry: Geometry
     grid: Grid
     _rays: NDArray[np.float64] = field(init=False, repr=False)
-    _steep: NDArray[np.bool_] = field(init=False, repr=False)
+    _axes: NDArray[Any] = field(init=False, repr=False)  # of the planes that sample each ray, as the kernels count them
 
     def __post_init__(self) -> None:
-        if not self.geometry.is_straight:
-            worst = np.rad2deg(max(np.abs(self.geometry.roll).max(), np.abs(self.geometry.tilt).max()))
-            raise ValueError(
-                f"views are rolled or tilted by up to {worst:.3g} degrees; the voxel projector takes straight ones "
-                "only: rotate the images first, or fit Gaussians (method r2)"
-            )
         reach = float(np.hypot(*np.abs(self.grid.edges[:, :2]).max(0)))
         if self.geometry.is_cone and reach >= self.geometry.sod:
             raise ValueError(
                 f"the box reaches {reach:.4g} mm from the rotation axis, but the source stands at "
                 f"{self.geometry.sod:.4g} mm: give a smaller grid"
             )
-        rays, steep = joseph_cpu.ray_table(self.geometry, self.grid)
+        kernels = joseph_cpu if self.geometry.is_straight else posed_cpu
+        rays, axes = kernels.ray_table(self.geometry, self.grid)
         object.__setattr__(self, "_rays", rays)
-        object.__setattr__(self, "_steep", steep)
+        object.__setattr__(self, "_axes", axes)
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -81,13 +78,15 @@ class Projector:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
-        if self.geometry.is_cone:
-            cone_cpu.forward(volume, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
+        if not self.geometry.is_straight:
+            posed_cpu.forward(volume, self._rays, self._axes, result)
+        elif self.geometry.is_cone:
+            cone_cpu.forward(volume, self._rays, self._axes, *self._heights(), self.geometry.pixel_pitch, result)
         elif self._on_rows():
-            joseph_cpu.forward(volume, self._rays, self._steep, result)
+            joseph_cpu.forward(volume, self._rays, self._axes, result)
         else:
             slices = np.empty((views, cols, self.grid.shape[0]), np.float32)
-            joseph_cpu.forward(volume, self._rays, self._steep, slices)
+            joseph_cpu.forward(volume, self._rays, self._axes, slices)
             rows_from_slices(slices, *self._levels(), result)
         return result
 
@@ -95,14 +94,16 @@ class Projector:
         """Aᵀ p: projections [view, col, row] to a volume [y, x, z]."""
         nz, ny, nx = self.grid.shape
         result = np.empty((ny, nx, nz), np.float32) if out is None else out
-        if self.geometry.is_cone:
-            cone_cpu.adjoint(projections, self._rays, self._steep, *self._heights(), self.geometry.pixel_pitch, result)
+        if not self.geometry.is_straight:
+            posed_cpu.adjoint(projections, self._rays, self._axes, result)
+        elif self.geometry.is_cone:
+            cone_cpu.adjoint(projections, self._rays, self._axes, *self._heights(), self.geometry.pixel_pitch, result)
         elif self._on_rows():
-            joseph_cpu.adjoint(projections, self._rays, self._steep, result)
+            joseph_cpu.adjoint(projections, self._rays, self._axes, result)
         else:
             slices = np.empty((*projections.shape[:2], nz), np.float32)
             slices_from_rows(projections, *self._levels(), slices)
-            joseph_cpu.adjoint(slices, self._rays, self._steep, result)
+            joseph_cpu.adjoint(slices, self._rays, self._axes, result)
         return result
 
     def _heights(self) -> tuple[NDArray[np.float64], float]:
