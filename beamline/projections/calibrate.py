@@ -17,9 +17,8 @@ from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.calibration.freedom import Change
-from recon.calibration.learn import Learnt, learn_geometry
+from recon.calibration.learn import COLS, ROWS, Learnt, learn_geometry
 
-_COLS, _ROWS = 192, 64  # binned pixels looked at, at most
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
 
 I64 = NDArray[np.int64]
@@ -35,18 +34,20 @@ class Calibrated:
         change: in pixels of the detector, about the middle row of the band.
         pitch: mm of such a pixel.
         off_middle: rows from the middle of the band to that of the rows used.
-        learnt: what views held out say of it.
+        binning: of the pixels of the band.
+        learnt: with what views held out say of it.
     """
 
     frames: I64
     change: Change
     pitch: float
     off_middle: float
+    binning: int
     learnt: Learnt
 
     @property
     def done(self) -> StepDone:
-        return StepDone(self.learnt.said, self.learnt.parameters)
+        return StepDone(self.learnt.said(self.binning), self.learnt.parameters(self.binning))
 
     @property
     def axis(self) -> float:
@@ -92,7 +93,7 @@ def calibrated(
     used, looked = rows_of(source, selection), rows_of(source, band)
     whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
     off = 0.0 if before.is_cone else (used.start + used.stop - looked.start - looked.stop) / 2
-    return Calibrated(ids, learnt.change.scaled(band.binning), whole.pixel_pitch, off, learnt)
+    return Calibrated(ids, learnt.change.scaled(band.binning), whole.pixel_pitch, off, band.binning, learnt)
 
 
 def search_memory(part: ScanPart, terms: frozenset[str]) -> int:
@@ -109,7 +110,7 @@ def _band(source: ScanSource, selection: Selection) -> Selection:
     """Rows around the middle of those used, with pixels binned so that a volume of them is quick."""
     used = rows_of(source, selection)
     height = used.stop - used.start
-    binning = max(selection.binning, min(math.ceil(source.shape[1] / _COLS), height))
-    n = min(height, _ROWS * binning)
+    binning = max(selection.binning, min(math.ceil(source.shape[1] / COLS), height))
+    n = min(height, ROWS * binning)
     first = (used.start + used.stop - n) // 2
     return replace(selection, rows=(first, first + n), binning=binning)
