@@ -22,12 +22,11 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.calibration.freedom import moved, slopes
-from recon.voxels.fbp import _transfer
+from recon.voxels.fbp import ramp
 from recon.voxels.projector import Projector, projection_lines
 
 _TRIAL = 0.25  # pixels at an image's edge, for the derivative by tilt
-
-_ROWS_SHARE = 0.0
+_MARGIN = 3  # slices beyond the rows at either end
 _FLOOR = 0.05  # of the typical view's information: a view without matter does not move
 
 
@@ -55,12 +54,9 @@ class JointFit:
         self.turned = _turned_back(self.data, self.geometry) if self.geometry.roll.any() else self.data
 
     @classmethod
-    def of(
-        cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None, margin: int = 2
-    ) -> JointFit:
-        """Of views [view, row, col]; so many slices more than rows at either end."""
-        grid = Grid.matching(geometry)
-        tall = replace(grid, shape=(grid.shape[0] + 2 * margin, *grid.shape[1:]))
+    def of(cls, data: F32, geometry: Geometry, terms: frozenset[str], known: F32 | None = None) -> JointFit:
+        """Of views [view, row, col]."""
+        tall = taller(Grid.matching(geometry))
         rays = None if known is None else projection_lines(known)
         return cls(projection_lines(data), geometry, terms, tall, rays)
 
@@ -89,6 +85,11 @@ class JointFit:
             self.geometry = moved(self.geometry, c, farthest)
             if {"col", "roll"} & set(free) and self.geometry.roll.any():
                 self.turned = _turned_back(self.data, self.geometry)
+
+
+def taller(grid: Grid) -> Grid:
+    """The grid with more slices at either end, for rays of views that lean or are shifted."""
+    return replace(grid, shape=(grid.shape[0] + 2 * _MARGIN, *grid.shape[1:]))
 
 
 class _Model:
@@ -157,12 +158,8 @@ def _ramp(images: F32) -> F32:
     cols = images.shape[1]
     n = fft.next_fast_len(2 * cols, real=True)
     spectrum = fft.rfft(images, n, axis=1, workers=get_num_threads())
-    spectrum *= _transfer(n, 1.0, "hann")[:, None]
+    spectrum *= ramp(n, 1.0, "hann")[:, None]
     out = np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
-    if images.shape[2] > 1 and _ROWS_SHARE:
-        steps = np.diff(images, axis=2) * np.float32(_ROWS_SHARE)
-        out[..., :-1] -= steps
-        out[..., 1:] += steps
     return out
 
 

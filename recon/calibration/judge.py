@@ -21,6 +21,7 @@ from recon.voxels.projector import Projector
 
 _ONE_IN = 4  # views held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
+_EDGE = 3  # rows at either end, in which rays of leaning views leave the slices seen
 _LEAST = 0.002  # share of the squared deviation that a better geometry takes away
 _SURE = 2.0  # standard errors of that share, from view to view
 
@@ -45,6 +46,7 @@ class Judge:
         """[view held out] root mean squares by a volume of the others in this geometry."""
         order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
         unseen = order[1::_ONE_IN]
+        rows = geometry.detector_shape[0]
         seen = np.setdiff1d(order, unseen)
         use = DataUse()
         if self.known is not None:
@@ -52,7 +54,9 @@ class Judge:
         problem = ReconProblem(self.views[seen], geometry.select(seen), self.grid, use, 0, "cpu")
         volume = FistaTv(_SWEEPS, _TV_WEIGHT).run(problem, RunControl()).volume
         images = Projector(geometry.select(unseen), self.grid).forward(volume.data)
-        known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known
+        known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
+        edge = min(_EDGE, (rows - 1) // 4)
+        known[:edge], known[rows - edge :] = 0, 0
         return np.array(
             [self._left(view - image, image, known) for view, image in zip(self.views[unseen], images, strict=True)]
         )

@@ -14,7 +14,7 @@ from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.calibration.freedom import TERMS, Change, reach
-from recon.calibration.joint import JointFit
+from recon.calibration.joint import JointFit, taller
 from recon.calibration.judge import Judge, better
 
 COLS, ROWS = 160, 64
@@ -135,7 +135,10 @@ def _confirmed(
     sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
     wanted = [term for term, size in zip(TERMS, sizes, strict=True) if size > _NOTHING]
     judge = Judge(
-        data, Grid.matching(small), None if known is None else bin_views(known[None], factor)[0], "shifts" in wanted
+        data,
+        taller(Grid.matching(small)),
+        None if known is None else bin_views(known[None], factor)[0],
+        "shifts" in wanted,
     )
 
     def judged(terms: list[str]) -> NDArray[np.float64]:
