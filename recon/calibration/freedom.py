@@ -86,10 +86,10 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
     """
     across, down = -np.gradient(images, axis=1), -np.gradient(images, axis=2) if images.shape[2] > 1 else 0 * images
     found: dict[str, F32] = {}
+    if "axis" in terms:  # beside shifts, too: their mean then comes in one step
+        found["axis"] = across
     if "shifts" in terms:
         found |= {"col": across, "row": down}
-    elif "axis" in terms:
-        found["axis"] = across
     rows, cols = geometry.detector_shape
     if "roll" in terms:
         u = np.arange(cols) - geometry.axis_col - geometry.shifts[:, :1]
@@ -114,7 +114,7 @@ def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: f
         shifts += np.stack((limited["col"], limited["row"]), axis=1)
         shifts, mean = knowable(shifts, geometry.angles)
         axis += mean
-    elif "axis" in limited:
+    if "axis" in limited:
         axis += float(limited["axis"][0])
     turns = {name: float(limited[name][0]) / reach(geometry) for name in ("roll", "tilt") if name in limited}
     limit = math.radians(30)

@@ -159,8 +159,7 @@ def _ramp(images: F32) -> F32:
     n = fft.next_fast_len(2 * cols, real=True)
     spectrum = fft.rfft(images, n, axis=1, workers=get_num_threads())
     spectrum *= ramp(n, 1.0, "hann")[:, None]
-    out = np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
-    return out
+    return np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
 
 
 def _solved(model: _Model, free: dict[str, F32], weighed: object, left: F32, rounds: int) -> tuple[F32, dict[str, F64]]:

@@ -17,10 +17,10 @@ from recon.calibration.freedom import TERMS, Change, reach
 from recon.calibration.joint import JointFit, taller
 from recon.calibration.judge import Judge, better
 
-COLS, ROWS = 160, 64
+COLS, ROWS = 320, 96
 """Pixels that show the geometry; more cost time."""
 _LEAST_VIEWS = 12
-_FEWEST, _ENOUGH = 20, 96  # columns of the coarsest pixels; from so many on, pixels are binned at least by two
+_FEWEST = 20  # columns of the coarsest pixels
 _AXIS_STEPS, _AXIS_ROUNDS = 4, 8  # the axis alone comes first: from far off, views would move in its place
 _STEPS = 6, 4, 3  # of Gauss-Newton, from the coarsest pixels on
 _ROUNDS = 16  # of conjugate gradients in each
@@ -115,7 +115,7 @@ def learn_geometry(
 
 def _factors(rows: int, cols: int) -> list[int]:
     """Binning of the levels, from coarse to fine."""
-    finest = 2 if cols >= 2 * _FEWEST and cols <= _ENOUGH and rows > 1 else 1
+    finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1  # a pixel is not needed for a hundredth of it
     found = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
     return found[-len(_STEPS) :] or [1]
 
@@ -151,8 +151,11 @@ def _confirmed(
         after = judged(kept)
         if not better(after, before):
             kept, after = [], before
-        for term in list(kept) if len(kept) > 1 else []:
-            rest = [each for each in kept if each != term]
+        # Shifts and axis are one: the axis is their mean.
+        places = [term for term in kept if term in ("axis", "shifts")]
+        groups = [each for each in (places, *([term] for term in kept if term not in places)) if each]
+        for group in groups if len(groups) > 1 else []:
+            rest = [term for term in kept if term not in group]
             without = judged(rest)
             if not better(after, without):
                 kept, after = rest, without
