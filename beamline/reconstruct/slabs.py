@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -260,7 +259,16 @@ def prepare_within(
 
     memory = memory_of(options)
     spill = spill_of(source, options, progress, say)
-    check = None if options.region is None else partial(locate, options.region, options.selection)
+
+    def check(geometry: Geometry) -> None:
+        if options.region is not None:
+            locate(options.region, options.selection, geometry)
+        if spill is not None and not geometry.is_straight:
+            raise DataError(
+                f"{source.path}: its views are rolled or tilted, and a volume in slabs takes rows for slices. "
+                "The whole scan has to be in memory: give more --memory, or --bin 2, or fewer --rows."
+            )
+
     prepared = prepare_projections(source, options.selection, warn, spill, check, phases)
     geometry, method = prepared.geometry, options.method_for(prepared.geometry)
     if spill is None:
@@ -268,8 +276,6 @@ def prepare_within(
             raise DataError(f"{options.partial} holds slabs, and {source.path} is a cone, which is not made in slabs.")
         _refuse_wider(source, prepared, Needs(method, geometry, 0, not method.traits.direct), memory)
         return prepared, []
-    if not geometry.is_straight:
-        raise DataError(f"{source.path}: its views are rolled or tilted, which needs the whole scan in memory.")
     weighted = not method.traits.direct and (prepared.ray_factors() is not None or prepared.shares_of is not None)
     needs = Needs(method, geometry, 0, weighted)
     refuse_smallest(source, needs, memory, options.selection.binning)

@@ -31,7 +31,7 @@ Axes = NDArray[np.int8]
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     """The path of the rays of every column: float64 [view, col, 12], and the axis across its planes, int8 [view, col].
 
-    The axis is 0 for planes of constant y, 1 for x, 2 for z. The other two axes have the order (x, z), (y, z) or (y, x).
+    The axis is 0 for planes of constant y, 1 for x, 2 for z. The other two are (x, z), (y, z) or (y, x), in this order.
     In plane j the ray to a row is at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row) of the first one. Of the second
     one t4 to t7 say the same. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -11,7 +12,20 @@ import pytest
 from click.testing import CliRunner
 
 from beamline.cli.main import main
-from tests.beamline.projections.test_poses import AXIS, COLUMNS, PITCH, SHIFTS, TURNS, N, every, posed, scan, table
+from tests.beamline.projections.test_poses import (
+    AXES,
+    AXIS,
+    COLUMNS,
+    PITCH,
+    SHAPE,
+    SHIFTS,
+    TURNS,
+    N,
+    every,
+    posed,
+    scan,
+    table,
+)  # fmt: skip
 
 FEW = ["--axis", str(AXIS), "--method", "sirt", "--iterations", "4"]
 
@@ -75,3 +89,19 @@ def test_methods_that_judge_by_views_held_out_take_poses(tmp_path: Path, method:
     words += ["--steps", "20"] if method == "r2" else []
     code, said = run("recon", scan(tmp_path, posed()), "--poses", every(tmp_path), *words, "-o", tmp_path / "a.h5")
     assert code == 0, said
+
+
+def test_slabs_take_shifts_and_refuse_views_that_lean(tmp_path: Path) -> None:
+    geometry = replace(posed(0 * TURNS), detector_shape=(160, SHAPE[1]), axis_row=79.5)
+    path = scan(tmp_path, geometry, AXES * (1, 1, 8))
+    shifts = table(tmp_path, "view,shift_col_px,shift_row_px", np.arange(N), *SHIFTS.T, name="shifts.csv")
+    words = ["recon", path, "--axis", AXIS, "-m", "fbp", "--no-report", "-o"]
+    for name, memory in (("whole.h5", "1G"), ("slabs.h5", "3M")):
+        code, said = run(*words, tmp_path / name, "--poses", shifts, "--memory", memory)
+        assert code == 0, said
+    with h5py.File(tmp_path / "whole.h5") as whole, h5py.File(tmp_path / "slabs.h5") as slabs:
+        np.testing.assert_array_equal(whole["entry/data/data"], slabs["entry/data/data"])
+        assert slabs["entry/data/data"].chunks is None  # made in slabs: one contiguous place
+    code, said = run(*words, tmp_path / "none.h5", "--poses", every(tmp_path), "--memory", "3M")
+    assert code != 0 and "rolled or tilted" in said and "more --memory" in said
+    assert not (tmp_path / "none.h5").exists()

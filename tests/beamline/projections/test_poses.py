@@ -50,11 +50,11 @@ def posed(turns: np.ndarray = TURNS) -> Geometry:
 
 
 def scan(folder: Path, geometry: Geometry, axes: np.ndarray = AXES) -> Path:
-    counts = 100 + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE))
-    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
+    counts, shape = 100 + 40_000 * np.exp(-ellipsoid_shadow(geometry, axes, CENTRE)), geometry.detector_shape
+    images = [np.full(shape, level) + np.eye(*shape) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
     kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
     angles = [np.nan] * 4 + geometry.angles.tolist()
-    with NXtomoWriter(folder / "scan.h5", ScanInfo("poses", pixel_size_mm=PITCH), SHAPE, clock=SystemClock()) as writer:
+    with NXtomoWriter(folder / "scan.h5", ScanInfo("poses", pixel_size_mm=PITCH), shape, clock=SystemClock()) as writer:
         for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
             frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
             writer.append(frame, digest(frame.counts), [])
@@ -239,3 +239,26 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
         prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
     with pytest.raises(ValueError, match="no sample/x_translation"):
         read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
+
+
+def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> None:
+    roll, tilt = np.radians(TURNS.T)
+    angles, shift = 2 * np.radians(DEGREES), 6 * np.linspace(-1, 1, N)
+    geometry = Geometry.cone(
+        angles,
+        SHAPE,
+        1.5 * PITCH,
+        10.0,
+        15.0,
+        AXIS,
+        shifts=np.stack((shift, SHIFTS[:, 1]), axis=1),
+        roll=roll,
+        tilt=tilt,
+    )
+    poses = table(tmp_path, f"view,{COLUMNS}", np.arange(N), shift, SHIFTS[:, 1], *TURNS.T)
+    found = prepared(
+        scan(tmp_path, geometry), poses, cone=(10.0, 15.0), pixel_size_mm=1.5 * PITCH, axis_col=None, rows=(2, 22)
+    )
+    assert found.axis_col == pytest.approx(AXIS, abs=0.15)
+    left = found.projections.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
+    assert np.abs(left).max() < 0.02
