@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
@@ -22,6 +23,7 @@ from recon.voxels.projector import Projector
 _ONE_IN = 4  # views held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
 _EDGE = 3  # rows at either end, in which rays of leaning views leave the slices seen
+_SMOOTH = 4.0  # pixels
 _LEAST = 0.002  # share of the squared deviation that a better geometry takes away
 _SURE = 2.0  # standard errors of that share, from view to view
 
@@ -63,12 +65,17 @@ class Judge:
 
     def _left(self, left: F32, image: F32, known: F32) -> float:
         """Root mean square of what is left of a view, after it was put where it fits best."""
-        rays = left[known > 0].astype(np.float64)
+        rays = _without_smooth(left)[known > 0]
         if self.placed:
-            ways = [np.gradient(image, axis=axis)[known > 0] for axis in (0, 1) if image.shape[axis] > 1]
-            slopes = np.stack(ways, axis=1).astype(np.float64)
+            ways = [_without_smooth(np.gradient(image, axis=axis)) for axis in (0, 1) if image.shape[axis] > 1]
+            slopes = np.stack([way[known > 0] for way in ways], axis=1)
             rays = rays - slopes @ np.linalg.lstsq(slopes, rays, rcond=1e-6)[0]
         return float(np.sqrt(np.mean(rays**2)))
+
+
+def _without_smooth(image: F32) -> F64:
+    """Differences from the surroundings: air that is not zero and matter beyond the field are smooth."""
+    return np.asarray(image - gaussian_filter(image, _SMOOTH, mode="nearest"), np.float64)
 
 
 def better(one: F64, other: F64) -> bool:

@@ -146,15 +146,18 @@ def _confirmed(
         return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
 
     before = judged([])
-    kept, after = list(wanted), before
-    if wanted:
-        after = judged(kept)
-        if not better(after, before):
-            kept, after = [], before
-        # Shifts and axis are one: the axis is their mean.
-        places = [term for term in kept if term in ("axis", "shifts")]
-        groups = [each for each in (places, *([term] for term in kept if term not in places)) if each]
+    # Shifts and axis are one: the axis is their mean.
+    places = [term for term in wanted if term in ("axis", "shifts")]
+    groups = [each for each in (places, *([term] for term in wanted if term not in places)) if each]
+    kept, after = list(wanted), judged(wanted) if wanted else before
+    if not better(after, before):
+        kept, after = [], before
         for group in groups if len(groups) > 1 else []:
+            alone = judged(group)
+            if better(alone, after):
+                kept, after = group, alone
+    elif len(groups) > 1:
+        for group in groups:
             rest = [term for term in kept if term not in group]
             without = judged(rest)
             if not better(after, without):
