@@ -12,11 +12,13 @@ from beamline.core.errors import DataError
 from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
+from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, checked_views
 from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
+from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import Places, PlaceStep, RayStep, ScanStep, StepDone
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
@@ -96,19 +98,30 @@ def prepare_projections(
             warn(places.said)
         usable = usable.only(places.frames)
 
-    def seen(view_ids: NDArray[np.int64]) -> Geometry:
-        geometry = geometry_of(source, selection, axis_col, source.angles[view_ids])
+    learnt: Calibrated | None = None
+
+    def placed(part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
+        geometry = geometry_of(source, part, axis_col, source.angles[view_ids])
         for places in moved.values():
             geometry = places.corrected(geometry, view_ids)
         for ray_step in (step for step in selection.in_order if isinstance(step, RayStep)):
-            geometry, rays[ray_step.name] = ray_step.rays(source, selection, geometry)
+            geometry, rays[ray_step.name] = ray_step.rays(source, part, geometry)
         return geometry
+
+    def seen(view_ids: NDArray[np.int64]) -> Geometry:
+        geometry = placed(selection, view_ids)
+        return geometry if learnt is None else learnt.corrected(geometry, view_ids)
 
     chosen = choose_views(source, usable.frames, selection, seen(usable.frames).period)
     wanted, rest = usable.frames[chosen], np.delete(usable.frames, chosen)
     if poses is not None:
         require_known(poses, source, selection, wanted)
         rest = rest[poses.known(rest)]
+    others_ids = spread(rest, _HELD_OUT_VIEWS)
+    calibrate = selection.step(Calibrate)
+    if calibrate.geometry:
+        phases.enter("calibration", "steps")
+        learnt = calibrate.learn(source, selection, np.union1d(wanted, others_ids), placed, phases.progress)
     if check is not None:
         check(seen(wanted))
     phases.enter("correction")
@@ -117,20 +130,24 @@ def prepare_projections(
     else:
         projections = correction.in_batches(wanted, spill.views, spill.batch, spill.progress)
     phases.enter("background, rings, views held out, hardening", "corrections")
-    others = correction.at_once(spread(rest, _HELD_OUT_VIEWS)) if rest.size else None
+    others = correction.at_once(others_ids) if rest.size else None
     ids = projections.view_ids
-    found = assemble(source, selection, projections, seen(ids), (axis_col, axis), usable, warn, spill is not None)
+    column = axis_col if learnt is None else axis_col + learnt.axis
+    found = assemble(source, selection, projections, seen(ids), (column, axis), usable, warn, spill is not None)
     if others is not None:
         found = replace(found, held_out=(others.data, seen(others.view_ids)))
     done = {**correction.done, **({"tilt": selection.step(TiltAndLens).done(sought)} if sought else {})}
     done |= {name: places.done for name, places in moved.items()} | rays
+    if learnt is not None:
+        done[calibrate.name] = learnt.done
+    found = replace(found, done=done)
     steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(found, source.angles[ids])
         phases.progress(n, len(steps))
     if spill is not None:
         _fill_unknown(found)
-    return replace(found, done=done)
+    return found
 
 
 def _fill_unknown(found: PreparedProjections) -> None:

@@ -26,6 +26,7 @@ REGISTRY: dict[str, str] = {
     "jumps": "Jumps",
     "poses": "PosesOfFile",
     "width": "Width",
+    "calibrate": "Calibrate",
     "rings": "Rings",
     "hardening": "Hardening",
 }

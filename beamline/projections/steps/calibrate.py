@@ -1,0 +1,96 @@
+"""Calibration: what the scan does not state of its geometry and its detector is learnt from the views themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import TYPE_CHECKING, ClassVar
+
+from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from beamline.projections.calibrate import Calibrated
+    from beamline.projections.prepared import PreparedProjections
+    from beamline.projections.selection import Selection
+    from beamline.storage.readers.base import ScanSource
+    from recon.base.geometry import Geometry
+
+GEOMETRY = "axis", "roll", "tilt", "shifts"
+OF_VIEWS: dict[str, str] = {}
+"""Terms that change line integrals: name, and `module:function` of ("views", "angles") to a StepDone, as
+`ScanStep.apply`. Each takes its line here."""
+
+
+def _terms(text: str) -> tuple[str, ...]:
+    """A list of terms without "none"; in the order of the registry."""
+    names = [name.strip() for name in text.split(",")]
+    if names == ["none"]:
+        return ()
+    every = *GEOMETRY, *OF_VIEWS
+    unknown = [name for name in names if name not in every]
+    if unknown:
+        raise ValueError(f"{', '.join(unknown)!r} is none of {', '.join(every)}")
+    return tuple(name for name in every if name in names)
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """What is learnt from the views.
+
+    Attributes:
+        terms: names; none: nothing.
+    """
+
+    name: ClassVar[str] = "calibrate"
+    follows: ClassVar[tuple[str, ...]] = ("jumps", "poses", "background")
+    terms: tuple[str, ...] = option(
+        "--calibrate",
+        "none",
+        "What is learnt from the views, a list of: axis, roll (its lean in the detector's plane), tilt (along the "
+        "beam), shifts (of each view). It enters the geometry, views are not resampled; what views held out do not "
+        "confirm stays as it was.",
+        parse=_terms,
+        metavar="LIST",
+    )
+
+    @property
+    def geometry(self) -> frozenset[str]:
+        """The terms that change the geometry."""
+        return frozenset(self.terms).intersection(GEOMETRY)
+
+    @property
+    def needs_finished(self) -> str:
+        return "--calibrate is for a finished scan: it needs all views." if self.terms else ""
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        from beamline.projections.calibrate import search_memory
+
+        return StepMemory(alone=search_memory(part, self.geometry))
+
+    def learn(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        frames: NDArray[np.int64],
+        seen: Callable[[Selection, NDArray[np.int64]], Geometry],
+        progress: Callable[[int, int], None],
+    ) -> Calibrated:
+        from beamline.projections.calibrate import calibrated
+
+        return calibrated(source, selection, frames, seen, self.geometry, progress)
+
+    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
+        if not self.terms:
+            return StepDone("", {"calibrate": "none"})
+        done = [views.done[self.name]] if self.name in views.done else []
+        for term, place in OF_VIEWS.items():
+            if term in self.terms:
+                module, function = place.split(":")
+                done.append(getattr(import_module(module), function)(views, angles))
+        said = " ".join(each.said for each in done if each.said)
+        values = {key: value for each in done for key, value in (each.parameters or {}).items()}
+        return StepDone(said, {"calibrate": ",".join(self.terms), "calibrate_said": said, **values})

@@ -1,0 +1,176 @@
+"""learn_geometry: a better geometry from line integrals, from coarse to fine pixels, confirmed by views held out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32
+from recon.base.binning import bin_views
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.calibration.freedom import TERMS, Change, reach
+from recon.calibration.joint import JointFit, taller
+from recon.calibration.judge import Judge, better
+
+COLS, ROWS = 320, 96
+"""Pixels that show the geometry; more cost time."""
+_LEAST_VIEWS = 12
+_FEWEST = 20  # columns of the coarsest pixels
+_AXIS_STEPS, _AXIS_ROUNDS = 4, 8  # the axis alone comes first: from far off, views would move in its place
+_STEPS = 6, 4, 3  # of Gauss-Newton, from the coarsest pixels on
+_ROUNDS = 16  # of conjugate gradients in each
+_FARTHEST = 2.0  # binned pixels that anything moves in a step
+_NOTHING = 0.03  # pixels at an image's edge, of the views given: a turn by less is none
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """What was learnt of a geometry.
+
+    Attributes:
+        change: in pixels of the views; what was not confirmed is zero.
+        confirmed, dropped: names of terms.
+        before, after: median deviation of views held out, by volumes of the others.
+    """
+
+    change: Change
+    confirmed: tuple[str, ...]
+    dropped: tuple[str, ...]
+    before: float
+    after: float
+
+    def said(self, binning: int = 1) -> str:
+        """In a sentence, in pixels smaller by `binning`."""
+        told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
+        kept = f"{', '.join(self.dropped)}: left as it was, views held out do not confirm a change."
+        if not told:
+            return f"Geometry: {kept}"
+        first = f"Geometry learnt: {told}. Views held out deviate by {self.after:.4g} in place of {self.before:.4g}."
+        return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
+
+    def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
+        """For the file of a volume, by name; pixels smaller by `binning`."""
+        return {
+            "calibrate_confirmed": ",".join(self.confirmed) or "none",
+            "calibrate_axis_change_px": self.change.axis * binning,
+            "calibrate_roll_deg": math.degrees(self.change.roll),
+            "calibrate_tilt_deg": math.degrees(self.change.tilt),
+            "calibrate_held_out_before": self.before,
+            "calibrate_held_out_after": self.after,
+        }
+
+
+def learn_geometry(
+    projections: F32,
+    geometry: Geometry,
+    terms: frozenset[str],
+    progress: Callable[[int, int], None] = lambda n, total: None,
+    known: F32 | None = None,
+) -> Learnt:
+    """The geometry by which a volume explains the views best, as far as views held out confirm it.
+
+    Args:
+        projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.
+        terms: what may change, of `freedom.TERMS`.
+        progress: steps done, and steps at most.
+        known: [row, col] weights of pixels; None: one for all.
+
+    Raises:
+        ValueError: fewer than twelve views, or views without matter.
+    """
+    if geometry.n_views < _LEAST_VIEWS:
+        raise ValueError(f"{geometry.n_views} views are too few; {_LEAST_VIEWS} are needed")
+    if not projections.any():
+        raise ValueError("the views show no matter")
+    factors = _factors(*geometry.detector_shape)
+    steps = _STEPS[: len(factors)]
+    total, done = _AXIS_STEPS + sum(steps) + 2 + len(terms), 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    found = geometry
+    for factor, count in zip(factors, steps, strict=True):
+        small, data = found.binned(factor), bin_views(projections, factor)
+        fit = JointFit.of(data, small, frozenset({"axis"}), _weights(known, factor, data))
+        fit.step(_AXIS_ROUNDS, 0.0)
+        if factor == factors[0] and "axis" in terms:
+            for _ in range(_AXIS_STEPS):
+                fit.step(_AXIS_ROUNDS, _FARTHEST)
+                tick()
+        fit.terms = terms
+        for _ in range(count):
+            fit.step(_ROUNDS, _FARTHEST)
+            tick()
+        found = Change.between(small, fit.geometry).scaled(factor).applied(found)
+    return _confirmed(projections, geometry, Change.between(geometry, found).of(terms), known, factors[-1], tick)
+
+
+def _factors(rows: int, cols: int) -> list[int]:
+    """Binning of the levels, from coarse to fine."""
+    finest = 2 if cols >= 2 * _FEWEST and rows > 1 else 1  # a pixel is not needed for a hundredth of it
+    found = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
+    return found[-len(_STEPS) :] or [1]
+
+
+def _weights(known: F32 | None, factor: int, data: F32) -> F32 | None:
+    if known is None:
+        return None
+    return np.ascontiguousarray(np.broadcast_to(bin_views(known[None], factor), data.shape))
+
+
+def _confirmed(
+    projections: F32, geometry: Geometry, change: Change, known: F32 | None, factor: int, tick: Callable[[], None]
+) -> Learnt:
+    """The part of a change that views held out confirm: the whole against none, then each term of it."""
+    small, data = geometry.binned(factor), bin_views(projections, factor)
+    edge = reach(geometry)
+    sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
+    wanted = [term for term, size in zip(TERMS, sizes, strict=True) if size > _NOTHING]
+    judge = Judge(
+        data,
+        taller(Grid.matching(small)),
+        None if known is None else bin_views(known[None], factor)[0],
+        "shifts" in wanted,
+    )
+
+    def judged(terms: list[str]) -> NDArray[np.float64]:
+        tick()
+        return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
+
+    before = judged([])
+    # Shifts and axis are one: the axis is their mean.
+    places = [term for term in wanted if term in ("axis", "shifts")]
+    groups = [each for each in (places, *([term] for term in wanted if term not in places)) if each]
+    kept, after = list(wanted), judged(wanted) if wanted else before
+    if not better(after, before):
+        kept, after = [], before
+        for group in groups if len(groups) > 1 else []:
+            alone = judged(group)
+            if better(alone, after):
+                kept, after = group, alone
+    elif len(groups) > 1:
+        for group in groups:
+            rest = [term for term in kept if term not in group]
+            without = judged(rest)
+            if not better(after, without):
+                kept, after = rest, without
+    asked = [term for term in wanted if term not in kept]
+    return Learnt(
+        change.of(frozenset(kept)), tuple(kept), tuple(asked), float(np.median(before)), float(np.median(after))
+    )
+
+
+def _text(change: Change, term: str, binning: int) -> str:
+    if term == "axis":
+        return f"the axis moves by {change.axis * binning:+.2f} px"
+    if term == "shifts":
+        return f"views by up to {np.abs(change.shifts).max() * binning:.2f} px"
+    return f"{term} {math.degrees(getattr(change, term)):+.3f}°"

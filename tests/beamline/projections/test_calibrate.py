@@ -1,0 +1,85 @@
+"""--calibrate: places of views and the axis are learnt from a scan's own views, and enter the geometry alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.monitor.digest import digest
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.calibrate import Calibrate
+from beamline.projections.steps.poses import PosesOfFile
+from beamline.projections.steps.step import PrepStep
+from beamline.storage.pose_table import read_poses
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from drivers.base.clock import SystemClock
+from drivers.base.frame import Frame, FrameKind
+from recon.base.geometry import Geometry
+from recon.calibration.freedom import knowable
+from tests.recon.calibration.bodies import balls
+
+N, SHAPE, PITCH, AXIS = 48, (24, 48), 0.5, 23.9
+JUMP = np.outer(np.arange(N) >= 20, (2.5, -1.5))
+LEARN = Calibrate(("axis", "shifts"))
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Counts of balls that jump, in pixels of half a millimetre."""
+    path = tmp_path_factory.mktemp("calibrate") / "scan.h5"
+    geometry = Geometry.parallel(np.linspace(0, np.pi, N, endpoint=False), SHAPE, PITCH, AXIS, shifts=JUMP)
+    counts = 100 + 40_000 * np.exp(-balls(10, 12).views(geometry))
+    images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
+    kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N
+    angles = [np.nan] * 4 + geometry.angles.tolist()
+    with NXtomoWriter(path, ScanInfo("jump", pixel_size_mm=PITCH), SHAPE, clock=SystemClock()) as writer:
+        for i, (image, kind, angle) in enumerate(zip(images, kinds, angles, strict=True)):
+            frame = Frame(image.round().astype(np.uint16), kind, i, i, i, angle, 1.8e9 + i, 0.05)
+            writer.append(frame, digest(frame.counts), [])
+    return path
+
+
+def prepared(path: Path, *steps: PrepStep, **selected: object) -> PreparedProjections:
+    chosen = Selection(**{"axis_col": AXIS + 0.8, "steps": (Air("none"), *steps), **selected})  # type: ignore[arg-type]
+    with SourceOptions(path).open() as source:
+        return prepare_projections(source, chosen, lambda _: None)
+
+
+def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path) -> None:
+    found, plain = prepared(scan, LEARN), prepared(scan)
+    np.testing.assert_array_equal(found.projections.data, plain.projections.data)
+    rest, axis = knowable(found.geometry.shifts - JUMP, found.geometry.angles)
+    assert np.sqrt(np.mean(rest**2)) < 0.1
+    assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
+    done = found.done["calibrate"]
+    assert done.said.startswith("Geometry learnt: the axis moves by +") and "Views held out deviate by" in done.said
+    assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
+    assert plain.done["calibrate"].said == ""
+
+
+def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
+    """With binning, shifts count in binned pixels; views held out are put in their places, too."""
+    found = prepared(scan, LEARN, binning=2, views="every:2", rows=(2, 22))
+    assert found.geometry.detector_shape == (10, 24) and found.geometry.n_views == N // 2
+    rest, _ = knowable(found.geometry.shifts - JUMP[::2] / 2, found.geometry.angles)
+    assert np.sqrt(np.mean(rest**2)) < 0.1
+    assert found.held_out is not None and found.held_out[1].shifts.any()
+
+
+def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Path) -> None:
+    assert "it needs all views" in LEARN.needs_finished and Calibrate().needs_finished == ""
+    table = tmp_path / "poses.csv"
+    rows = "\n".join(f"{view},1,0" for view in range(N))
+    table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
+    with pytest.raises(ConfigError, match="--calibrate learns what --poses states"):
+        prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
+    with pytest.raises(ValueError, match="'lean' is none of axis, roll, tilt, shifts"):
+        Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")
