@@ -128,7 +128,7 @@ def background_memory(geometry: Geometry) -> int:
     rays = small.n_views * math.prod(small.detector_shape)
     voxels = math.prod(Grid.for_fit(small, Grid.matching(small), wider=True).shape)
     pixels = math.prod(geometry.detector_shape)
-    return 4 * ((7 * len(TERMS) + 12) * rays + 12 * voxels + 6 * pixels)
+    return 4 * ((9 * len(TERMS) + 16) * rays + 12 * voxels + 6 * pixels)
 
 
 def _factor(shape: tuple[int, int]) -> int:
@@ -289,19 +289,20 @@ def _levelled(start: _Trial, unseen: _Views, progress: Callable[[int], object]) 
     whole = np.stack([trial.views.flat(term) for term in terms], -1)
     basis, known = terms[:, 0].reshape(_MEAN, -1).T.astype(np.float64), trial.views.weight
     used = np.ones(len(basis), bool) if known is None else known[0].ravel() > 0
-    error, rounds = math.inf, 0
+    error, rounds, longer = math.inf, 0, np.eye(_MEAN)
     while rounds < _ROUNDS:
         progress(rounds)
         left, rounds = trial.sweep(_SWEEPS), rounds + 1
         before, error = error, float(np.sqrt(trial.errors(unseen).mean()))
         if error > _NEARER * before:
             break
-        assert trial.volume is not None
-        x = volume_lines(trial.volume.data)
-        dense = (x > _DENSE * density_unit(x)).astype(np.float32)
-        unheld = np.stack([trial.views.without_volume(term, dense) for term in terms], -1)
-        shares, combinations = eigh(unheld.T @ unheld, whole.T @ whole)
-        longer = combinations / np.maximum(shares, 1 / _LONGEST) @ combinations.T @ (whole.T @ whole)
+        if rounds & (rounds - 1) == 0:  # after 1, 2, 4, 8 ... rounds: dense matter changes slowly
+            assert trial.volume is not None
+            x = volume_lines(trial.volume.data)
+            dense = (x > _DENSE * density_unit(x)).astype(np.float32)
+            unheld = np.stack([trial.views.without_volume(term, dense) for term in terms], -1)
+            shares, combinations = eigh(unheld.T @ unheld, whole.T @ whole)
+            longer = combinations / np.maximum(shares, 1 / _LONGEST) @ combinations.T @ (whole.T @ whole)
         trial.coefficients[:_MEAN] += longer @ _fitted(np.median(left, axis=0), basis, used)
     return trial, rounds
 

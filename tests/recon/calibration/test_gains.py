@@ -50,6 +50,7 @@ def _rms(values: NDArray[np.floating]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.slow
 def test_gains_are_found_and_the_ball_on_the_axis_stays_as_no_filter_leaves_it(gains: F32) -> None:
     clean = _views(BALL)
     ringed = clean + gains
