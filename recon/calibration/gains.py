@@ -1,8 +1,8 @@
 """Gains of pixels, learnt with the volume: a constant of each pixel in all views, which makes a ring.
 
 A few sweeps of FISTA-TV and the median of the residual over the views alternate, see `ring_offsets`. Total variation
-keeps rings out of the volume, and bodies in it. What cannot be told apart is left alone: a gain near the axis and a
-body on the axis; a stripe of all rows and the wall of a can around the axis; what changes slowly along a row.
+keeps rings out of the volume, and bodies in it. What cannot be told apart is left alone. A gain near the axis looks
+like a body on the axis, a stripe of all rows like the wall of a can. What changes slowly along a row is density.
 """
 
 from __future__ import annotations
