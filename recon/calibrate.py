@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,7 +64,7 @@ def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> S
     high = geometry.rows(0, min(_SWEPT_ROWS, geometry.detector_shape[0]))
     some = Grid.of_field(high, high.sample_pitch)
     sweep = sweep_seconds(high, some, now) * grid.shape[0] / some.shape[0]
-    trials = choice_sweeps(geometry) * sweep if math.isfinite(sweep) else 0.0
+    trials = choice_sweeps(geometry) * sweep
     return Speeds(fbp_seconds, start_seconds, step_seconds, fill_seconds, sweep, trials)
 
 

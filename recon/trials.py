@@ -194,8 +194,6 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
     data, weights = problem.projections, problem.use.weights
     if geometry.n_views < LEAST_VIEWS:
         return None, f"{geometry.n_views} views are too few to hold any out"
-    if not geometry.is_straight:
-        return None, "rolled or tilted views"
     if not geometry.is_cone:
         if rows <= height:
             return problem, "all rows"
@@ -226,7 +224,8 @@ def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str]
     if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
         return None
     views = geometry.rows(rows.start, rows.stop)
-    tall = (height + 1) * geometry.sample_pitch * (1 + geometry.reach / geometry.sod)  # at the far side of the field
+    # At the far side of the field.
+    tall = ((height + 1) * geometry.sample_pitch + 2 * geometry.lean) * (1 + geometry.reach / geometry.sod)
     slices = math.ceil(tall / grid.spacing[0])
     box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
     return _of_rows(problem, rows, views, box)

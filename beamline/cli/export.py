@@ -33,11 +33,11 @@ def window_of(text: str) -> tuple[float, float]:
     return low, high
 
 
-_PLY = ".ply"
+_PLY, _CSV = ".ply", ".csv"
 
 
 def _output_path(text: str) -> Path:
-    return Path(text) if Path(text).suffix.lower() == _PLY else volume_path(text)
+    return Path(text) if Path(text).suffix.lower() in (_PLY, _CSV) else volume_path(text)
 
 
 @click.command()
@@ -48,7 +48,7 @@ def _output_path(text: str) -> Path:
     metavar="PATH",
     callback=parsed(_output_path),
     required=True,
-    help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply.",
+    help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv.",
 )
 @click.option("--bits", type=click.Choice(["8", "16", "32"]), default="32", help="32: the values; 8, 16: grey values.")
 @click.option(
@@ -58,6 +58,7 @@ def _output_path(text: str) -> Path:
     help="Of --bits 8 and 16: values that become 0 and the greatest grey value; beyond them they are clipped.",
 )
 @click.option("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
+@click.option("--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads.")
 @click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
 @json_option
 def export(
@@ -66,6 +67,7 @@ def export(
     bits: str,
     window: tuple[float, float] | None,
     gaussians: bool,
+    poses: bool,
     dataset: str | None,
     as_json: bool,
 ) -> None:
@@ -78,13 +80,16 @@ def export(
     from beamline.storage.volumes.files import format_of, opened_volume, write_volume
 
     refuse_shared({"VOLUME": volume, "--output": output})
-    if (output.suffix.lower() == _PLY) != gaussians:
-        raise click.UsageError(f"-o {output}: --gaussians goes with the suffix {_PLY}, and voxels with another.")
-    if gaussians:
-        if window is not None or bits != "32" or dataset is not None:
-            raise click.UsageError("--gaussians does not go with --bits, --window or --dataset.")
-        _export_gaussians(volume, output, as_json)
-        return
+    parts = {"--gaussians": (gaussians, _PLY, _export_gaussians), "--poses": (poses, _CSV, _export_poses)}
+    for name, (wanted, suffix, _) in parts.items():
+        if (output.suffix.lower() == suffix) != wanted:
+            raise click.UsageError(f"-o {output}: {name} goes with the suffix {suffix}, and voxels with another.")
+    for name, (wanted, _, export_part) in parts.items():
+        if wanted:
+            if window is not None or bits != "32" or dataset is not None:
+                raise click.UsageError(f"{name} does not go with --bits, --window or --dataset.")
+            export_part(volume, output, as_json)
+            return
     pixels = Pixels(int(bits), window)
     if pixels.bits == 32 and window is not None:
         raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")
@@ -125,6 +130,17 @@ def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:
         sink(Done({"output": output, "gaussians": model.gaussians.n}, time=SystemClock().now()))
     if not as_json:
         click.echo(f"output     {output} (PLY)\ngaussians  {model.gaussians.n}, {model.gaussians.kernel}")
+
+
+def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
+    from beamline.storage.pose_table import write_poses
+
+    with terminated_like_interrupted(), json_events(as_json) as sink:
+        refuse_existing(output)
+        views = write_poses(output, volume)
+        sink(Done({"output": output, "views": views}, time=SystemClock().now()))
+    if not as_json:
+        click.echo(f"output  {output} (CSV)\nviews   {views}")
 
 
 def _suggestion(record: ReconRecord) -> str:

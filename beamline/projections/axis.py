@@ -14,7 +14,9 @@ from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews
 from beamline.projections.jumps import longest_part
+from beamline.projections.poses import poses_of
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
+from beamline.projections.steps.poses import PosesOfFile
 from beamline.projections.tilt import spread, spread_views
 from beamline.storage.readers.base import ScanSource
 from recon.axis_by_views import COLS, VIEWS, axis_by_views
@@ -40,8 +42,9 @@ def rotation_axis(
         ConfigError: it lies outside the detector.
     """
     axis_col, axis = selection.axis_col, None
-    if axis_col is None and cone_of(source, selection) is not None:
-        axis_col, axis = _axis_of_cone(source, selection, usable, warn, progress)
+    posed = selection.step(PosesOfFile).table is not None  # opposite views are then no mirror images
+    if axis_col is None and (posed or cone_of(source, selection) is not None):
+        axis_col, axis = _axis_by_views(source, selection, usable, warn, progress)
     elif axis_col is None:
         whole = selection.axis_rows
         by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
@@ -50,7 +53,7 @@ def rotation_axis(
     return axis_col, axis
 
 
-def _axis_of_cone(
+def _axis_by_views(
     source: ScanSource, selection: Selection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
 ) -> tuple[float, AxisEstimate | None]:
     """The axis by views held out. What the file states stays, unless they agree better with another one."""
@@ -63,9 +66,14 @@ def _axis_of_cone(
     first = min(max((rows.start + rows.stop - height) // 2, 0), source.shape[0] - height)
     binning = max(selection.binning, min(cols // COLS, height))
     coarse = replace(selection, binning=binning, rows=(first, first + height))
-    views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(usable.frames, VIEWS))
+    poses, frames = poses_of(source, coarse, usable.frames), usable.frames
+    if poses is not None:
+        frames = frames[poses.known(frames)]
+    views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
     geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])
+    if poses is not None:
+        geometry = poses.corrected(geometry, views.view_ids)
     try:
         found = axis_by_views(
             views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)), near=stated is not None

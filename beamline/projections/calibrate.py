@@ -9,17 +9,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.projections.correction import ScanCorrection, at_once_memory
 from beamline.projections.selection import Selection, geometry_of, rows_of
+from beamline.projections.steps.poses import PosesOfFile
 from beamline.projections.steps.step import ScanPart, StepDone
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.calibration.freedom import Change
-from recon.calibration.learn import Learnt, learn_geometry
+from recon.calibration.learn import COLS, ROWS, Learnt, learn_geometry
 
-_COLS, _ROWS = 192, 64  # binned pixels looked at, at most
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
 
 I64 = NDArray[np.int64]
@@ -34,30 +34,35 @@ class Calibrated:
         frames: rows of the file, in order.
         change: in pixels of the detector, about the middle row of the band.
         pitch: mm of such a pixel.
-        off_middle: rows from the middle of the band to that of the rows used.
-        learnt: what views held out say of it.
+        off_middle: rows from the middle of the band to that of the detector, about which views roll and tilt.
+        pivot: the detector's middle, in rows from the first one used, binned.
+        binning: of the pixels of the band.
+        learnt: with what views held out say of it.
     """
 
     frames: I64
     change: Change
     pitch: float
     off_middle: float
+    pivot: float
+    binning: int
     learnt: Learnt
 
     @property
     def done(self) -> StepDone:
-        return StepDone(self.learnt.said, self.learnt.parameters)
+        return StepDone(self.learnt.said(self.binning), self.learnt.parameters(self.binning))
 
     @property
     def axis(self) -> float:
-        """Columns of the detector by which the axis moves in the middle of the rows used."""
+        """Columns of the detector by which the axis moves in the detector's middle row."""
         return self.change.axis + self.off_middle * math.tan(self.change.roll)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
         """The geometry of these rows of the file, which may be binned, as it was learnt."""
         at = np.searchsorted(self.frames, view_ids)
         own = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
-        return own.scaled(self.pitch / geometry.pixel_pitch).applied(geometry)
+        after = own.scaled(self.pitch / geometry.pixel_pitch).applied(geometry)
+        return after if after.is_straight or after.is_cone else replace(after, axis_row=self.pivot)
 
 
 def calibrated(
@@ -77,7 +82,10 @@ def calibrated(
 
     Raises:
         DataError: too few views, or nothing in the beam.
+        ConfigError: a file states poses, too.
     """
+    if selection.step(PosesOfFile).table is not None:
+        raise ConfigError("--calibrate learns what --poses states: give one of them.")
     band = _band(source, selection)
     views = ScanCorrection(source, band, lambda _: None).at_once(frames)
     ids = views.view_ids
@@ -89,10 +97,12 @@ def calibrated(
         )  # fmt: skip
     except ValueError as error:
         raise DataError(f"{source.path}: the geometry was not learnt: {error}. Leave out --calibrate.") from error
-    used, looked = rows_of(source, selection), rows_of(source, band)
+    looked, middle, binning = rows_of(source, band), (source.shape[0] - 1) / 2, selection.binning
     whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
-    off = 0.0 if before.is_cone else (used.start + used.stop - looked.start - looked.stop) / 2
-    return Calibrated(ids, learnt.change.scaled(band.binning), whole.pixel_pitch, off, learnt)
+    off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
+    pivot = (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
+    change = learnt.change.scaled(band.binning)
+    return Calibrated(ids, change, whole.pixel_pitch, off, pivot, band.binning, learnt)
 
 
 def search_memory(part: ScanPart, terms: frozenset[str]) -> int:
@@ -109,7 +119,7 @@ def _band(source: ScanSource, selection: Selection) -> Selection:
     """Rows around the middle of those used, with pixels binned so that a volume of them is quick."""
     used = rows_of(source, selection)
     height = used.stop - used.start
-    binning = max(selection.binning, min(math.ceil(source.shape[1] / _COLS), height))
-    n = min(height, _ROWS * binning)
+    binning = max(selection.binning, min(math.ceil(source.shape[1] / COLS), height))
+    n = min(height, ROWS * binning)
     first = (used.start + used.stop - n) // 2
     return replace(selection, rows=(first, first + n), binning=binning)

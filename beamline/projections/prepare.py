@@ -15,12 +15,12 @@ from beamline.projections.axis import rotation_axis
 from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.flags import UsableViews, checked_views
-from beamline.projections.jumps import SamplePlaces
+from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
 from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import PlaceStep, ScanStep
+from beamline.projections.steps.step import Places, PlaceStep, ScanStep
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
@@ -77,14 +77,18 @@ def prepare_projections(
     phases.enter("flags and references")
     usable = checked_views(source, selection, warn)
     pixel_size(source, selection)
-    choose_views(source, usable.frames, selection)  # what is wrong with the words is told before any frame is read
+    first = choose_views(source, usable.frames, selection)  # what is wrong is told before any frame is read
+    poses = poses_of(source, selection, usable.frames)
+    if poses is not None:
+        require_known(poses, source, selection, usable.frames[first])
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(source, selection, warn)
-    warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
+    if poses is None:
+        warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
-    moved: dict[str, SamplePlaces] = {}
+    moved: dict[str, Places] = {}
     for place_step in (step for step in selection.in_order if isinstance(step, PlaceStep)):
         phases.enter(place_step.name, "guesses")
         places = place_step.place(source, selection, usable, axis_col, phases.progress)
@@ -107,6 +111,9 @@ def prepare_projections(
 
     chosen = choose_views(source, usable.frames, selection, seen(usable.frames).period)
     wanted, rest = usable.frames[chosen], np.delete(usable.frames, chosen)
+    if poses is not None:
+        require_known(poses, source, selection, wanted)
+        rest = rest[poses.known(rest)]
     others_ids = spread(rest, _HELD_OUT_VIEWS)
     calibrate = selection.step(Calibrate)
     if calibrate.geometry:
@@ -144,7 +151,7 @@ def prepare_projections(
 def _fill_unknown(found: PreparedProjections) -> None:
     """Fill, view by view, what `ray_weights` says weighs nothing, as `masked` does for all views."""
     data, geometry = found.projections.data, found.geometry
-    seen = seen_rays(geometry, Grid.matching(geometry)) if np.ptp(geometry.shifts[:, 1]) > 0 else None
+    seen = seen_rays(geometry, Grid.matching(geometry)) if found.leaves_slices else None
     for view in range(len(data)):
         known = np.ones(geometry.detector_shape, np.float32)
         if found.measured is not None:
@@ -153,7 +160,7 @@ def _fill_unknown(found: PreparedProjections) -> None:
             shares = found.shares_of(slice(view, view + 1), slice(0, len(known)))
             known *= 1 if shares is None else shares[0]
         if seen is not None:
-            known *= seen[view][:, None]
+            known *= seen[view]
         if not known.all():
             data[view] = masked(data[view : view + 1], known[None])[0][0]
 

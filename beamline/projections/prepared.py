@@ -85,6 +85,12 @@ class PreparedProjections:
             shares_of=None,
         )
 
+    @property
+    def leaves_slices(self) -> bool:
+        """Views of a parallel beam see beyond the slices of the volume, since they move along it or lean."""
+        moved = np.ptp(self.geometry.shifts[:, 1]) > 0
+        return not self.geometry.is_cone and (bool(moved) or not self.geometry.is_straight)
+
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
         """Weights [view, row, col] as `ray_factors` says, read-only."""
         factors = self.ray_factors(others)
@@ -94,7 +100,7 @@ class PreparedProjections:
         """Weights [view, row, col], computed only where they are asked for; None: one for all rays.
 
         Args:
-            others: views after these, which weigh 1, as a usual ray of these does.
+            others: views held out after these, which weigh 1, as a usual ray of these does; 0: none.
         """
         factors: list[NDArray[np.float32]] = []
         if self.view_weights is not None:
@@ -103,9 +109,14 @@ class PreparedProjections:
             factors.append(_and_ones(counted / counted.mean(where=counted > 0), others))
         if self.measured is not None:
             factors.append(self.measured.astype(np.float32)[None])
-        if np.ptp(self.geometry.shifts[:, 1]) > 0:
-            seen = seen_rays(self.geometry, Grid.matching(self.geometry)).astype(np.float32)
-            factors.append(_and_ones(seen, others)[:, :, None])
+        if self.leaves_slices:
+            seen = seen_rays(self.geometry, grid := Grid.matching(self.geometry))
+            held = np.ones((others, 1, 1), np.bool_)
+            if self.held_out is not None and others == self.held_out[1].n_views:
+                held = seen_rays(self.held_out[1], grid)
+            rays = np.broadcast_shapes(seen.shape[1:], held.shape[1:])
+            factors.append(np.concatenate([np.broadcast_to(part, (len(part), *rays)) for part in (seen, held)]))
+            factors[-1] = factors[-1].astype(np.float32)
         if self.shares is not None:
             factors.append(_and_ones(self.shares, others))
         if not factors:

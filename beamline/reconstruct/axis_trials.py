@@ -14,12 +14,12 @@ from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.sinks import Warnings
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import check_axis, cone_of, geometry_of, rows_of
+from beamline.projections.selection import check_axis, cone_of, rows_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.axis_sheet import AxisTrial, axis_sheet
 from drivers.base.clock import Clock
 from recon.base.volume import Grid
-from recon.voxels.fbp import fbp
+from recon.voxels.direct import direct
 
 _MOST, _SHOWN = 400, 24
 
@@ -66,14 +66,14 @@ def try_axes(
         first = rows.start + (rows.stop - rows.start) // n // 2 * n
         selection = replace(selection, rows=(first, first + n), axis_col=float(columns[columns.size // 2]))
         prepared = prepare_projections(source, selection, Warnings(sink, clock))
-        data, angles = prepared.projections.data, prepared.geometry.angles
+        data = prepared.projections.data
         grid = Grid.matching(prepared.geometry)
         inside = _circle(grid.shape[1:])
         kept = set(np.unique(np.linspace(0, columns.size - 1, min(columns.size, _SHOWN)).astype(int)).tolist())
         trials = []
         for i, col in enumerate(columns.tolist()):
-            geometry = replace(geometry_of(source, selection, col, angles), shifts=prepared.geometry.shifts)
-            image = fbp(data, geometry, grid, "hann")[0]
+            geometry = replace(prepared.geometry, axis_col=(col - (n - 1) / 2) / n)
+            image = direct(data, geometry, grid, "hann")[0]
             part = image[inside]
             score = -float(np.minimum(part, 0).sum()) / max(float(np.abs(part).sum()), 1e-30)
             trials.append(AxisTrial(col, score, image if i in kept else None))

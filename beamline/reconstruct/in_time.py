@@ -66,8 +66,6 @@ def fit_within(
     assert method.seconds is not None
     geometry, grid = prepared.geometry, Grid.matching(prepared.geometry)
     sweep = first_sweep_seconds(geometry, grid, clock.now)
-    if not math.isfinite(sweep):  # rolled or tilted: as straight ones take
-        sweep = first_sweep_seconds(geometry.straightened(), grid, clock.now)
     spent = clock.now() - started[0]
     busy = min(max(spent / max(time.process_time() - started[1], 1e-3), 1.0), _BUSIEST)
     pages = target.report is not None

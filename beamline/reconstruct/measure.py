@@ -97,7 +97,7 @@ def residual_share(geometry: Geometry, grid: Grid, held_out: tuple[NDArray[np.fl
     """Approximate share of all rays in the residual of `measure`."""
     views = min(geometry.n_views, _RESIDUAL_VIEWS) + (0 if held_out is None else held_out[1].n_views)
     rows, cols = geometry.detector_shape
-    in_bands = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
+    in_bands = geometry.rows_show_slices and grid == Grid.matching(geometry)
     return views / geometry.n_views * (min(1.0, _RESIDUAL_RAYS / (rows * cols)) if in_bands else 1.0)
 
 
@@ -172,8 +172,7 @@ def residual_bands(grid: Grid, geometry: Geometry, matter: NDArray[np.float64]) 
     """
     rows, cols = geometry.detector_shape
     bands = max(1, _RESIDUAL_RAYS // (_RESIDUAL_ROWS * cols))
-    on_rows = grid == Grid.matching(geometry) and not geometry.shifts[:, 1].any() and not geometry.is_cone
-    if not on_rows:
+    if not geometry.rows_show_slices or grid != Grid.matching(geometry):
         return [slice(0, rows)]
     if rows <= bands * _RESIDUAL_ROWS:
         return [slice(first, min(first + _RESIDUAL_ROWS, rows)) for first in range(0, rows, _RESIDUAL_ROWS)]

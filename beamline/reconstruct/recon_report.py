@@ -346,6 +346,17 @@ def _pictures(
                 figures.axis_curve(axis.candidates, axis.curve, axis.value, axis.confident),
             )
         )
+    turns = np.degrees(np.stack((geometry.roll, geometry.tilt), axis=1))
+    if geometry.shifts.any() or turns.any():
+        pitch, unit = geometry.sample_pitch, prepared.length_unit
+        pictures.append(
+            Picture(
+                "Poses of the views",
+                "Displacement at the sample, roll and tilt of each view, against the angle of the stage: runout, "
+                "wobble, drift and jumps. `beamline export --poses` writes them as a table.",
+                figures.pose_curves(np.degrees(geometry.angles), geometry.shifts * pitch, turns, unit),
+            )
+        )
     return pictures
 
 

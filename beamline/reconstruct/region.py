@@ -97,9 +97,9 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
     grid, side = Grid.matching(geometry), selection.binning
     low, high = ((row - selection.axis_rows[0]) // side for row in selection.rows)
     slices = (selection.axis_rows[1] - selection.axis_rows[0]) // side
-    if geometry.shifts[:, 1].any():
+    if not geometry.rows_show_slices:
         raise DataError(
-            "The views are shifted along the axis, by jumps of the sample: --roi takes rows for slices. Give --rows."
+            "The views are shifted along the axis, rolled or tilted: --roi takes rows for slices. Give --rows."
         )
     _refuse_beyond(region, grid.shape[2], "the volume's")
     part = slice(region.z[0] - low, region.z[1] - low), slice(*region.y), slice(*region.x)

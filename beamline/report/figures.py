@@ -226,6 +226,23 @@ def axis_curve(candidates: NDArray[np.float64], curve: NDArray[np.float64], valu
     return png(figure)
 
 
+def pose_curves(
+    angles_deg: NDArray[np.float64], shifts: NDArray[np.float64], turns_deg: NDArray[np.float64], unit: str
+) -> bytes:
+    """Displacement (col, row) in `unit`, and roll and tilt in degrees, of the views [view, 2] against their angle."""
+    curves = [(shifts, unit, ("along the columns", "along the rows")), (turns_deg, "degrees", ("roll", "tilt"))]
+    shown = [curve for curve in curves if curve[0].any()]
+    figure = Figure(figsize=(WIDTH, 2.4 * len(shown)), dpi=DPI, layout="constrained")
+    order = np.argsort(angles_deg, kind="stable")
+    for axes, (values, said, names) in zip(np.ravel(figure.subplots(len(shown), sharex=True)), shown, strict=True):
+        for column, name in enumerate(names):
+            axes.plot(angles_deg[order], values[order, column], lw=1.0, marker=".", ms=2, label=name)
+        axes.set(xlabel="angle (degrees)", ylabel=said)
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3)
+    return png(figure)
+
+
 def bright_centre(data: NDArray[np.float32]) -> tuple[int, int, int]:
     """[z, y, x] of the centre of mass of the voxels brighter than half the grey window; the middle if none are."""
     steps = [max(1, n // _LOOKED_AT) for n in data.shape]

@@ -141,13 +141,26 @@ class Geometry:
         return not (self.roll.any() or self.tilt.any())
 
     @property
+    def rows_show_slices(self) -> bool:
+        """Each detector row shows one slice in all views: a parallel beam, straight, not shifted along the axis."""
+        return self.is_straight and not (self.is_cone or self.shifts[:, 1].any())
+
+    @property
+    def lean(self) -> float:
+        """mm by which roll and tilt move a point of the field along the rows at most, measured at the rotation axis."""
+        across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
+        return self.reach * float(across.max())
+
+    @property
     def period(self) -> float:
         """Angle, in radians, after which views repeat the same rays: π for a centred parallel beam, else 2π.
 
-        2π holds for a cone, and for an axis that leans along the beam. It also holds for an axis more than a tenth of
-        the field off the detector's middle: views half a turn apart then see different parts.
+        2π holds for a cone, and for an axis that leans along the beam by more than half a pixel over the field. It also
+        holds for an axis more than a tenth of the field off the detector's middle: views half a turn apart then see
+        different parts.
         """
-        return 2 * math.pi if self.is_cone or self.tilt.any() or self.is_off_middle else math.pi
+        leans = self.reach * float(np.abs(np.sin(self.tilt)).max()) > 0.5 * self.sample_pitch
+        return 2 * math.pi if self.is_cone or leans or self.is_off_middle else math.pi
 
     @property
     def is_off_middle(self) -> bool:
@@ -246,19 +259,20 @@ class Geometry:
         """The same geometry for detector rows start..stop.
 
         For a parallel beam v is then measured from the middle of these rows, so that a slab is a scan of its own. The
-        central ray of a cone keeps its place.
+        central ray of a cone keeps its place, and so does the point that views are rolled and tilted about.
         """
         rows = self.detector_shape[0]
         if not 0 <= start < stop <= rows:
             raise ValueError(f"rows {start}:{stop} do not lie in 0:{rows}")
         off_middle = self.axis_row - (rows - 1) / 2
-        axis_row = self.axis_row - start if self.is_cone else off_middle + (stop - start - 1) / 2
+        keeps = self.is_cone or not self.is_straight
+        axis_row = self.axis_row - start if keeps else off_middle + (stop - start - 1) / 2
         return replace(self, detector_shape=(stop - start, self.detector_shape[1]), axis_row=axis_row)
 
     def binned(self, factor: int) -> Geometry:
         """The geometry after binning by factor x factor; trailing rows and columns that do not fill a bin are dropped.
 
-        As with `rows`, v of a parallel beam is then measured from the middle of the rows left.
+        As with `rows`, v of a straight parallel beam is then measured from the middle of the rows left.
         """
         if operator.index(factor) < 1:
             raise ValueError(f"bin factor must be >= 1, got {factor}")

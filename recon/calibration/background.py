@@ -3,8 +3,9 @@
     p = A x + B c        B: polynomials of column and row, times polynomials of time
 
 Terms are found in two steps. The drift is what no volume holds, whatever its sign. What a volume explains is taken off
-the views and off the terms, and least squares of what is left follow (Frisch & Waugh 1933). A constant of all views, and a mean surface that is even about the axis, are a volume's as well; they are left alone. Then the mean
-surface: what a volume without negative densities leaves. A positive one stays in the volume.
+the views and off the terms, and least squares of what is left follow (Frisch & Waugh 1933). A constant of all views,
+and a mean surface that is even about the axis, are a volume's as well; they are left alone. Then the mean surface: what
+a volume without negative densities leaves. A positive one stays in the volume.
 
 Views held out judge: a step is taken only if it predicts them better.
 """
@@ -280,8 +281,8 @@ def _levelled(start: _Trial, unseen: _Views, progress: Callable[[int], object]) 
     """A trial with the mean surface that a volume without negative densities leaves, and its rounds.
 
     Each round fits the residual. A volume of dense matter alone holds a share of each combination of terms; the step
-    along it is divided by the other share. Rounds end where views held out gain less than a per cent: later ones lift the
-    air by the noise that is clipped at zero.
+    along it is divided by the other share. Rounds end where views held out gain less than a per cent: later ones lift
+    the air by the noise that is clipped at zero.
     """
     trial = _Trial(start.views, start.coefficients.copy(), start.volume)
     terms = trial.views.terms[:_MEAN]

@@ -1,4 +1,4 @@
-"""learn_geometry: from line integrals and a geometry to a better one, from coarse to fine pixels."""
+"""learn_geometry: a better geometry from line integrals, from coarse to fine pixels, confirmed by views held out."""
 
 from __future__ import annotations
 
@@ -12,14 +12,20 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
-from recon.calibration.freedom import Change
-from recon.calibration.joint import JointFit
+from recon.base.volume import Grid
+from recon.calibration.freedom import TERMS, Change, reach
+from recon.calibration.joint import JointFit, taller
+from recon.calibration.judge import Judge, better
 
+COLS, ROWS = 160, 64
+"""Pixels that show the geometry; more cost time."""
 _LEAST_VIEWS = 12
-_FIRST = 6  # rounds of conjugate gradients on the volume alone
-_ROUNDS = 8
-_STEPS = 8, 5, 4  # of Gauss-Newton at each binning, from coarse to fine
-_COARSEST = 24  # columns
+_FEWEST, _ENOUGH = 20, 96  # columns of the coarsest pixels; from so many on, pixels are binned at least by two
+_AXIS_STEPS, _AXIS_ROUNDS = 4, 8  # the axis alone comes first: from far off, views would move in its place
+_STEPS = 6, 4, 3  # of Gauss-Newton, from the coarsest pixels on
+_ROUNDS = 16  # of conjugate gradients in each
+_FARTHEST = 2.0  # binned pixels that anything moves in a step
+_NOTHING = 0.03  # pixels at an image's edge, of the views given: a turn by less is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +33,36 @@ class Learnt:
     """What was learnt of a geometry.
 
     Attributes:
-        change: in pixels of the views.
-        said: a sentence.
-        parameters: for the file of a volume, by name.
+        change: in pixels of the views; what was not confirmed is zero.
+        confirmed, dropped: names of terms.
+        before, after: median deviation of views held out, by volumes of the others.
     """
 
     change: Change
-    said: str
-    parameters: Mapping[str, NDArray[np.float64] | float | str]
+    confirmed: tuple[str, ...]
+    dropped: tuple[str, ...]
+    before: float
+    after: float
+
+    def said(self, binning: int = 1) -> str:
+        """In a sentence, in pixels smaller by `binning`."""
+        told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
+        kept = f"{', '.join(self.dropped)}: left as it was, views held out do not confirm a change."
+        if not told:
+            return f"Geometry: {kept}"
+        first = f"Geometry learnt: {told}. Views held out deviate by {self.after:.4g} in place of {self.before:.4g}."
+        return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
+
+    def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
+        """For the file of a volume, by name; pixels smaller by `binning`."""
+        return {
+            "calibrate_confirmed": ",".join(self.confirmed) or "none",
+            "calibrate_axis_change_px": self.change.axis * binning,
+            "calibrate_roll_deg": math.degrees(self.change.roll),
+            "calibrate_tilt_deg": math.degrees(self.change.tilt),
+            "calibrate_held_out_before": self.before,
+            "calibrate_held_out_after": self.after,
+        }
 
 
 def learn_geometry(
@@ -44,37 +72,99 @@ def learn_geometry(
     progress: Callable[[int, int], None] = lambda n, total: None,
     known: F32 | None = None,
 ) -> Learnt:
-    """The geometry by which a volume explains the views best, as far as the views can tell it.
+    """The geometry by which a volume explains the views best, as far as views held out confirm it.
 
     Args:
-        projections: [view, row, col], line integrals; some 200 columns and 64 rows are enough.
+        projections: [view, row, col], line integrals; `COLS` and `ROWS` are enough.
         terms: what may change, of `freedom.TERMS`.
         progress: steps done, and steps at most.
         known: [row, col] weights of pixels; None: one for all.
 
     Raises:
-        ValueError: fewer than twelve views.
+        ValueError: fewer than twelve views, or views without matter.
     """
     if geometry.n_views < _LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few; {_LEAST_VIEWS} are needed")
-    rows, cols = geometry.detector_shape
-    factors = [f for f in (4, 2, 1) if f == 1 or (cols // f >= _COARSEST and rows // f >= 1)]
-    steps = _STEPS[-len(factors) :]
-    found, total, done = geometry, sum(steps), 0
+    if not projections.any():
+        raise ValueError("the views show no matter")
+    factors = _factors(*geometry.detector_shape)
+    steps = _STEPS[: len(factors)]
+    total, done = _AXIS_STEPS + sum(steps) + 2 + len(terms), 0
+
+    def tick() -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    found = geometry
     for factor, count in zip(factors, steps, strict=True):
-        small = found.binned(factor)
-        data = bin_views(projections, factor)
-        weights = None if known is None else np.broadcast_to(bin_views(known[None], factor), data.shape)
-        fit = JointFit.of(data, small, terms, weights)
-        fit.step(_FIRST, 0.0)
+        small, data = found.binned(factor), bin_views(projections, factor)
+        fit = JointFit.of(data, small, frozenset({"axis"}), _weights(known, factor, data))
+        fit.step(_AXIS_ROUNDS, 0.0)
+        if factor == factors[0] and "axis" in terms:
+            for _ in range(_AXIS_STEPS):
+                fit.step(_AXIS_ROUNDS, _FARTHEST)
+                tick()
+        fit.terms = terms
         for _ in range(count):
-            fit.step(_ROUNDS, 2.0)
-            done += 1
-            progress(done, total)
+            fit.step(_ROUNDS, _FARTHEST)
+            tick()
         found = Change.between(small, fit.geometry).scaled(factor).applied(found)
-    change = Change.between(geometry, found)
-    text = (
-        f"Geometry learnt: the axis moves by {change.axis:+.2f} px, roll {math.degrees(change.roll):+.3f}°, tilt "
-        f"{math.degrees(change.tilt):+.3f}°, views by up to {np.abs(change.shifts).max():.2f} px."
+    return _confirmed(projections, geometry, Change.between(geometry, found).of(terms), known, factors[-1], tick)
+
+
+def _factors(rows: int, cols: int) -> list[int]:
+    """Binning of the levels, from coarse to fine."""
+    finest = 2 if cols >= 2 * _FEWEST and cols <= _ENOUGH and rows > 1 else 1
+    found = [f for f in (8, 4, 2, 1) if f >= finest and cols // f >= _FEWEST and rows // f >= 1]
+    return found[-len(_STEPS) :] or [1]
+
+
+def _weights(known: F32 | None, factor: int, data: F32) -> F32 | None:
+    if known is None:
+        return None
+    return np.ascontiguousarray(np.broadcast_to(bin_views(known[None], factor), data.shape))
+
+
+def _confirmed(
+    projections: F32, geometry: Geometry, change: Change, known: F32 | None, factor: int, tick: Callable[[], None]
+) -> Learnt:
+    """The part of a change that views held out confirm: the whole against none, then each term of it."""
+    small, data = geometry.binned(factor), bin_views(projections, factor)
+    edge = reach(geometry)
+    sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
+    wanted = [term for term, size in zip(TERMS, sizes, strict=True) if size > _NOTHING]
+    judge = Judge(
+        data,
+        taller(Grid.matching(small)),
+        None if known is None else bin_views(known[None], factor)[0],
+        "shifts" in wanted,
     )
-    return Learnt(change, text, {"calibrate_axis_px": change.axis})
+
+    def judged(terms: list[str]) -> NDArray[np.float64]:
+        tick()
+        return judge.deviations(change.of(frozenset(terms)).scaled(1 / factor).applied(small))
+
+    before = judged([])
+    kept, after = list(wanted), before
+    if wanted:
+        after = judged(kept)
+        if not better(after, before):
+            kept, after = [], before
+        for term in list(kept) if len(kept) > 1 else []:
+            rest = [each for each in kept if each != term]
+            without = judged(rest)
+            if not better(after, without):
+                kept, after = rest, without
+    asked = [term for term in wanted if term not in kept]
+    return Learnt(
+        change.of(frozenset(kept)), tuple(kept), tuple(asked), float(np.median(before)), float(np.median(after))
+    )
+
+
+def _text(change: Change, term: str, binning: int) -> str:
+    if term == "axis":
+        return f"the axis moves by {change.axis * binning:+.2f} px"
+    if term == "shifts":
+        return f"views by up to {np.abs(change.shifts).max() * binning:.2f} px"
+    return f"{term} {math.degrees(getattr(change, term)):+.3f}°"

@@ -129,7 +129,7 @@ def finish(
     Args:
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
-        problem: the views that were fitted, without roll and tilt, and the weights of their rays.
+        problem: the views that were fitted, and the weights of their rays.
         sweeps: 1 or more; None: 8, or as views held out prefer, see `preferred_sweeps` and `bregman_weight`.
         settings: of the fit; None: the defaults.
         control: is told of each sweep, also of those of trials, and asked after it whether to stop. A stop between the
@@ -140,7 +140,7 @@ def finish(
         nonnegative: voxels below zero are clipped.
 
     Raises:
-        ValueError: for views with roll or tilt, shapes that disagree, or no sweeps.
+        ValueError: for shapes that disagree, or no sweeps.
     """
     fit, control = settings or FitSettings(), control or RunControl()
     decide = control.decide or Decisions(problem.seed)

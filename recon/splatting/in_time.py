@@ -34,12 +34,10 @@ _EIGENVALUE_ROUNDS, _FIRST_SWEEPS = 6, 3
 
 
 def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """Time of a sweep of FISTA-TV over all views; infinite for rolled or tilted ones, which voxels do not take.
+    """Time of a sweep of FISTA-TV over all views.
 
     It is measured on projections of a few views in both directions and one proximal step of total variation.
     """
-    if not geometry.is_straight:
-        return math.inf
     some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _SWEPT_VIEWS))[:_SWEPT_VIEWS])
     projector = Projector(some, grid)
     begin = now()
@@ -51,10 +49,9 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
 
 
 def first_sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
-    """The same for straight views, estimated quickly at the beginning from binned pixels."""
-    straight = geometry.straightened()
-    factor = max(1, min(straight.detector_shape[1] // _COLS, straight.detector_shape[0]))
-    coarse = straight.binned(factor)
+    """The same, estimated quickly at the beginning from binned pixels."""
+    factor = max(1, min(geometry.detector_shape[1] // _COLS, geometry.detector_shape[0]))
+    coarse = geometry.binned(factor)
     box = Grid.of_field(coarse, coarse.sample_pitch)
     share = math.prod(grid.shape) / math.prod(box.shape)
     return sweep_seconds(coarse, box, now) * share

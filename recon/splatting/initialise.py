@@ -21,8 +21,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import binned_geometry
 from recon.splatting.splat import project
-from recon.voxels.fbp import fbp
-from recon.voxels.fdk import fdk
+from recon.voxels.direct import direct
 from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
@@ -142,18 +141,18 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
 
     "fbp": FBP or FDK; a short scan of a cone, which FDK does not cover, gets a few sweeps of OS-SIRT with TV instead.
     "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
-    ramp. Rolled and tilted views count as straight ones here; the fit then uses the full geometry.
+    ramp.
     """
-    straight, projections = geometry.straightened(), without_wild_pixels(projections)
+    projections = without_wild_pixels(projections)
     if _swept(geometry, start):
         sweeps = OsSirtTv(iterations=_SWEEPS, tv_weight=_SWEEP_WEIGHT, momentum=True)
-        return solve(sweeps, Projector(straight, grid), projections)
+        return solve(sweeps, Projector(geometry, grid), projections)
     ramp: Filter = "ram-lak" if start == "published" else "hann"
     if geometry.is_cone:
-        return Volume(fdk(projections, straight, grid, ramp), grid)
+        return Volume(direct(projections, geometry, grid, ramp), grid)
     # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
-    return Volume(fbp(projections, straight, grid, ramp) * whole, grid)
+    return Volume(direct(projections, geometry, grid, ramp) * whole, grid)
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:

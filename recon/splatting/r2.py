@@ -45,8 +45,7 @@ class R2:
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
         with the lowest residual.
         finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8
-            to 24 as views held out prefer. Rolled or tilted views get none, since the voxel projector does not take
-            them. The result's `gaussians` stay the model as it was fitted.
+            to 24 as views held out prefer. The result's `gaussians` stay the model as it was fitted.
         allow_negative: the finish keeps voxels below zero; Gaussians have none.
         fit: weights, rates and limits.
     """
@@ -90,9 +89,7 @@ class R2:
 
     def finish_sweeps(self, geometry: Geometry) -> int:
         """Sweeps of the finish on these views."""
-        if self.finish is None:
-            return SWEEPS if geometry.is_straight else 0
-        return self.finish
+        return SWEEPS if self.finish is None else self.finish
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
         return run_fit(self, problem, control)

@@ -96,10 +96,6 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     now, settings, geometry = control.now, method.fit, problem.geometry
     begin, decide = now(), control.decide or Decisions(problem.seed)
     sweeps = method.finish_sweeps(geometry)
-    if sweeps and not geometry.is_straight:
-        raise ValueError(
-            "finish works on voxels, whose projector takes straight views only: these are rolled or tilted"
-        )
     held_out = tuple(problem.use.held_out)
     backend = backend_for(problem.device)
     used, kept_back = _split(geometry.n_views, held_out, method.early_stop)

@@ -14,6 +14,7 @@ from recon.base.method import MethodResult, Progress, ReconProblem, RunControl, 
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import Filter, fbp, fbp_memory
 from recon.voxels.fdk import fdk
+from recon.voxels.posed_direct import posed_direct
 from recon.voxels.view_weights import covers_the_circle
 
 
@@ -64,12 +65,15 @@ def direct(
     on_block: Callable[[int, int], None] = lambda done, of: None,
     out: F32 | None = None,
 ) -> F32:
-    """FBP of a parallel beam, FDK of a cone [z, y, x]; see `fbp` and `fdk`. Only `fbp` takes `out`."""
+    """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
+    and `posed_direct`. Only `fbp` takes `out`."""
+    if not geometry.is_straight:
+        return posed_direct(projections, geometry, grid, filter, on_block)
     if geometry.is_cone:
         return fdk(projections, geometry, grid, filter, on_block)
     return fbp(projections, geometry, grid, filter, on_block, out)
 
 
 def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: without roll and tilt, and over the full circle for a cone."""
-    return geometry.is_straight and (not geometry.is_cone or covers_the_circle(geometry.angles))
+    """Whether FBP or FDK takes these views: a cone must cover the full circle."""
+    return not geometry.is_cone or covers_the_circle(geometry.angles)

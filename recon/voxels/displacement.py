@@ -191,7 +191,7 @@ class _Problem:
 
     def weights(self, geometry: Geometry) -> F32:
         seen = seen_rays(geometry, self.grid)
-        return (seen[:, :, None] & self.known).astype(np.float32)
+        return (seen & self.known).astype(np.float32)
 
     def volume(self, geometry: Geometry, views: NDArray[np.integer]) -> Volume:
         geometry, projections = geometry.select(views), self.projections[views]

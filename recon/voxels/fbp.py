@@ -36,7 +36,7 @@ from recon.voxels.view_weights import ray_weights
 _VIEWS = 32  # filtered at a time
 
 
-def _transfer(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
+def ramp(n: int, pixel_pitch: float, filter: Filter) -> NDArray[np.float32]:
     """Transfer function [n // 2 + 1] of the ramp for a transform of n samples, 1/mm."""
     # The kernel is sampled in space and transformed: sampling |ω| instead would lose the mean value of the volume.
     k = np.minimum(np.arange(n), n - np.arange(n))
@@ -72,7 +72,7 @@ def filter_projections(
     cols = projections.shape[-1]
     n = fft.next_fast_len(2 * cols, real=True)  # no wrap-around for kernels as long as the row
     spectrum = fft.rfft(np.asarray(projections, np.float32), n, axis=-1, workers=get_num_threads())
-    spectrum *= _transfer(n, pixel_pitch, filter)
+    spectrum *= ramp(n, pixel_pitch, filter)
     return fft.irfft(spectrum, n, axis=-1, workers=get_num_threads())[..., :cols]
 
 
@@ -124,14 +124,14 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     if geometry.is_cone:
         raise ValueError("FBP is for a parallel beam; a cone beam is for fdk")
     if not geometry.is_straight:
-        raise ValueError("FBP takes straight views only; these are rolled or tilted: rotate the images first")
+        raise ValueError("FBP takes straight views only; these are rolled or tilted: `direct` takes them")
     z, y, x = (axis / geometry.pixel_pitch for axis in grid.coordinates())
     weights, zeros = ray_weights(geometry)
     axis_cols = geometry.axis_col + geometry.shifts[:, 0] + zeros[0]
     cols = geometry.detector_shape[1] + sum(zeros)
     back_project = partial(ray_by_ray, geometry.angles, axis_cols, x, y)
     if is_gridded(geometry, grid, filter):
-        response = partial(_transfer, pixel_pitch=1.0, filter=filter)
+        response = partial(ramp, pixel_pitch=1.0, filter=filter)
         back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
     share = weights.astype(np.float32)[:, None]
     return FbpPlan(geometry, grid, filter, share, zeros, z + geometry.axis_row, back_project)
@@ -145,7 +145,7 @@ def fbp_memory(views: int, cols: int) -> int:
 
 def fbp_nanoseconds(views: int, cols: int, slices: int) -> float:
     """Time of FBP of so many slices [cols, cols], on the machine of docs/notes/performance.md."""
-    response = partial(_transfer, pixel_pitch=1.0, filter="hann")
+    response = partial(ramp, pixel_pitch=1.0, filter="hann")
     return min(nanoseconds(views, cols, (cols, cols), slices, response)) * -(-slices // SLICES)
 
 
@@ -153,7 +153,7 @@ def is_gridded(geometry: Geometry, grid: Grid, filter: Filter) -> bool:
     """Whether FBP of these views grids the slices; never of a cone, or of rolled or tilted views."""
     if geometry.is_cone or not geometry.is_straight:
         return False
-    response = partial(_transfer, pixel_pitch=1.0, filter=filter)
+    response = partial(ramp, pixel_pitch=1.0, filter=filter)
     nz, ny, nx = grid.shape
     return gridding_pays(geometry.n_views, geometry.detector_shape[1], (ny, nx), nz, response)
 

@@ -102,7 +102,7 @@ def fdk(
     if not geometry.is_cone:
         raise ValueError("FDK is for a cone beam; a parallel beam is for fbp")
     if not geometry.is_straight:
-        raise ValueError("FDK takes straight views only; these are rolled or tilted: rotate the images first")
+        raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
     grid = Grid.matching(geometry) if grid is None else grid
     reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
     if reach >= geometry.sod:

@@ -37,9 +37,16 @@ _GAIN, _FURTHER_GAIN = 0.003, 0.001
 
 
 def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geometry, Grid]:
-    """Rows first..stop of a parallel beam, and the slices that they see, as wide as `grid`."""
+    """Rows first..stop of a parallel beam, and the slices that they see, as wide as `grid`.
+
+    If rows do not show slices, these are all slices that any ray to the rows meets.
+    """
     views = geometry.rows(first, stop)
     slab = Grid.matching(views)
+    if not geometry.rows_show_slices:
+        low, high = views.heights
+        slices = math.ceil((high - low + 2 * geometry.lean) / geometry.sample_pitch)
+        slab = replace(slab, shape=(slices, *slab.shape[1:]), centre=((low + high) / 2, 0.0, 0.0))
     shape, centre = (slab.shape[0], *grid.shape[1:]), (slab.centre[0], *grid.centre[1:])
     return views, replace(grid, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
 
@@ -150,8 +157,10 @@ def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: i
     eight views in three rounds. Each has to bring the others nearer, and all by one per cent, which parts the two
     (docs/notes/exploration.md). Where slices are not those of rows: `sweeps`.
     """
-    grid, rows = problem.projector.grid, Grid.matching(problem.projector.geometry)
-    if (grid.shape[0], grid.spacing[0], grid.centre[0]) != (rows.shape[0], rows.spacing[0], rows.centre[0]):
+    geometry, grid = problem.projector.geometry, problem.projector.grid
+    rows = Grid.matching(geometry)
+    same = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
+    if not (same and geometry.rows_show_slices):
         return sweeps
     trial = _Trial.of(problem, start)
     x = trial.start.copy()
@@ -204,7 +213,7 @@ class _Trial:
         if start is not None:
             return cls(trial, np.ascontiguousarray(start[:, :, rows]), of_views(unseen))
         first = trial.filtered("hann")
-        assert first is not None  # views of a parallel beam, straight
+        assert first is not None  # views of a parallel beam
         return cls(trial, np.maximum(first, 0, out=first), of_views(unseen))
 
     def _go_on(self, sweep: int, residual: float) -> bool:

@@ -114,8 +114,7 @@ def _band(geometry: Geometry) -> int:
 def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slice, F32, F32]]:
     """Views, rows, the volume's projection [view, row, col] there and its sharp part: in bands if rows are slices."""
     rows, band = geometry.detector_shape[0], _band(geometry)
-    shifted = geometry.is_cone or bool(geometry.shifts[:, 1].any())
-    if shifted or volume.grid != Grid.matching(geometry):
+    if not geometry.rows_show_slices or volume.grid != Grid.matching(geometry):
         lines = volume_lines(volume.data)  # once: of a large volume that takes as long as a view
         for view in range(0, geometry.n_views, _AT_A_TIME):
             some = slice(view, view + _AT_A_TIME)

@@ -25,6 +25,7 @@ from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 
 _ON_ROWS = 1e-6  # slices: slices this close to the rows lie on them
+_TALL = 0.25  # of the box's height: views that climb by more within the field keep rays that leave it
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 
 
@@ -193,10 +194,22 @@ def residual_norms(
 
 
 def seen_rays(geometry: Geometry, grid: Grid) -> NDArray[np.bool_]:
-    """[view, row] rays of a parallel beam between the outer slices of the grid, which the volume can explain."""
-    rows = np.arange(geometry.detector_shape[0]) - geometry.axis_row - geometry.shifts[:, 1:]
-    off = np.abs(rows * geometry.pixel_pitch - grid.centre[0]) / grid.spacing[0]
-    return np.asarray(off <= (grid.shape[0] - 1) / 2 + _EDGE_ROWS)
+    """[view, row, col] rays of a parallel beam between the outer slices of the grid, which the volume can explain.
+
+    One column stands for all where views are straight. A ray that roll or tilt takes beyond these slices within the
+    field is not among them. Of views that climb by a quarter of the box or more, the middle of each ray decides.
+    """
+    rows, cols = geometry.detector_shape
+    down = np.arange(rows)[:, None] - geometry.axis_row - geometry.shifts[:, 1, None, None]
+    middle, climb = down, np.zeros(1)
+    if not geometry.is_straight:
+        across = np.arange(cols) - geometry.axis_col - geometry.shifts[:, 0, None, None]
+        lean = np.stack([geometry.axes(view)[:, 2] for view in range(geometry.n_views)])[:, :, None, None]
+        middle = across * lean[:, 0] + down * lean[:, 1]
+        climb = geometry.reach * np.abs(lean[:, 2])
+        climb = np.where(climb < _TALL * grid.shape[0] * grid.spacing[0], climb, 0.0)
+    off = np.abs(middle * geometry.pixel_pitch - grid.centre[0]) + climb
+    return np.asarray(off / grid.spacing[0] <= (grid.shape[0] - 1) / 2 + _EDGE_ROWS)
 
 
 def _plain(array: F32) -> F32:

@@ -78,7 +78,7 @@ def unexplained(
     if level <= 0 or not matter.any():
         return None
     left = projections[:, first : first + n] - Projector(views, part.grid).forward(part.data)
-    unseen = np.broadcast_to(~seen_rays(views, part.grid)[:, :, None], left.shape)
+    unseen = np.broadcast_to(~seen_rays(views, part.grid), left.shape)
     if weights is not None:
         unseen = unseen | (weights[:, first : first + n] == 0)
     left[unseen] = 0

@@ -99,21 +99,14 @@ def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
         recon.reconstruct(data, VIEWS, Auto((Refusing(),)))
 
 
-@pytest.mark.parametrize(
-    ("views", "why"),
-    [
-        (VIEWS.select(np.arange(0, 24, 2)), "12 views are too few"),
-        (replace(VIEWS, tilt=np.full(24, 0.02)), "rolled or tilted"),
-    ],
-)
-def test_where_nothing_can_be_tried_the_first_one_runs(data: F32, views: recon.Geometry, why: str) -> None:
+def test_where_nothing_can_be_tried_the_first_one_runs(data: F32) -> None:
     @dataclass(frozen=True)
     class Blank(Fbp):
         def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:
             return MethodResult(Volume(np.zeros(problem.grid.shape, np.float32), problem.grid), {})
 
-    found = recon.reconstruct(data[: views.n_views], views, Auto((Blank(), Scaled())))
-    assert why in found.settings["chosen_because"]
+    found = recon.reconstruct(data[:12], VIEWS.select(np.arange(0, 24, 2)), Auto((Blank(), Scaled())))
+    assert "12 views are too few" in found.settings["chosen_because"]
 
 
 TURN = np.linspace(0, 2 * np.pi, 24, endpoint=False)

@@ -49,7 +49,7 @@ class Calibrate:
     """
 
     name: ClassVar[str] = "calibrate"
-    follows: ClassVar[tuple[str, ...]] = ("jumps", "background")
+    follows: ClassVar[tuple[str, ...]] = ("jumps", "poses", "background")
     terms: tuple[str, ...] = option(
         "--calibrate",
         "none",

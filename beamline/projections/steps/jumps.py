@@ -48,7 +48,10 @@ class Jumps:
         progress: Callable[[int, int], None],
     ) -> SamplePlaces:
         from beamline.projections.jumps import SamplePlaces, find_jumps, frames_text
+        from beamline.projections.steps.poses import PosesOfFile
 
+        if selection.step(PosesOfFile).table is not None:  # it states where the sample was
+            return SamplePlaces(usable.frames)
         if self.wanted == "correct":
             return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)

@@ -24,6 +24,7 @@ REGISTRY: dict[str, str] = {
     "flats": "Flats",
     "phase": "Phase",
     "jumps": "Jumps",
+    "poses": "PosesOfFile",
     "calibrate": "Calibrate",
     "rings": "Rings",
     "hardening": "Hardening",

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from beamline.projections.flags import UsableViews
-    from beamline.projections.jumps import SamplePlaces
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.selection import Selection
     from beamline.storage.readers.base import ScanSource
@@ -171,6 +170,28 @@ class ViewStep(PrepStep, Protocol):
         """
 
 
+class Places(Protocol):
+    """Where the sample was in the views of a scan.
+
+    Attributes:
+        frames: int64 [view], the rows of the file that are used.
+        said: what was done, in a line; empty: nothing.
+        done: what the step did.
+    """
+
+    @property
+    def frames(self) -> NDArray[np.int64]: ...
+
+    @property
+    def said(self) -> str: ...
+
+    @property
+    def done(self) -> StepDone: ...
+
+    def corrected(self, geometry: Geometry, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of these rows of the file, as the sample was in them."""
+
+
 @runtime_checkable
 class PlaceStep(PrepStep, Protocol):
     """A step that finds where the sample was in each view, before views are corrected."""
@@ -182,7 +203,7 @@ class PlaceStep(PrepStep, Protocol):
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
-    ) -> SamplePlaces:
+    ) -> Places:
         """The views that are used, where the sample was in them, and what was done.
 
         Args:

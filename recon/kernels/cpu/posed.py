@@ -22,7 +22,6 @@ from recon.kernels.cpu.joseph import F64, calls
 
 _f = np.float32
 _COLS = 16  # columns of one job
-_EDGE = 1e-9  # voxels: a sample closer than this to the end of its reach weighs nothing
 _FLAT = 1e-15  # voxels a row: such a line of samples stays at its place
 _LEAST = 0.05  # of the run across the planes in a column's middle, anywhere in that column
 
@@ -32,9 +31,9 @@ Axes = NDArray[np.int8]
 def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     """The path of the rays of every column: float64 [view, col, 12], and the axis across its planes, int8 [view, col].
 
-    The axis is 0 for planes of constant y, 1 for x, 2 for z. In plane j the ray to a row meets the other two axes, in
-    the order (x, z), (y, z) or (y, x), at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row), and t4 to t7 for the
-    second. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
+    The axis is 0 for planes of constant y, 1 for x, 2 for z. The other two axes have the order (x, z), (y, z) or (y, x).
+    In plane j the ray to a row is at voxel (t0 + t1 j + (t2 + t3 j) row) / (1 + t8 row) of the first one. Of the second
+    one t4 to t7 say the same. Its path from plane to plane is sqrt(t9 + t10 row + t11 row²) / (1 + t8 row) mm.
 
     Raises:
         ValueError: if rays of one column differ so much that they share no planes.
@@ -68,8 +67,8 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Axes]:
     last = 1 + narrow * (rows - 1)
     if (np.minimum(last, 1) < _LEAST * (1 + last) / 2).any():
         raise ValueError(
-            "rays of one detector column differ in direction by almost a right angle: views tilted or rolled as far "
-            "as these need a narrower cone or fewer rows"
+            "rays of one detector column differ in direction by almost a right angle: views that lean this far need "
+            "a narrower cone or fewer rows"
         )
     table = np.empty((views, cols, 12))
     for part, axis in ((0, np.where(across == 2, 1, np.where(across == 1, 2, 1))), (4, np.where(across == 0, 2, 0))):
@@ -101,17 +100,18 @@ def _crossed(n0, n1, narrow, low, high, first, end):
 
 
 @njit(inline="always", error_model="numpy")
-def _rows(b0, b1, c0, c1, narrow, n_b, n_c, rows):
-    """Rows first..end (excluded) whose samples in a plane lie less than one voxel outside it."""
-    first, end = _crossed(b0, b1, narrow, -1.0 + _EDGE, n_b - _EDGE, 0.0, rows * 1.0)
-    first, end = _crossed(c0, c1, narrow, -1.0 + _EDGE, n_c - _EDGE, first, end)
+def _rows(t, j, n_b, n_c, rows):
+    """Rows first..end (excluded) of a column whose samples in plane j lie less than one voxel outside it."""
+    b0, b1, c0, c1 = t[0] + t[1] * j, t[2] + t[3] * j, t[4] + t[5] * j, t[6] + t[7] * j
+    first, end = _crossed(b0, b1, t[8], -1.0, n_b, 0.0, rows * 1.0)
+    first, end = _crossed(c0, c1, t[8], -1.0, n_c, first, end)
     first, end = math.ceil(min(first, rows * 1.0)), math.floor(max(end, 0.0))
     return first, max(first, end)
 
 
 @njit(inline="always")
 def _strides(axis, ny, nx, nz):
-    """Voxels of each of the three coordinates (plane, b, c), and the distance of neighbours in memory along them."""
+    """Voxels along the three coordinates (plane, b, c), and the distance of neighbours in memory along them."""
     if axis == 0:
         return ny, nx, nz, nx * nz, nz, 1
     if axis == 1:
@@ -119,39 +119,53 @@ def _strides(axis, ny, nx, nz):
     return nz, ny, nx, 1, nx * nz, nz
 
 
+@njit(inline="always", fastmath=True, error_model="numpy")
+def _samples(t, j, row0, row1, n_b, n_c, of_b, of_c, at, low_b, high_b, low_c, high_c):
+    """The samples of rows row0..row1 (excluded) of a column in plane j, as arrays from row0 on.
+
+    at: the first of four voxels. low, high: weights of the lower and the upper line, and of their voxels. A line beyond
+    the last one has weight 0, so a sample outside the outermost lines stays on these.
+    """
+    b0, b1, c0, c1, narrow = t[0] + t[1] * j, t[2] + t[3] * j, t[4] + t[5] * j, t[6] + t[7] * j, t[8]
+    last_b, last_c = max(n_b - 2, 0), max(n_c - 2, 0)
+    up_b, up_c = _f(min(n_b - 1, 1)), _f(min(n_c - 1, 1))
+    for s in range(row1 - row0):
+        row = row0 + s
+        scale = 1.0 / (1.0 + narrow * row)
+        b, c = (b0 + b1 * row) * scale, (c0 + c1 * row) * scale
+        i, k = min(max(np.int32(b), np.int32(0)), last_b), min(max(np.int32(c), np.int32(0)), last_c)
+        p, q = _f(b - i), _f(c - k)
+        at[s] = i * of_b + k * of_c
+        low_b[s], high_b[s] = max(_f(1) - abs(p), _f(0)), max(_f(1) - abs(p - _f(1)), _f(0)) * up_b
+        low_c[s], high_c[s] = max(_f(1) - abs(q), _f(0)), max(_f(1) - abs(q - _f(1)), _f(0)) * up_c
+
+
 @njit(**OPTIONS)
 def _forward(voxels: F32, shape: tuple[int, int, int], rays: F64, axes: Axes, start: int, end: int, out: F32) -> None:
     """Jobs start to end, of as many as there are views times blocks of columns."""
-    views, cols, rows = out.shape
+    _, cols, rows = out.shape
     blocks = (cols + _COLS - 1) // _COLS
     for job in prange(start, end):
         v, first_col = job // blocks, job % blocks * _COLS
         last_col = min(first_col + _COLS, cols)
         out[v, first_col:last_col] = _f(0)
+        at, weights = np.empty(rows, np.int64), np.empty((4, rows), np.float32)
+        low_b, high_b, low_c, high_c = weights[0], weights[1], weights[2], weights[3]
         for axis in range(3):
             planes, n_b, n_c, of_plane, of_b, of_c = _strides(axis, shape[0], shape[1], shape[2])
+            along_b, along_c = of_b * min(n_b - 1, 1), of_c * min(n_c - 1, 1)
             for j in range(planes):
-                plane = j * of_plane
                 for col in range(first_col, last_col):
                     if axes[v, col] != axis:
                         continue
-                    t = rays[v, col]
-                    b0, b1, c0, c1, narrow = t[0] + t[1] * j, t[2] + t[3] * j, t[4] + t[5] * j, t[6] + t[7] * j, t[8]
-                    row0, row1 = _rows(b0, b1, c0, c1, narrow, n_b, n_c, rows)
-                    target = out[v, col]
-                    for row in range(row0, row1):
-                        scale = 1.0 / (1.0 + narrow * row)
-                        b, c = (b0 + b1 * row) * scale, (c0 + c1 * row) * scale
-                        i, k = int(b + 1.0) - 1, int(c + 1.0) - 1
-                        p, q = _f(b - i), _f(c - k)
-                        p0 = _f(1) - p if i >= 0 else _f(0)
-                        q0 = _f(1) - q if k >= 0 else _f(0)
-                        p1 = p if i + 1 < n_b else _f(0)
-                        q1 = q if k + 1 < n_c else _f(0)
-                        near, far = plane + max(i, 0) * of_b, plane + min(i + 1, n_b - 1) * of_b
-                        low, high = max(k, 0) * of_c, min(k + 1, n_c - 1) * of_c
-                        target[row] += p0 * (q0 * voxels[near + low] + q1 * voxels[near + high]) + p1 * (
-                            q0 * voxels[far + low] + q1 * voxels[far + high]
+                    row0, row1 = _rows(rays[v, col], j, n_b, n_c, rows)
+                    _samples(rays[v, col], j, row0, row1, n_b, n_c, of_b, of_c, at, low_b, high_b, low_c, high_c)
+                    target, plane = out[v, col, row0:row1], voxels[j * of_plane :]
+                    for s in range(row1 - row0):
+                        i = at[s]
+                        h = i + along_b
+                        target[s] += low_b[s] * (low_c[s] * plane[i] + high_c[s] * plane[i + along_c]) + high_b[s] * (
+                            low_c[s] * plane[h] + high_c[s] * plane[h + along_c]
                         )
         for col in range(first_col, last_col):
             _lengthen(out[v, col], out[v, col], rays[v, col])
@@ -178,34 +192,27 @@ def _adjoint(
 ) -> None:  # fmt: skip
     """Planes start to end across one axis, added to the voxels."""
     views, cols, rows = weighed.shape
-    planes, n_b, n_c, of_plane, of_b, of_c = _strides(axis, shape[0], shape[1], shape[2])
+    _, n_b, n_c, of_plane, of_b, of_c = _strides(axis, shape[0], shape[1], shape[2])
+    along_b, along_c = of_b * min(n_b - 1, 1), of_c * min(n_c - 1, 1)
     for j in prange(start, end):
-        plane = j * of_plane
+        at, weights = np.empty(rows, np.int64), np.empty((4, rows), np.float32)
+        low_b, high_b, low_c, high_c = weights[0], weights[1], weights[2], weights[3]
+        plane = voxels[j * of_plane :]
         for v in range(views):
             for col in range(cols):
                 if axes[v, col] != axis:
                     continue
-                t = rays[v, col]
-                b0, b1, c0, c1, narrow = t[0] + t[1] * j, t[2] + t[3] * j, t[4] + t[5] * j, t[6] + t[7] * j, t[8]
-                row0, row1 = _rows(b0, b1, c0, c1, narrow, n_b, n_c, rows)
-                source = weighed[v, col]
-                for row in range(row0, row1):
-                    scale = 1.0 / (1.0 + narrow * row)
-                    b, c = (b0 + b1 * row) * scale, (c0 + c1 * row) * scale
-                    i, k = int(b + 1.0) - 1, int(c + 1.0) - 1
-                    p, q = _f(b - i), _f(c - k)
-                    p0 = _f(1) - p if i >= 0 else _f(0)
-                    q0 = _f(1) - q if k >= 0 else _f(0)
-                    p1 = p if i + 1 < n_b else _f(0)
-                    q1 = q if k + 1 < n_c else _f(0)
-                    near, far = plane + max(i, 0) * of_b, plane + min(i + 1, n_b - 1) * of_b
-                    low, high = max(k, 0) * of_c, min(k + 1, n_c - 1) * of_c
-                    p0 *= source[row]
-                    p1 *= source[row]
-                    voxels[near + low] += p0 * q0
-                    voxels[near + high] += p0 * q1
-                    voxels[far + low] += p1 * q0
-                    voxels[far + high] += p1 * q1
+                row0, row1 = _rows(rays[v, col], j, n_b, n_c, rows)
+                _samples(rays[v, col], j, row0, row1, n_b, n_c, of_b, of_c, at, low_b, high_b, low_c, high_c)
+                source = weighed[v, col, row0:row1]
+                for s in range(row1 - row0):
+                    i = at[s]
+                    h = i + along_b
+                    low, high = low_b[s] * source[s], high_b[s] * source[s]
+                    plane[i] += low * low_c[s]
+                    plane[i + along_c] += low * high_c[s]
+                    plane[h] += high * low_c[s]
+                    plane[h + along_c] += high * high_c[s]
 
 
 def forward(volume: F32, rays: F64, axes: Axes, out: F32) -> None:

@@ -226,9 +226,14 @@ def test_the_pixel_of_a_cone_is_smaller_at_the_sample() -> None:
         Geometry.cone([0.0], (4, 8), 0.7, 70.0, 50.0)
 
 
-@given(start=st.integers(0, 3), factor=st.integers(1, 3))
-def test_cutting_and_binning_keep_the_rays_of_a_cone(start: int, factor: int) -> None:
-    whole = Geometry.cone([0.3], (9, 12), 0.5, 20.0, 30.0, 4.2, axis_row=3.1, shifts=[[1.0, 2.0]])
+@given(start=st.integers(0, 3), factor=st.integers(1, 3), cone=st.booleans())
+def test_cutting_and_binning_keep_the_rays_of_a_cone_and_of_leaning_views(start: int, factor: int, cone: bool) -> None:
+    lean = {"axis_row": 3.1, "shifts": [[1.0, 2.0]], "roll": 0.2, "tilt": 0.1}
+    whole = (
+        Geometry.cone([0.3], (9, 12), 0.5, 20.0, 30.0, 4.2, **lean)
+        if cone
+        else Geometry.parallel([0.3], (9, 12), 0.5, 4.2, **lean)
+    )
     binned = whole.rows(start, 9).binned(factor)
     for j in range(binned.detector_shape[0]):
         rows = np.arange(start + j * factor, start + (j + 1) * factor)

@@ -192,6 +192,3 @@ def test_what_cannot_be_is_refused() -> None:
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
     with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'finish' \(r2, r2-published has\)"):
         build(Fbp, {"finish": 2})
-    leaning = Geometry.parallel(VIEWS.angles, VIEWS.detector_shape, tilt=0.1)
-    with pytest.raises(ValueError, match=r"finish .* rolled or tilted"):
-        reconstruct(data, leaning, R2(steps=1, finish=2))

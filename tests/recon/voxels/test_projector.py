@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
+from recon.base.ray_model import RayModel
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_kernels
 from recon.kernels.cpu import joseph
-from recon.base.ray_model import RayModel
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project as gaussian_views
 from recon.splatting.splat import voxelize
@@ -249,7 +249,7 @@ def test_leaning_views_of_voxels_are_those_of_gaussians(cone: bool) -> None:
     found = project(Volume(voxelize(blobs, grid).numpy(), grid), geometry)
     # Linear interpolation across a ray errs in each of two directions by at most h²/8 of the second derivative.
     assert np.abs(found - shown).max() < 2 * (0.025 / 0.1) ** 2 / 8 * shown.max()
-    assert found.sum() == pytest.approx(shown.sum(), rel=1e-3)
+    assert found.sum() == pytest.approx(shown.sum(), rel=5e-3)
 
 
 @pytest.mark.parametrize("cone", [False, True])

@@ -1,0 +1,62 @@
+"""Poses of views from a file: displacement, roll and tilt, which become geometry. No view is resampled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+from beamline.projections.steps.step import Places, ScanPart, StepMemory, option
+
+if TYPE_CHECKING:
+    from beamline.projections.flags import UsableViews
+    from beamline.projections.selection import Selection
+    from beamline.storage.pose_table import PoseTable
+    from beamline.storage.readers.base import ScanSource
+
+
+def _table(text: str) -> PoseTable:
+    from beamline.storage.pose_table import read_poses
+
+    return read_poses(text)
+
+
+@dataclass(frozen=True)
+class PosesOfFile:
+    """Where views were displaced, rolled and tilted, as a file states it.
+
+    Attributes:
+        table: the file's; None: views are straight and not displaced.
+    """
+
+    name: ClassVar[str] = "poses"
+    follows: ClassVar[tuple[str, ...]] = ("jumps",)
+    table: PoseTable | None = option(
+        "--poses",
+        None,
+        "Displacement, roll and tilt of each view; no view is resampled. A CSV with view or angle_deg, and "
+        "shift_col_px, shift_row_px, roll_deg, tilt_deg. Or a volume that keeps poses. Or an NXtomo file as FILE:x,-y: "
+        "columns grow with x_translation, rows against y_translation.",
+        parse=_table,
+        metavar="FILE",
+    )
+
+    @property
+    def needs_finished(self) -> str:
+        return "" if self.table is None else "--poses is for a finished scan: it needs all views."
+
+    def memory(self, part: ScanPart) -> StepMemory:
+        return StepMemory()
+
+    def place(
+        self,
+        source: ScanSource,
+        selection: Selection,
+        usable: UsableViews,
+        axis_col: float,
+        progress: Callable[[int, int], None],
+    ) -> Places:
+        from beamline.projections.jumps import SamplePlaces
+        from beamline.projections.poses import poses_of
+
+        return poses_of(source, selection, usable.frames) or SamplePlaces(usable.frames)

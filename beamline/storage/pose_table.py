@@ -1,0 +1,221 @@
+"""PoseTable: displacement, roll and tilt of each view, from a CSV, from a volume of ours or from an NXtomo file."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import text_in, write_whole
+from beamline.storage import hdf5
+from beamline.storage.readers.nexus_places import choose, find
+from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
+from drivers.base.frame import FrameKind
+
+_KEYS = "frame", "view", "angle_deg"
+_PIXELS = "shift_col_px", "shift_row_px"
+_TURNS = "roll_deg", "tilt_deg"
+_FOR_PEOPLE = "shift_col_mm", "shift_row_mm"
+_STEEPEST = 85.0  # degrees of tilt
+_LARGEST = 64 * 2**20  # bytes of a CSV
+_HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTable:
+    """Poses of some views, of unbinned pixels.
+
+    Attributes:
+        path: of the file.
+        by: what `keys` are: rows of the scan file, views counted from 0 in its order, or angles in degrees.
+        keys: float64 [row], all different.
+        angles_deg: float64 [row] of the views, to be compared with the scan's; None where the file has none.
+        shifts: float64 [row, 2], (col, row) by which the image is displaced, in `unit`.
+        turns_deg: float64 [row, 2], roll and tilt, as of `recon.base.geometry.Geometry`.
+        unit: "px" of the unbinned detector, or "mm" at the sample.
+        frames: of the scan that the file was made with; None: not known.
+    """
+
+    path: Path
+    by: Literal["frame", "view", "angle_deg"]
+    keys: F64
+    angles_deg: F64 | None
+    shifts: F64
+    turns_deg: F64
+    unit: Literal["px", "mm"] = "px"
+    frames: int | None = None
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def __post_init__(self) -> None:
+        for name, values in (("shift", self.shifts), ("roll or tilt", self.turns_deg)):
+            if not np.isfinite(values).all():
+                row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+                raise ValueError(f"{self.path}: {self.by} {self.keys[row]:g} has no finite {name}")
+        steep = np.abs(self.turns_deg) > (180.0, _STEEPEST)
+        if steep.any():
+            row = int(np.flatnonzero(steep.any(axis=1))[0])
+            roll, tilt = self.turns_deg[row]
+            raise ValueError(
+                f"{self.path}: {self.by} {self.keys[row]:g} has a roll of {roll:g} and a tilt of {tilt:g} degrees; "
+                f"expected at most 180 and {_STEEPEST:g}"
+            )
+        ordered, counts = np.unique(self.keys, return_counts=True)
+        if (counts > 1).any():
+            raise ValueError(f"{self.path}: {self.by} {ordered[counts > 1][0]:g} has {counts.max()} rows; expected one")
+
+
+def read_poses(text: str) -> PoseTable:
+    """The table that `FILE`, or `FILE:x,-y` of an NXtomo file, names.
+
+    Raises:
+        ValueError: the file cannot be read as poses; the message says why.
+    """
+    match = re.fullmatch(r"(.+):([+-]?[xyz]|0),([+-]?[xyz]|0)", text)
+    path = Path(match[1] if match else text)
+    try:
+        if hdf5.is_hdf5(path):
+            return _of_hdf5(path, (match[2], match[3]) if match else None)
+        return _of_csv(path, text_in(path, _LARGEST, "utf-8-sig"))
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ValueError(f"{path} cannot be read ({hdf5.reason(error)})") from error
+
+
+def _of_csv(path: Path, content: str) -> PoseTable:
+    lines = [line for line in content.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    rows = list(csv.reader(lines))
+    names = [name.strip().lower() for name in rows[0]] if rows else []
+    legal = (*_KEYS, *_PIXELS, *_TURNS, *_FOR_PEOPLE)
+    if not set(names) & set(_KEYS) or not set(names) & {*_PIXELS, *_TURNS}:
+        raise ValueError(
+            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
+            f"some of {', '.join((*_PIXELS, *_TURNS))}"
+        )
+    unknown = [name for name in names if name not in legal]
+    if unknown or len(set(names)) < len(names):
+        twice = [name for name in names if names.count(name) > 1]
+        raise ValueError(
+            f"{path}: column {(unknown or twice)[0]!r} is unknown or there twice; known: {', '.join(legal)}"
+        )
+    values = np.empty((len(rows) - 1, len(names)))
+    for number, row in enumerate(rows[1:]):
+        try:
+            values[number] = [float(cell) for _, cell in zip(names, row, strict=True)]
+        except ValueError:
+            raise ValueError(f"{path}: {','.join(row)!r} are not {len(names)} numbers") from None
+    if not len(values):
+        raise ValueError(f"{path} has a header and no rows; expected one for each view")
+    columns = dict(zip(names, values.T, strict=True))
+    by = next(name for name in _KEYS if name in columns)
+    keys, angles = columns[by], columns.get("angle_deg")
+    for name in (by, *(() if angles is None else ("angle_deg",))):
+        given = columns[name]
+        bad = ~np.isfinite(given) | ((name != "angle_deg") & (given != np.abs(np.round(given))))
+        if bad.any():
+            kind = "finite angles" if name == "angle_deg" else "whole numbers from 0 on"
+            raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
+    none = np.zeros(len(values))
+    shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
+    return PoseTable(path, by, keys, angles, shifts, turns)  # type: ignore[arg-type]
+
+
+def _of_hdf5(path: Path, ways: tuple[str, str] | None) -> PoseTable:
+    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+        if ways is None and hdf5.text_at(file, "entry/definition") == "NXtomoproc":
+            own = True
+        else:
+            own, table = False, _of_nexus(path, file, ways)
+    if not own:
+        return table
+    with opened_reconstruction(path) as record:
+        return _of_volume(path, record)
+
+
+def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
+    said = record.parameters
+    frames, angles = (
+        np.atleast_1d(np.asarray(said.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
+    )
+    if not any(name in said for name in POSES_KEPT) or not frames.size:
+        raise ValueError(f"{path} holds no poses: its views were taken as straight and not displaced")
+    none, binning = np.zeros(frames.size), int(said.get("binning", 1))
+    shifts = np.asarray(said.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
+    turns = np.stack([np.asarray(said.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
+    return PoseTable(path, "frame", frames, angles, shifts, turns)
+
+
+POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
+"""Parameters of a volume that keep the poses of its views, shifts in binned pixels."""
+
+
+def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
+    """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
+    places = choose(file, find(file))
+    keys = np.ravel(places.image_key[()])
+    shown = keys == FrameKind.PROJECTION
+    moved: dict[str, F64] = {}
+    for axis in "xyz":
+        item = hdf5.dataset(places.entry, f"sample/{axis}_translation")
+        if item is None:
+            continue
+        hdf5.require_real(item.dtype, f"{item.name} in {path}")
+        unit = hdf5.LENGTH_UNITS.get(hdf5.attribute(item, "units").lower())
+        values = np.ravel(np.asarray(item[()], np.float64))
+        if unit is None or values.size not in (1, keys.size):
+            raise ValueError(
+                f"{path}: {item.name} has {values.size} values in the units {hdf5.attribute(item, 'units')!r}; "
+                f"expected one for each of {keys.size} frames, in a unit of length"
+            )
+        values = np.broadcast_to(values * unit, keys.shape)
+        if not np.isfinite(values[shown]).all():
+            raise ValueError(f"{path}: {item.name} is not finite in {(~np.isfinite(values[shown])).sum()} projections")
+        moved[axis] = values - np.median(values[shown])
+    if not moved:
+        raise ValueError(f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV")
+    said = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
+    if ways is None:
+        raise ValueError(f"{path}: the sample moves in {said}, and NeXus does not say where on the detector; {_HOW}")
+    named = {way[-1] for way in ways} - {"0"}
+    if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):
+        raise ValueError(f"{path}: {','.join(ways)} are not two of the translations there, {', '.join(moved)}; {_HOW}")
+    shifts = [np.zeros(keys.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
+    rows = np.flatnonzero(shown)
+    stacked = np.stack(shifts, axis=1)[rows]
+    return PoseTable(path, "frame", rows.astype(np.float64), None, stacked, np.zeros((rows.size, 2)), "mm", keys.size)
+
+
+def write_poses(path: Path, volume: Path) -> int:
+    """The poses of the views of a volume file as a CSV that `read_poses` reads; how many views.
+
+    Raises:
+        DataError: the volume holds none, `path` exists, or the disk refuses; nothing is left.
+    """
+    with opened_reconstruction(volume) as record:
+        try:
+            table = _of_volume(volume, record)
+        except ValueError as error:
+            raise DataError(f"{error}. Nothing was written.") from error
+        said, mm = record.parameters, record.length_unit == "mm"
+        pixel = record.volume.grid.voxel_size if "sample_pitch" not in said else float(said["sample_pitch"])
+        pixel /= int(said.get("binning", 1))
+    assert table.angles_deg is not None
+    header = ["frame", "angle_deg", *_PIXELS, *_TURNS, *(_FOR_PEOPLE if mm else ())]
+    columns = [table.angles_deg, *table.shifts.T, *table.turns_deg.T, *(table.shifts.T * pixel if mm else ())]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for frame, *values in zip(table.keys, *columns, strict=True):
+        writer.writerow([int(frame), *(repr(float(value)) for value in values)])
+    write_whole(path, text.getvalue())
+    return int(table.keys.size)
