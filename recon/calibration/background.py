@@ -269,12 +269,22 @@ def _of_no_volume(views: _Views, progress: Callable[[int], object]) -> F64:
     data, known = views.without_volume(views.data), views.flat(np.ones_like(views.data))
     weight, found = known, np.zeros(len(TERMS))
     for _ in range(_ROBUST):
-        shares, combinations = eigh(terms.T @ (terms * weight[:, None]), whole.T @ (whole * weight[:, None]))
+        shares, combinations = _shares(terms.T @ (terms * weight[:, None]), whole.T @ (whole * weight[:, None]))
         kept = combinations[:, shares > _LEAST] / shares[shares > _LEAST] ** 0.5
         found = kept @ (kept.T @ (terms.T @ (weight * data)))
         off = np.abs(data - terms @ found)
         weight = known * (off <= _CLIPPED * _MAD * np.median(off[known > 0]))
     return np.asarray(found)
+
+
+def _shares(left: F64, whole: F64) -> tuple[F64, F64]:
+    """Shares [combination] of sums of squares [term, term] that are left of the whole, and combinations [term, .].
+
+    Terms that are alike on few rows have no share of their own.
+    """
+    least = 1e-9 * np.trace(whole) * np.eye(len(whole))
+    shares, combinations = eigh(left, whole + least)
+    return np.asarray(shares), np.asarray(combinations)
 
 
 def _levelled(start: _Trial, unseen: _Views, progress: Callable[[int], object]) -> tuple[_Trial, int]:
@@ -301,7 +311,7 @@ def _levelled(start: _Trial, unseen: _Views, progress: Callable[[int], object]) 
             x = volume_lines(trial.volume.data)
             dense = (x > _DENSE * density_unit(x)).astype(np.float32)
             unheld = np.stack([trial.views.without_volume(term, dense) for term in terms], -1)
-            shares, combinations = eigh(unheld.T @ unheld, whole.T @ whole)
+            shares, combinations = _shares(unheld.T @ unheld, whole.T @ whole)
             longer = combinations / np.maximum(shares, 1 / _LONGEST) @ combinations.T @ (whole.T @ whole)
         trial.coefficients[:_MEAN] += longer @ _fitted(np.median(left, axis=0), basis, used)
     return trial, rounds

@@ -152,6 +152,13 @@ def test_few_views_are_refused() -> None:
         learn_background(np.ones((23, *SHAPE), np.float32), GEOMETRY.select(np.arange(23)), TIMES[:23])
 
 
+@pytest.mark.parametrize("rows", [1, 2])
+def test_few_rows_have_no_slope_of_their_own(rows: int) -> None:
+    views, low = _views(THORAX)[:, :rows] + _bent(down=0)[:, :rows], GEOMETRY.rows(0, rows)
+    found = learn_background(np.ascontiguousarray(views), low, TIMES)
+    assert np.isfinite(found.coefficients).all() and found.lowest > -0.1
+
+
 def test_pixels_that_were_not_measured_do_not_count() -> None:
     views, measured = _views(THORAX) + _bent(), np.ones(SHAPE, bool)
     measured[4:10, 6:14] = False
