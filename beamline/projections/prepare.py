@@ -135,7 +135,7 @@ def prepare_projections(
     column = axis_col if learnt is None else axis_col + learnt.axis
     found = assemble(source, selection, projections, seen(ids), (column, axis), usable, warn, spill is not None)
     if others is not None:
-        found = replace(found, held_out=(others.data, seen(others.view_ids)))
+        found = replace(found, held_out=(others.data, seen(others.view_ids)), held_out_ids=others.view_ids)
     done = {**correction.done, **({"tilt": selection.step(TiltAndLens).done(sought)} if sought else {})}
     done |= {name: places.done for name, places in moved.items()} | rays
     if learnt is not None:
@@ -143,7 +143,8 @@ def prepare_projections(
     found = replace(found, done=done)
     steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
-        done[step.name] = step.apply(found, source.angles[ids])
+        progress = {"progress": phases.progress} if isinstance(step, Calibrate) and step.terms else {}
+        done[step.name] = step.apply(found, source.angles[ids], **progress)
         phases.progress(n, len(steps))
     if spill is not None:
         _fill_unknown(found)

@@ -29,6 +29,7 @@ class PreparedProjections:
         axis_col: rotation axis in columns of the full detector.
         axis: how it was found; None where it was given.
         held_out: line integrals of some views that are not used, and their geometry; None where all are used.
+        held_out_ids: rows of the file of these views; None: unknown.
         n_projections: how many views the scan has.
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
@@ -57,6 +58,7 @@ class PreparedProjections:
     shares: NDArray[np.float32] | None = None
     done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
+    held_out_ids: NDArray[np.int64] | None = None
 
     @property
     def on_disk(self) -> bool:

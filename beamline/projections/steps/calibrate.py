@@ -20,9 +20,12 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
-OF_VIEWS: dict[str, str] = {}
-"""Terms that change line integrals: name, and `module:function` of ("views", "angles") to a StepDone, as
-`ScanStep.apply`. Each takes its line here."""
+OF_VIEWS: dict[str, str] = {
+    "background": "beamline.projections.learnt_terms:without_learnt_background",
+    "gains": "beamline.projections.learnt_terms:without_learnt_gains",
+}
+"""Terms that change line integrals: name, and `module:function` of ("views", "angles", "progress") to a
+StepDone, as `ScanStep.apply`. Each takes its line here."""
 
 
 def _terms(text: str) -> tuple[str, ...]:
@@ -51,8 +54,8 @@ class Calibrate:
         "--calibrate",
         "none",
         "What is learnt from the views, a list of: axis, roll (its lean in the detector's plane), tilt (along the "
-        "beam), shifts (of each view). It enters the geometry, views are not resampled; what views held out do not "
-        "confirm stays as it was.",
+        "beam), shifts (of each view), background (of the beam), gains (of pixels). Geometry is not resampled; what "
+        "views held out do not confirm stays as it was.",
         parse=_terms,
         metavar="LIST",
     )
@@ -68,8 +71,10 @@ class Calibrate:
 
     def memory(self, part: ScanPart) -> StepMemory:
         from beamline.projections.calibrate import search_memory
+        from beamline.projections.learnt_terms import MEMORY
 
-        return StepMemory(alone=search_memory(part, self.geometry))
+        terms = [MEMORY[term](part.geometry) for term in self.terms if term in MEMORY]
+        return StepMemory(alone=max([search_memory(part, self.geometry), *terms]))
 
     def learn(
         self,
@@ -83,14 +88,19 @@ class Calibrate:
 
         return calibrated(source, selection, frames, seen, self.geometry, progress)
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
+    def apply(
+        self,
+        views: PreparedProjections,
+        angles: NDArray[np.float64],
+        progress: Callable[[int, int], None] = lambda n, of: None,
+    ) -> StepDone:
         if not self.terms:
             return StepDone("", {"calibrate": "none"})
         done = [views.done[self.name]] if self.name in views.done else []
         for term, place in OF_VIEWS.items():
             if term in self.terms:
                 module, function = place.split(":")
-                done.append(getattr(import_module(module), function)(views, angles))
+                done.append(getattr(import_module(module), function)(views, angles, progress))
         said = " ".join(each.said for each in done if each.said)
         values = {key: value for each in done for key, value in (each.parameters or {}).items()}
         return StepDone(said, {"calibrate": ",".join(self.terms), "calibrate_said": said, **values})

@@ -24,7 +24,7 @@ class Rings:
     """
 
     name: ClassVar[str] = "rings"
-    follows: ClassVar[tuple[str, ...]] = ("background",)
+    follows: ClassVar[tuple[str, ...]] = ("background", "calibrate")
     way: Way = option(
         "--rings",
         "none",

@@ -14,6 +14,7 @@ from beamline.projections.flags import usable_views
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.steps.air import Air
+from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.flats import Flats
 from beamline.projections.steps.hardening import Hardening
@@ -45,6 +46,8 @@ ON_ALL = {
     "wavelet": Rings("wavelet"),
     "auto": Air("auto"),
     "surface": Air("surface:1"),
+    "background": pytest.param(Calibrate(("background",)), marks=pytest.mark.slow),
+    "gains": pytest.param(Calibrate(("gains",)), marks=pytest.mark.slow),
     "fit": Hardening("fit"),
     "aluminium": Hardening("Al:60kV,Al=1"),
 }
