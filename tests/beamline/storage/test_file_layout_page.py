@@ -129,7 +129,10 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     path = write_exchange(tmp_path / "exchange.h5", SCAN)
     events: list[dict[str, object]] = []
     fit = ["--method", "r2", "--steps", "20", "--gaussians", "300", "--checkpoint", str(tmp_path / "checkpoint.h5")]
-    for name, options in (("fbp", ["--method", "fbp"]), ("r2", fit)):
+    poses = tmp_path / "poses.csv"
+    views = "".join(f"{view},0.5,0.1,0.1\n" for view in range(SCAN.angles.size))
+    poses.write_text(f"view,shift_col_px,roll_deg,tilt_deg\n{views}")
+    for name, options in (("fbp", ["--method", "fbp", "--poses", str(poses)]), ("r2", fit)):
         words = ["recon", str(path), *options, "-o", str(tmp_path / f"{name}.h5"), "--no-report", "--json"]
         done = CliRunner().invoke(main, words, catch_exceptions=False)
         assert done.exit_code == 0, done.output
