@@ -143,7 +143,8 @@ def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float
     `deviation` of the grey values at a distance d have the correlation exp(-d² / (2 · 1.2²)), d in voxels. And the
     whole surface may lie off by 0.07 voxels, the same everywhere: the threshold, the blur and the opening place it so.
     Both numbers are from balls of radius 2.5 to 7 voxels in six simulated volumes, by FBP and FISTA-TV. Of the true
-    volumes of others, 58 to 84 % are within one deviation (docs/error_bars.md). Particles of a few voxels lose more to the opening.
+    volumes of others, 58 to 84 % are within one deviation (docs/error_bars.md). Particles of a few voxels lose more to
+    the opening.
 
     Args:
         labels, grey, deviation: [z, y, x]; the particles are `grey` above `threshold`.
