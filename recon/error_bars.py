@@ -31,7 +31,7 @@ _SHARE = 0.2  # of a method's iterations, in each of two refits: both take half 
 _WINDOW = 7  # voxels, a side: variances are averaged over it; one squared difference has a relative deviation of 1.4
 _CLASSES = 4  # of the gradient, which are averaged apart: edges move more than what lies beside them
 _EDGE = 0.7  # voxels, the blur before the gradient
-_SAMPLED = 2**20  # voxels of which the limits of the classes are computed
+_SAMPLED = 2**20  # voxels that give the limits of the classes
 _OF_RUN = ("units", "weight", "balance")  # decisions of the run that a refit follows
 _LIMITS = "limits"  # the decision of the first slab's error bars that tells them from the run's
 
@@ -56,16 +56,16 @@ def error_bars(
 
     The views, in the order of their angles, are parted into two halves, every other view in each. An iterative method
     goes on from the volume twice, for fewer iterations: one half weighs 1.5 and the other 0.5, then the reverse.
-    Half the difference, divided by 0.5, has the variance of the noise: it is a jackknife of two groups with both kept
-    (Shao & Tu 1995, The Jackknife and Bootstrap, 2.3; Jaeckel 1972). What both refits have in common cancels: how far
-    the volume is from convergence. A fit is refitted on voxels by FISTA-TV with the weight of its finish. FBP is
+    Half the difference, divided by 0.5, has the variance of the noise. That is a jackknife of two groups, by weights
+    (Shao & Tu 1995, The Jackknife and Bootstrap, 2.3). What both refits have in common cancels: how far the volume is
+    from convergence. A fit is refitted on voxels by FISTA-TV with the weight of its finish. FBP is
     linear: half the difference of the FBPs of both halves is FBP of the views with alternating signs.
 
     One squared difference is a poor variance. It is averaged over 7³ voxels, in four classes of the gradient apart.
     Noise is one part of the error, and the blur and the smoothing of the method are the other, which no refit shows.
     So the result is √((a s)² + (b g)²), where s is the deviation by the refits and g the change of the volume from
-    voxel to voxel. The method's trait `error_bars` has a and b, which were chosen on simulated scans so that 68 % of
-    the true voxels are within one deviation (docs/error_bars.md).
+    voxel to voxel. The method's trait `error_bars` has a and b. They were chosen on simulated scans, so that about 68 %
+    of the true voxels are within one deviation (docs/error_bars.md).
 
     Args:
         method: that made the volume; no choice of methods.

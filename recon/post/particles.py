@@ -142,8 +142,9 @@ def volume_deviation(labels: Labels, grey: F32, deviation: F32, threshold: float
     An error e of the grey value moves the boundary by e / |gradient|. Two parts are added in squares. The errors by the
     `deviation` of the grey values at a distance d have the correlation exp(-d² / (2 · 1.2²)), d in voxels. And the
     whole surface may lie off by 0.07 voxels, the same everywhere: the threshold, the blur and the opening place it so.
-    Both numbers are from balls of radius 2.5 to 7 voxels in six simulated volumes, by FBP and FISTA-TV: of the true
-    volumes about 68 % are within one deviation. Particles of a few voxels lose more to the opening.
+    Both numbers are from balls of radius 2.5 to 7 voxels in six simulated volumes, by FBP and FISTA-TV. Of the true
+    volumes of others, 58 to 84 % are within one deviation (docs/error_bars.md). Particles of a few voxels lose more to
+    the opening.
 
     Args:
         labels, grey, deviation: [z, y, x]; the particles are `grey` above `threshold`.

@@ -31,8 +31,8 @@ from tests.bench.quality_cases import Case, dense_battery, slab
 pytestmark = pytest.mark.bench
 ROWS = 20
 METHODS: dict[str, recon.Method] = {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(), "r2": recon.R2()}
-# Sample, views, photons a pixel. The first are of the twelve scans that the factors were chosen on (grains, thorax,
-# foam, shell, battery and kernel, 60 to 180 views); the others, with a sample more, had no part in it.
+# Sample, views, photons a pixel. The factors were chosen on twelve scans: grains, thorax, foam, shell, battery and
+# kernel, of 60 to 180 views. CHOSEN are four of these. CHECKED had no part in it.
 CHOSEN = [("grains", 90, 5000), ("thorax", 90, 5000), ("foam", 120, 5000), ("shell", 60, 3000)]
 CHECKED = [("battery", 180, 3000), ("teapot", 120, 5000), ("kernel", 120, 4000), ("thorax", 180, 2000)]
 

@@ -132,6 +132,7 @@ def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options
     assert left(folder) == {"scan.h5"}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("real_pictures")
 def test_the_report_draws_it(folder: Path) -> None:
     assert beamline("recon", "scan.h5", "--uncertainty", "-m", "fbp", "-o", "out.h5").exit_code == 0
