@@ -30,8 +30,8 @@ def description(
     """Everything that this camera model reports of itself, by name.
 
     Number of electrons = (count - conversion_offset) * conversion_factor. Both depend on the readout; the entries are
-    missing for a camera that does not report them. `row_period` (s) is by how much each row starts later than the one
-    above; it is missing where all rows start together and are read one after the other.
+    missing for a camera that does not report them. `row_period` (s): how much later each row starts than the one
+    above. It is missing where all rows start together.
     """
     cooler = properties.find(Property.SENSORCOOLERSTATUS)
     repairs = properties.find(Property.DEFECTCORRECT_MODE) == codes.ON

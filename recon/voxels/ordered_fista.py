@@ -68,6 +68,7 @@ def ordered_fista(
             projectors[s].adjoint_lines(residual, gradient)
             combine(1.0, x, step, gradient, x)
             prox(x, mu * step / count)
+            prox.turn()
             if at + 1 < count:
                 ahead(x)
         if isinstance(weight, NoiseBalance):

@@ -4,8 +4,8 @@ Both directions run on lines along z: volumes [y, x, z], projections [view, col,
 that applies them again and again keeps that layout (`forward_lines`, `adjoint_lines`, `volume_lines`, ...); `forward`
 and `adjoint` take and give the usual one. They pay a copy each way (256³: some 0.05 s on two cores).
 
-Without `Geometry.width` a ray has no width. With it, a pixel takes from its neighbours what a square and a Gaussian of
-its variance would give it, and a view is the mean of views at angles within its arc. Both are linear and transposed
+Without `Geometry.width` a ray has no width. With it, a pixel takes from its neighbours, with the variance
+of its square and its blur. A view is then the mean of views at angles within its arc. Both are linear and transposed
 exactly. Pixels should not be much larger than voxels, or voxels between the rays are not seen.
 
 With `Geometry.skew`, bands of slices are seen at the angles of their rows.

@@ -14,24 +14,48 @@ def difference_weights(grid: Grid) -> tuple[float, float, float]:
     return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
 
 
+_TURNS: tuple[tuple[int, ...], ...] = (
+    (),
+    (1, 2),
+    (0, 2),
+    (0, 1),
+)  # axes that are reversed: four mirror images, in turn
+
+
 class TotalVariationProx:
     """argmin_y ½|y - x|² + threshold TV(y), y >= 0 if wanted; isotropic TV, differences of voxels in 1/voxel.
 
     A few steps of the dual problem a call (Chambolle 2004, J. Math. Imaging Vis. 20, 89; with the bound: Beck &
     Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field stays from one call to the next: in an outer
     iteration x changes little, so later calls continue the steps. Memory: three volumes.
+
+    Differences of a voxel are those to its three next ones; `turn` takes the next ones on other sides.
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
         self._dual = np.zeros((3, *shape), np.float32)
         self._scratch = tv_cpu.dual_scratch(shape)
         self._weights, self._nonnegative, self._steps = weights, nonnegative, steps
+        self._turn = 0
 
     def __call__(self, x: F32, threshold: float) -> None:
         """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
         if threshold > 0:
+            reversed_axes = _TURNS[self._turn]
+            tv_cpu.mirror(x, reversed_axes)
             for _ in range(self._steps):
                 tv_cpu.dual_step(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch)
             tv_cpu.primal(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch, x)
+            tv_cpu.mirror(x, reversed_axes)
         elif self._nonnegative:
             np.maximum(x, 0, out=x)
+
+    def turn(self) -> None:
+        """Take the next of four mirror images from here on, so that no side is preferred.
+
+        The differences, which the dual field holds, stay: only which three of them belong to a voxel changes.
+        """
+        before, self._turn = self._turn, (self._turn + 1) % len(_TURNS)
+        axes = tuple(set(_TURNS[before]) ^ set(_TURNS[self._turn]))
+        for axis, part in enumerate(self._dual):
+            tv_cpu.mirror(part, axes, axis)

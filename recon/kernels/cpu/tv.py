@@ -112,6 +112,43 @@ def primal(
     _primal(x, p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch.planes, out)
 
 
+@njit(**OPTIONS)
+def _mirror(x: F32, span0: int, span1: int, span2: int, sign: float) -> None:
+    na, nb, nc = x.shape
+    s = _f(sign)
+    for job in prange(na):
+        i = np.int64(job)
+        to = span0 - 1 - i if span0 > 0 else i
+        if to < i:
+            continue  # done from the other end; also what lies beyond the span
+        for j in range(nb):
+            there = span1 - 1 - j if span1 > 0 else j
+            if there < 0 or (to == i and there < j):
+                continue
+            here, other = x[i, j], x[to, there]
+            alone = to == i and there == j
+            for k in range(span2 if span2 > 0 else nc):
+                end = span2 - 1 - k if span2 > 0 else k
+                if alone and end < k:
+                    break
+                value = here[k]
+                here[k] = s * other[end]
+                other[end] = s * value
+
+
+def mirror(x: F32, axes: tuple[int, ...], differences: int | None = None) -> None:
+    """Reverse [a, b, c] along `axes` in place; with `differences`, the axis of these, as part of a dual field.
+
+    The difference from i to i + 1 lies at i. Seen from the other end it changes its sign, and lies at n - 2 - i; the
+    last place holds none, and stays.
+    """
+    spans = [n if axis in axes else 0 for axis, n in enumerate(x.shape)]
+    sign = 1.0
+    if differences in axes:
+        spans[differences], sign = max(x.shape[differences] - 1, 1), -1.0
+    _mirror(x, *spans, sign)
+
+
 def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:
     """Scratch for `dual_step` and `primal`.
 

@@ -8,8 +8,11 @@ with s from `RayWidth.variance` and Σ₂, W as in `cpu.footprints`. For a paral
 along the beam, times the arc, along the columns. A compact kernel keeps its profile: its second moment is exact, its
 shape is not. In a cone, Gaussians that are integrated ray by ray keep their rays: they are many pixels wide.
 
-Backward, with G = ∂L/∂Σ' = W' / 2 (K' M₂ K' - M₀ K') and a, b of `cpu.footprints`: the deformation T in the Gaussian's
-own axes is 2 (G_uu aaᵀ + G_uv (abᵀ + baᵀ) + G_vv bbᵀ) + W' M₀ 1. Unlike there, needles lose no accuracy: Σ' is never
+Backward, a, b and the deformation T are those of `cpu.footprints`:
+
+    G = ∂L/∂Σ' = W' / 2 (K' M₂ K' - M₀ K')        T = 2 (G_uu aaᵀ + G_uv (abᵀ + baᵀ) + G_vv bbᵀ) + W' M₀ 1
+
+Unlike there, needles lose no accuracy: Σ' is never
 thinner than the pixel. e moves with the centre, which is included.
 """
 

@@ -372,6 +372,7 @@ def test_a_camera_that_refuses_its_first_setting_is_let_go(world) -> None:
 
 def test_description_names_the_camera_and_what_counts_mean(camera: DcamCamera) -> None:
     description = camera.describe()
+    assert description["row_period"] == pytest.approx(camera.timing.row_period)
     assert (description["vendor"], description["model"]) == ("Hamamatsu", "C15550-20UP")
     assert description["cameraid"] == "S/N: 000123"
     assert (description["conversion_factor"], description["conversion_offset"]) == (0.107, 200)

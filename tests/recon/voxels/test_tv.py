@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
+from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.tv import total_variation as total_variation_cpu
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from tests.recon.voxels.tv_reference import total_variation, transposed_differences
@@ -72,3 +73,35 @@ def test_the_sum_of_changes_equals_the_reference(rng: np.random.Generator) -> No
     x, weights = rng.normal(size=(7, 8, 9)).astype(np.float32), (1.0, 1.0, 0.6)
     assert total_variation_cpu(x, weights) == pytest.approx(total_variation(x.astype(np.float64), weights), rel=1e-5)
     assert total_variation_cpu(np.ones((1, 2, 1), np.float32), weights) == 0
+
+
+@pytest.mark.parametrize("axes", [(), (0,), (1, 2), (0, 2), (0, 1, 2)])
+@pytest.mark.parametrize("shape", [(5, 4, 7), (4, 6, 1), (1, 1, 8)])
+def test_a_mirror_image_has_the_same_differences(
+    axes: tuple[int, ...], shape: tuple[int, int, int], rng: np.random.Generator
+) -> None:
+    x = rng.random(shape, dtype=np.float32)
+    image, fields = x.copy(), [np.diff(x, axis=axis, append=x.take([-1], axis)) for axis in range(3)]
+    tv_cpu.mirror(image, axes)
+    np.testing.assert_array_equal(image, np.flip(x, axes))
+    for axis, field in enumerate(fields):
+        mirrored = field.copy()
+        tv_cpu.mirror(mirrored, axes, axis)
+        np.testing.assert_array_equal(mirrored, np.diff(image, axis=axis, append=image.take([-1], axis)))
+
+
+def test_no_side_is_preferred(rng: np.random.Generator) -> None:
+    """Four turns see four mirror images alike."""
+    x = rng.random((5, 6, 7), dtype=np.float32)
+    found = []
+    for before in range(5):
+        prox, y = TotalVariationProx(x.shape, CUBES, True, 3), x.copy()
+        for _ in range(before):
+            prox.turn()
+        prox(y, 0.2)
+        found.append(y)
+    for y, axes in zip(found, ((), (1, 2), (0, 2), (0, 1), ()), strict=True):
+        prox, image = TotalVariationProx(x.shape, CUBES, True, 3), np.flip(x, axes).copy()
+        prox(image, 0.2)
+        np.testing.assert_allclose(np.flip(image, axes), y, atol=1e-6)
+    assert np.abs(found[0] - found[1]).max() > 1e-3
