@@ -1,8 +1,8 @@
 """Freedom: which quantities of a geometry are learnt, what they do to an image, and which of them nobody can know.
 
-What cannot be known (the gauge): a sample elsewhere on its stage shows the same views, moved by a cos θ + b sin θ along
-the columns and by a constant along the rows. So shifts have no such part here. Their mean along the columns is the
-axis. A turn of the sample about the axis adds a constant to all angles, which are never changed.
+What cannot be known is the gauge. A sample elsewhere on its stage shows the same views, moved by a cos θ + b sin θ
+along the columns. A higher sample moves them by a constant along the rows. So shifts have no such part here. Their mean
+along the columns is the axis. A turn of the sample about the axis adds a constant to all angles; these never change.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from recon.voxels.projector import Projector
 
 _ONE_IN = 4  # views held out
 _SWEEPS, _TV_WEIGHT = 6, 3e-3
-_EDGE = 3  # rows at either end, in which rays of leaning views leave the slices seen
+_EDGE = 1  # row at either end, in which rays of leaning views leave the slices seen
 _SMOOTH = 4.0  # pixels
 _LEAST = 0.002  # share of the squared deviation that a better geometry takes away
 _SURE = 2.0  # standard errors of that share, from view to view

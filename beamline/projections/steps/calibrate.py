@@ -36,7 +36,7 @@ def _terms(text: str) -> tuple[str, ...]:
     every = *GEOMETRY, *OF_VIEWS
     unknown = [name for name in names if name not in every]
     if unknown:
-        raise ValueError(f"{', '.join(unknown)!r} is none of {', '.join(every)}")
+        raise ValueError(f"{', '.join(unknown)!r} is not known; choose from {', '.join(every)}")
     return tuple(name for name in every if name in names)
 
 
