@@ -168,8 +168,8 @@ class Projector:
         return middle - rows * step, step
 
     def _to_rows(self) -> bool:
-        """The kernels give the rows of the detector, not lines of slices: slice k lies on row k of every view, or each
-        ray has a height of its own."""
+        """The kernels give rows of the detector, not lines of slices: each ray has a height of its own, or slice k lies
+        on row k of every view."""
         return not self.geometry.is_straight or self.geometry.is_cone or self._on_rows()
 
     def _on_rows(self) -> bool:
