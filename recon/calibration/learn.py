@@ -47,6 +47,8 @@ class Learnt:
     def said(self, binning: int = 1) -> str:
         """In a sentence, in pixels smaller by `binning`."""
         told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
+        if not (self.confirmed or self.dropped):
+            return "Geometry: the views show no error of it that matters; it is left as it was."
         kept = f"{', '.join(self.dropped)}: left as it was, views held out do not confirm a change."
         if not told:
             return f"Geometry: {kept}"
