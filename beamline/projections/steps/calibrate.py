@@ -95,7 +95,7 @@ class Calibrate:
         progress: Callable[[int, int], None] = lambda n, of: None,
     ) -> StepDone:
         if not self.terms:
-            return StepDone("", {"calibrate": "none"})
+            return StepDone(parameters={})
         done = [views.done[self.name]] if self.name in views.done else []
         for term, place in OF_VIEWS.items():
             if term in self.terms:
