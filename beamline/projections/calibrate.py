@@ -17,7 +17,7 @@ from beamline.projections.steps.step import ScanPart, StepDone
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
-from recon.calibration.freedom import Change
+from recon.calibration.freedom import GeometryChange
 from recon.calibration.learn import COLS, ROWS, Learnt, learn_geometry
 
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
@@ -41,7 +41,7 @@ class Calibrated:
     """
 
     frames: I64
-    change: Change
+    change: GeometryChange
     pitch: float
     off_middle: float
     pivot: float

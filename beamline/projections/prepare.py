@@ -20,7 +20,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
 from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import Places, PlaceStep, RayStep, ScanStep, StepDone
+from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
@@ -88,10 +88,10 @@ def prepare_projections(
         warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
-    moved: dict[str, Places] = {}
+    moved: dict[str, ViewPlaces] = {}
     rays: dict[str, StepDone] = {}
+    phases.enter("jumps", "guesses")
     for place_step in (step for step in selection.in_order if isinstance(step, PlaceStep)):
-        phases.enter(place_step.name, "guesses")
         places = place_step.place(source, selection, usable, axis_col, phases.progress)
         moved[place_step.name] = places
         if places.said:

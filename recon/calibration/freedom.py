@@ -21,7 +21,7 @@ TERMS = "axis", "roll", "tilt", "shifts"
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class GeometryChange:
     """A change of a geometry, in its pixels and radians.
 
     Attributes:
@@ -35,11 +35,11 @@ class Change:
     shifts: F64
 
     @classmethod
-    def none(cls, views: int) -> Change:
+    def none(cls, views: int) -> GeometryChange:
         return cls(0.0, 0.0, 0.0, np.zeros((views, 2)))
 
     @classmethod
-    def between(cls, before: Geometry, after: Geometry) -> Change:
+    def between(cls, before: Geometry, after: Geometry) -> GeometryChange:
         """The change from one geometry to another one of the same views."""
         return cls(
             after.axis_col - before.axis_col,
@@ -48,14 +48,14 @@ class Change:
             after.shifts - before.shifts,
         )
 
-    def of(self, terms: frozenset[str]) -> Change:
+    def of(self, terms: frozenset[str]) -> GeometryChange:
         """The part of it that these terms name."""
-        return Change(
+        return GeometryChange(
             self.axis * ("axis" in terms), self.roll * ("roll" in terms), self.tilt * ("tilt" in terms),
             self.shifts * ("shifts" in terms),
         )  # fmt: skip
 
-    def scaled(self, factor: float) -> Change:
+    def scaled(self, factor: float) -> GeometryChange:
         """The same in pixels that are smaller by this factor."""
         return replace(self, axis=self.axis * factor, shifts=self.shifts * factor)
 

@@ -13,7 +13,7 @@ from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.calibration.freedom import TERMS, Change, reach
+from recon.calibration.freedom import TERMS, GeometryChange, reach
 from recon.calibration.joint import JointFit, taller
 from recon.calibration.judge import Judge, better
 
@@ -38,7 +38,7 @@ class Learnt:
         before, after: median deviation of views held out, by volumes of the others.
     """
 
-    change: Change
+    change: GeometryChange
     confirmed: tuple[str, ...]
     dropped: tuple[str, ...]
     before: float
@@ -111,8 +111,10 @@ def learn_geometry(
         for _ in range(count):
             fit.step(_ROUNDS, _FARTHEST)
             tick()
-        found = Change.between(small, fit.geometry).scaled(factor).applied(found)
-    return _confirmed(projections, geometry, Change.between(geometry, found).of(terms), known, factors[-1], tick)
+        found = GeometryChange.between(small, fit.geometry).scaled(factor).applied(found)
+    return _confirmed(
+        projections, geometry, GeometryChange.between(geometry, found).of(terms), known, factors[-1], tick
+    )
 
 
 def _factors(rows: int, cols: int) -> list[int]:
@@ -129,7 +131,12 @@ def _weights(known: F32 | None, factor: int, data: F32) -> F32 | None:
 
 
 def _confirmed(
-    projections: F32, geometry: Geometry, change: Change, known: F32 | None, factor: int, tick: Callable[[], None]
+    projections: F32,
+    geometry: Geometry,
+    change: GeometryChange,
+    known: F32 | None,
+    factor: int,
+    tick: Callable[[], None],
 ) -> Learnt:
     """The part of a change that views held out confirm: the whole against none, then each term of it."""
     small, data = geometry.binned(factor), bin_views(projections, factor)
@@ -170,7 +177,7 @@ def _confirmed(
     )
 
 
-def _text(change: Change, term: str, binning: int) -> str:
+def _text(change: GeometryChange, term: str, binning: int) -> str:
     if term == "axis":
         return f"the axis moves by {change.axis * binning:+.2f} px"
     if term == "shifts":

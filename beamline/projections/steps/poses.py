@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from beamline.projections.steps.step import Places, ScanPart, StepMemory, option
+from beamline.projections.steps.step import ScanPart, StepMemory, ViewPlaces, option
 
 if TYPE_CHECKING:
     from beamline.projections.flags import UsableViews
@@ -55,7 +55,7 @@ class PosesOfFile:
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
-    ) -> Places:
+    ) -> ViewPlaces:
         from beamline.projections.jumps import SamplePlaces
         from beamline.projections.poses import poses_of
 

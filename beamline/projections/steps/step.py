@@ -170,7 +170,7 @@ class ViewStep(PrepStep, Protocol):
         """
 
 
-class Places(Protocol):
+class ViewPlaces(Protocol):
     """Where the sample was in the views of a scan.
 
     Attributes:
@@ -203,7 +203,7 @@ class PlaceStep(PrepStep, Protocol):
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
-    ) -> Places:
+    ) -> ViewPlaces:
         """The views that are used, where the sample was in them, and what was done.
 
         Args:

@@ -17,13 +17,13 @@ from beamline.reconstruct import budget, checkpoints
 from beamline.reconstruct import finished as offline
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.assess.plans import Speeds
-from recon.base.method import Progress
+from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
 from recon.splatting import optimise as fit
 from recon.splatting import train
 from recon.splatting.initialise import place
 from recon.voxels import direct
 from recon.voxels import fbp as fbp_module
-from recon.voxels.fbp import FbpPlan, fbp, fbp_block
+from recon.voxels.fbp import FbpPlan, fbp_block
 from tests.beamline.cli.small_scan import SCAN, beamline, left
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -137,12 +137,14 @@ def test_an_fbp_that_is_interrupted_ends_at_once_and_leaves_nothing(
 def test_an_fbp_that_is_interrupted_within_a_budget_is_complete_all_the_same(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(*arguments: Any) -> Any:
-        if arguments[1].n_views == SCAN.angles.size:  # not the toy that is reconstructed before
-            signal.raise_signal(signal.SIGINT)
-        return fbp(*arguments)
+    run = direct.Fbp.run
 
-    monkeypatch.setattr(direct, "fbp", interrupted)
+    def interrupted(method: direct.Fbp, problem: ReconProblem, control: RunControl) -> MethodResult:
+        if problem.geometry.n_views == SCAN.angles.size:  # not the toy that is reconstructed before
+            signal.raise_signal(signal.SIGINT)
+        return run(method, problem, control)
+
+    monkeypatch.setattr(direct.Fbp, "run", interrupted)
     monkeypatch.setattr(budget, "calibrate", lambda *_: Speeds(0.1, 0.1, 1e6, 0.1, 1e6))
     result = beamline("recon", "scan.h5", "--budget", "20s", "-o", "out.h5", "--no-report")
     assert result.exit_code == 0, result.output

@@ -22,6 +22,7 @@ from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
+from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
 from recon.base.volume import Grid
@@ -132,12 +133,16 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     poses = tmp_path / "poses.csv"
     views = "".join(f"{view},0.5,0.1,0.1\n" for view in range(SCAN.angles.size))
     poses.write_text(f"view,shift_col_px,roll_deg,tilt_deg\n{views}")
-    for name, options in (("fbp", ["--method", "fbp", "--poses", str(poses)]), ("r2", fit)):
+    bars = ["--method", "fista-tv", "--iterations", "3", "--uncertainty", "--cols", "1:39"]
+    for name, options in (("fbp", ["--method", "fbp", "--poses", str(poses)]), ("r2", fit), ("bars", bars)):
         words = ["recon", str(path), *options, "-o", str(tmp_path / f"{name}.h5"), "--no-report", "--json"]
         done = CliRunner().invoke(main, words, catch_exceptions=False)
         assert done.exit_code == 0, done.output
         events += [json.loads(line) for line in done.stdout.splitlines()]
-    assert unmatched(paths(tmp_path / "fbp.h5", tmp_path / "r2.h5"), names("Volume file")) == (set(), set())
+    record = read_reconstruction(tmp_path / "bars.h5")
+    write_reconstruction(tmp_path / "doubtful.h5", replace(record, fbp=record.volume.data))
+    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful")))
+    assert unmatched(volumes, names("Volume file")) == (set(), set())
     assert unmatched(paths(tmp_path / "checkpoint.h5"), names("Checkpoint")) == (set(), set())
     assert_on_the_page(events)
 

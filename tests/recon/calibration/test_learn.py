@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.calibration.freedom import Change, knowable
+from recon.calibration.freedom import GeometryChange, knowable
 from recon.calibration.judge import better
 from recon.calibration.learn import Learnt, learn_geometry
 from tests.recon.calibration.bodies import balls
@@ -63,21 +63,21 @@ def test_a_sample_elsewhere_on_its_stage_is_no_error_of_the_geometry() -> None:
 
 
 def test_a_change_is_of_its_terms_and_scales_with_pixels() -> None:
-    change = Change(1.0, 0.1, 0.2, np.ones((2, 2)))
+    change = GeometryChange(1.0, 0.1, 0.2, np.ones((2, 2)))
     assert (change.of(frozenset({"roll"})).axis, change.of(frozenset({"roll"})).roll) == (0, 0.1)
     assert change.scaled(4).axis == 4 and change.scaled(4).tilt == 0.2 and (change.scaled(4).shifts == 4).all()
     after = change.applied(Geometry.parallel([0.0, 1.0], (4, 8)))
-    found = Change.between(Geometry.parallel([0.0, 1.0], (4, 8)), after)
+    found = GeometryChange.between(Geometry.parallel([0.0, 1.0], (4, 8)), after)
     assert (found.axis, found.shifts.tolist()) == (1.0, change.shifts.tolist())
 
 
 def test_what_was_learnt_is_said_in_pixels_of_the_detector() -> None:
-    change = Change(1.0, 0.0, 0.0, np.zeros((2, 2)))
+    change = GeometryChange(1.0, 0.0, 0.0, np.zeros((2, 2)))
     assert Learnt(change, ("axis",), ("roll",), 0.4, 0.3).said(2) == (
         "Geometry learnt: the axis moves by +2.00 px. Views held out deviate by 0.3 in place of 0.4. Roll: left as it "
         "was, views held out do not confirm a change."
     )
-    assert Learnt(Change.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
+    assert Learnt(GeometryChange.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
 
 
 def test_better_means_better_in_most_views() -> None:

@@ -156,7 +156,26 @@ def test_the_step_bound_is_the_largest_eigenvalue_from_above() -> None:
         assert exact * (1 - 1e-5) <= bound < 1.1 * exact
 
 
+MIRRORS: tuple[tuple[int, ...], ...] = ((), (1, 2), (0, 2), (0, 1))  # axes of [z, y, x] that are reversed
+
+
+def mirrored_variation(x: NDArray[np.float64]) -> float:
+    """The mean total variation of four mirror images."""
+    return float(np.mean([total_variation(np.flip(x, axes), CUBES) for axes in MIRRORS]))
+
+
+def mirrored_differences(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[mirror, 3, z, y, x], a quarter of the differences of each image."""
+    return np.stack([differences(np.flip(x, axes), CUBES) for axes in MIRRORS]) / 4
+
+
+def transposed_mirrored_differences(dual: NDArray[np.float64]) -> NDArray[np.float64]:
+    images = [transposed_differences(each, CUBES) for each in dual]
+    return np.sum([np.flip(image, axes) for image, axes in zip(images, MIRRORS, strict=True)], axis=0) / 4
+
+
 def test_fista_reaches_the_minimum_of_a_slow_reference() -> None:
+    """Each sweep takes the differences of another of four mirror images, and so their mean in the end."""
     projector, _, views = parallel_case(n_views=5, noise=0.03)
     matrix = system_matrix(projector.geometry, projector.grid)
     step = 1 / float(svds(matrix, k=1, return_singular_vectors=False, rng=0)[0] ** 2)
@@ -169,18 +188,18 @@ def test_fista_reaches_the_minimum_of_a_slow_reference() -> None:
     mu = threshold * largest_eigenvalue(projector, None)
 
     def value(x: NDArray[np.float64]) -> float:
-        return 0.5 * float(((matrix @ x.ravel() - views.ravel()) ** 2).sum()) + mu * total_variation(x, CUBES)
+        return 0.5 * float(((matrix @ x.ravel() - views.ravel()) ** 2).sum()) + mu * mirrored_variation(x)
 
     x = np.zeros(projector.grid.shape)
-    dual = np.zeros((3, *x.shape))
+    dual = np.zeros((len(MIRRORS), 3, *x.shape))
     t, y = 1.0, x
     for _ in range(200):
         z = y - step * (matrix.T @ (matrix @ y.ravel() - views.ravel())).reshape(x.shape)
         for _ in range(8):
-            pull = np.maximum(z - mu * step * transposed_differences(dual, CUBES), 0)
-            dual += differences(pull, CUBES) / (12 * mu * step)
-            dual /= np.maximum(1, np.sqrt((dual**2).sum(0)))
-        new = np.maximum(z - mu * step * transposed_differences(dual, CUBES), 0)
+            pull = np.maximum(z - mu * step * transposed_mirrored_differences(dual), 0)
+            dual += mirrored_differences(pull) / (3 * mu * step)
+            dual /= np.maximum(1, np.sqrt((dual**2).sum(1, keepdims=True)))
+        new = np.maximum(z - mu * step * transposed_mirrored_differences(dual), 0)
         after = (1 + math.sqrt(1 + 4 * t * t)) / 2
         y, x, t = new + (t - 1) / after * (new - x), new, after
     assert value(found.data.astype(np.float64)) == pytest.approx(value(x), rel=1e-3)
