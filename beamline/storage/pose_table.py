@@ -76,6 +76,10 @@ class PoseTable:
             raise ValueError(f"{self.path}: {self.by} {ordered[counts > 1][0]:g} has {counts.max()} rows; expected one")
 
 
+class _NoPosesError(Exception):
+    """A sound file that does not state poses: a ValueError would be taken for damage."""
+
+
 def read_poses(text: str) -> PoseTable:
     """The table that `FILE`, or `FILE:x,-y` of an NXtomo file, names.
 
@@ -88,6 +92,8 @@ def read_poses(text: str) -> PoseTable:
         if hdf5.is_hdf5(path):
             return _of_hdf5(path, (match[2], match[3]) if match else None)
         return _of_csv(path, text_in(path, _LARGEST, "utf-8-sig"))
+    except _NoPosesError as error:
+        raise ValueError(str(error)) from error
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ValueError(f"{path} cannot be read ({hdf5.reason(error)})") from error
 
@@ -173,22 +179,28 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         unit = hdf5.LENGTH_UNITS.get(hdf5.attribute(item, "units").lower())
         values = np.ravel(np.asarray(item[()], np.float64))
         if unit is None or values.size not in (1, keys.size):
-            raise ValueError(
+            raise _NoPosesError(
                 f"{path}: {item.name} has {values.size} values in the units {hdf5.attribute(item, 'units')!r}; "
                 f"expected one for each of {keys.size} frames, in a unit of length"
             )
         values = np.broadcast_to(values * unit, keys.shape)
         if not np.isfinite(values[shown]).all():
-            raise ValueError(f"{path}: {item.name} is not finite in {(~np.isfinite(values[shown])).sum()} projections")
+            raise _NoPosesError(
+                f"{path}: {item.name} is not finite in {(~np.isfinite(values[shown])).sum()} projections"
+            )
         moved[axis] = values - np.median(values[shown])
     if not moved:
-        raise ValueError(f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV")
+        raise _NoPosesError(
+            f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV"
+        )
     said = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
     if ways is None:
-        raise ValueError(f"{path}: the sample moves in {said}, and NeXus does not say where on the detector; {_HOW}")
+        raise _NoPosesError(f"{path}: the sample moves in {said}, and NeXus does not say where on the detector; {_HOW}")
     named = {way[-1] for way in ways} - {"0"}
     if not named <= set(moved) or len(named) < sum(way != "0" for way in ways):
-        raise ValueError(f"{path}: {','.join(ways)} are not two of the translations there, {', '.join(moved)}; {_HOW}")
+        raise _NoPosesError(
+            f"{path}: {','.join(ways)} are not two of the translations there, {', '.join(moved)}; {_HOW}"
+        )
     shifts = [np.zeros(keys.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
     rows = np.flatnonzero(shown)
     stacked = np.stack(shifts, axis=1)[rows]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from beamline.core.errors import ConfigError
+from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ class Width:
         """The geometry with the rays' width; angles become those of the middle of the exposure.
 
         Raises:
-            ConfigError: rows of a cone, or of rolled or tilted views, that see angles of their own.
+            ConfigError: rows of a cone, or of views that roll or tilt or may do so, that see angles of their own.
         """
         from recon.base.ray_width import RayWidth
 
@@ -102,14 +103,15 @@ class Width:
         told, motion = self._motion(source), _Motion(0.0, 0.0)
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
         if told is not None:
-            bent = geometry.is_cone or not geometry.is_straight
+            leaning = not geometry.is_straight or selection.step(Calibrate).geometry & {"roll", "tilt"}
+            bent = geometry.is_cone or leaning
             if self.arc != "auto":
                 motion = told
                 if bent and told.skew:
+                    found = "a cone" if geometry.is_cone else "rolled or tilted, or to be calibrated so"
                     raise ConfigError(
                         f"--exposure-arc {self.arc}: rows with angles of their own are known of a straight parallel "
-                        f"beam only, and this is {'a cone' if geometry.is_cone else 'rolled or tilted'}. Give the arc "
-                        "alone. Nothing was written."
+                        f"beam only, and this is {found}. Give the arc alone. Nothing was written."
                     )
             elif abs(told.arc) * reach >= _LEAST_PX:
                 motion = _Motion(told.arc, 0.0 if bent else told.skew)

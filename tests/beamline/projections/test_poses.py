@@ -227,7 +227,8 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
     path = scan(tmp_path, geometry)
     motors = nexus(tmp_path, x=12e3 + 1e3 * PITCH * SHIFTS[:, 0], z=-1e3 * PITCH * SHIFTS[:, 1])
     with pytest.raises(
-        ValueError, match=r"moves in x by 0.2\d* mm, z by 0.1\d* mm, and NeXus does not say where .*FILE:x,-y"
+        ValueError,
+        match=r"^(?!.*damaged).*moves in x by 0.2\d* mm, z by 0.1\d* mm, and NeXus does not say where .*FILE:x,-y",
     ):
         read_poses(str(motors))
     found = prepared(path, f"{motors}:x,-z").geometry.shifts
@@ -237,7 +238,7 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
         read_poses(f"{motors}:y,x")
     with pytest.raises(DataError, match="no shifts of a cone's views"):
         prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
-    with pytest.raises(ValueError, match="no sample/x_translation"):
+    with pytest.raises(ValueError, match=r"^(?!.*damaged).*no sample/x_translation"):
         read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection, geometry_of
+from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.step import StepDone, options_of
 from beamline.projections.steps.width import Width
 from beamline.simulate.scene_file import Scan, open_scene
@@ -97,6 +98,16 @@ def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:
     assert after.width.arc > 0 and after.skew == 0
     with pytest.raises(ConfigError, match="is a cone"):
         _rays(Width(arc="1:0.1"), source)
+
+
+@pytest.mark.parametrize("term", ["roll", "tilt"])
+def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: str) -> None:
+    learnt = Selection().having(Calibrate((term,)))
+    _, after, done = _rays(Width(), _source(), learnt)
+    assert after.width.arc > 0 and after.skew == 0 and done.parameters["row_skew_deg"] == 0
+    with pytest.raises(ConfigError, match="calibrated"):
+        _rays(Width(arc="1:0.1"), _source(), learnt)
+    assert _rays(Width(), _source(), Selection().having(Calibrate(("axis", "shifts"))))[1].skew > 0
 
 
 @pytest.mark.parametrize("words", [{"spread": "wide"}, {"spread": "-1"}, {"arc": "-1"}, {"arc": "1:2:3"}, {"arc": "x"}])
