@@ -82,7 +82,7 @@ class Width:
 
     @property
     def needs_finished(self) -> str:
-        if (self.spread, self.arc) == ("none", "auto") or (self.spread, self.arc) == ("none", "none"):
+        if self.spread == "none" and self.arc in ("auto", "none"):
             return ""
         return "--ray-width and --exposure-arc are for a finished scan"
 
