@@ -76,9 +76,9 @@ class Width:
     arc: str = option(
         "--exposure-arc",
         "auto",
-        "Degrees that the stage turns: ARC during an exposure, READOUT from the first row's readout to the last's (below "
-        "0: the last row is read first). auto: as the file of a fly scan says, where ARC is 1 px or more. none: it "
-        "stands.",
+        "Degrees that the stage turns: ARC during an exposure, READOUT from the first row's readout to the last's "
+        "(below 0: the last row is read first). auto: as the file of a fly scan says, where ARC is 1 px or more. none: "
+        "it stands.",
         parse=_arc,
         metavar="auto|none|ARC[:READOUT]",
     )
