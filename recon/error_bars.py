@@ -26,7 +26,7 @@ HALO = 8
 """Slices beside a slab, at least, that its error bars need."""
 LEAST_VIEWS = 8
 
-_TILT = 0.5  # half of the views weigh so much more, the others so much less
+_EXTRA = 0.5  # half of the views weigh so much more, the others so much less
 _SHARE = 0.2  # of a method's iterations, in each of two refits: both take half the time of its iterations
 _WINDOW = 7  # voxels, a side: variances are averaged over it; one squared difference has a relative deviation of 1.4
 _CLASSES = 4  # of the gradient, which are averaged apart: edges move more than what lies beside them
@@ -128,7 +128,7 @@ def _alternating(method: Method, problem: ReconProblem) -> F32:
 def _refitted(
     method: Method, problem: ReconProblem, volume: Volume, decided: Mapping[str, Sequence[Any]], control: RunControl
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
-    """Half the difference of two refits, divided by the tilt of their weights, and their decisions; None: stopped."""
+    """Half the difference of two refits, divided by the extra weight of a half, and their decisions; None: stopped."""
     refit = _refit(method)
     if not isinstance(method, IterativeMethod) and "weight" not in decided:
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
@@ -150,10 +150,10 @@ def _refitted(
 
     found: list[F32] = []
     for sign in (1, -1):
-        tilted = np.broadcast_to(1 + np.float32(sign * _TILT) * signs, data.shape)
+        trust = np.broadcast_to(1 + np.float32(sign * _EXTRA) * signs, data.shape)
         decide = Decisions(problem.seed, follow)
         refitted = solve(
-            refit, projector, data, weight=tilted.copy() if known is None else known * tilted, start=volume,
+            refit, projector, data, weight=trust.copy() if known is None else known * trust, start=volume,
             nonnegative=not getattr(method, "allow_negative", False), on_iteration=told, decide=decide,
         )  # fmt: skip
         if stopped:
@@ -162,7 +162,7 @@ def _refitted(
         found.append(refitted.data)
     more, less = found
     more -= less
-    more *= np.float32(0.5 / _TILT)
+    more *= np.float32(0.5 / _EXTRA)
     return more, follow
 
 

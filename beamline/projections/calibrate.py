@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.correction import ScanCorrection, at_once_memory
+from beamline.projections.poses import about, pivot_of
 from beamline.projections.selection import Selection, geometry_of, rows_of
 from beamline.projections.steps.poses import PosesOfFile
 from beamline.projections.steps.step import ScanPart, StepDone
@@ -18,7 +19,7 @@ from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.calibration.freedom import GeometryChange
-from recon.calibration.learn import COLS, ROWS, Learnt, learn_geometry
+from recon.calibration.learn import COLS, ROWS, LearntGeometry, learn_geometry
 
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
 
@@ -35,7 +36,7 @@ class Calibrated:
         change: in pixels of the detector, about the middle row of the band.
         pitch: mm of such a pixel.
         off_middle: rows from the middle of the band to that of the detector, about which views roll and tilt.
-        pivot: the detector's middle, in rows from the first one used, binned.
+        pivot: row of the detector, binned and counted from the first one used, that views are rolled and tilted about.
         binning: of the pixels of the band.
         learnt: with what views held out say of it.
     """
@@ -46,7 +47,7 @@ class Calibrated:
     off_middle: float
     pivot: float
     binning: int
-    learnt: Learnt
+    learnt: LearntGeometry
 
     @property
     def done(self) -> StepDone:
@@ -61,8 +62,7 @@ class Calibrated:
         """The geometry of these rows of the file, which may be binned, as it was learnt."""
         at = np.searchsorted(self.frames, view_ids)
         own = replace(self.change, shifts=self.change.shifts[at], axis=self.axis)
-        after = own.scaled(self.pitch / geometry.pixel_pitch).applied(geometry)
-        return after if after.is_straight or after.is_cone else replace(after, axis_row=self.pivot)
+        return about(own.scaled(self.pitch / geometry.pixel_pitch).applied(geometry), self.pivot)
 
 
 def calibrated(
@@ -97,12 +97,11 @@ def calibrated(
         )  # fmt: skip
     except ValueError as error:
         raise DataError(f"{source.path}: the geometry was not learnt: {error}. Leave out --calibrate.") from error
-    looked, middle, binning = rows_of(source, band), (source.shape[0] - 1) / 2, selection.binning
+    looked, middle = rows_of(source, band), (source.shape[0] - 1) / 2
     whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
     off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
-    pivot = (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
     change = learnt.change.scaled(band.binning)
-    return Calibrated(ids, change, whole.pixel_pitch, off, pivot, band.binning, learnt)
+    return Calibrated(ids, change, whole.pixel_pitch, off, pivot_of(source, selection), band.binning, learnt)
 
 
 def search_memory(part: ScanPart, terms: frozenset[str]) -> int:

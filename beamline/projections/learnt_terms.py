@@ -19,7 +19,7 @@ MEMORY: dict[str, Callable[[Geometry], int]] = {"background": background_memory,
 """Bytes that a term takes at most beside the views."""
 
 
-def without_learnt_background(views: PreparedProjections, angles: NDArray[np.float64], progress: Progress) -> StepDone:
+def without_learnt_background(views: PreparedProjections, progress: Progress) -> StepDone:
     """Take the background of the beam off the views where views held out confirm it, see `learn_background`."""
     data, ids = views.projections.data, views.projections.view_ids
     first, last = int(ids.min()), int(ids.max())
@@ -32,7 +32,10 @@ def without_learnt_background(views: PreparedProjections, angles: NDArray[np.flo
     except ValueError as error:
         raise DataError(f"--calibrate background: {error}. Leave it out.") from error
     judged = f"views held out are left {found.without:.3g} without it and {found.left:.3g} with it"
-    values = {"background_without": found.without, "background_left": found.left}
+    values = {
+        "learnt_background_held_out_before": found.without,
+        "learnt_background_held_out_after": found.left,
+    }
     if not (found.drift or found.mean):
         said = "Background learnt with the volume: views held out confirm none; nothing taken off."
         return StepDone(said, {"learnt_background": said, **values})
@@ -48,13 +51,13 @@ def without_learnt_background(views: PreparedProjections, angles: NDArray[np.flo
     return StepDone(said, {"learnt_background": said, "learnt_background_terms": found.coefficients, **values})
 
 
-def without_learnt_gains(views: PreparedProjections, angles: NDArray[np.float64], progress: Progress) -> StepDone:
+def without_learnt_gains(views: PreparedProjections, progress: Progress) -> StepDone:
     """Take gains of pixels off the views where views held out confirm them, see `learn_gains`."""
     try:
         found = learn_gains(views.projections.data, views.geometry, views.measured, progress)
     except ValueError as error:
         raise DataError(f"--calibrate gains: {error}. Leave it out, or give --rings.") from error
-    values = {"gains_without": found.without, "gains_left": found.left}
+    values = {"learnt_gains_held_out_before": found.without, "learnt_gains_held_out_after": found.left}
     judged = f"views held out are left {found.without:.4g} without them and {found.left:.4g} with them"
     if not found.confirmed:
         said = f"Gains learnt with the volume: none taken off; {judged}."

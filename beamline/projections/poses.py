@@ -61,8 +61,19 @@ class ScanPoses:
             roll=geometry.roll + self.roll[view_ids],
             tilt=geometry.tilt + self.tilt[view_ids],
         )
-        # A parallel beam's z = 0 is the middle of its rows, but those views lean about the detector's middle.
-        return posed if posed.is_straight or posed.is_cone else replace(posed, axis_row=self.pivot)
+        return about(posed, self.pivot)
+
+
+def pivot_of(source: ScanSource, selection: Selection) -> float:
+    """The middle row of the detector, binned and counted from the first row used."""
+    middle, binning = (source.shape[0] - 1) / 2, selection.binning
+    return (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
+
+
+def about(geometry: Geometry, pivot: float) -> Geometry:
+    """The geometry whose views roll and tilt about this row."""
+    # A parallel beam's z = 0 is the middle of its rows, but those views lean about the detector's middle.
+    return geometry if geometry.is_straight or geometry.is_cone else replace(geometry, axis_row=pivot)
 
 
 def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses | None:
@@ -78,7 +89,7 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     tilt = selection.step(TiltAndLens)
     if tilt.sought or tilt.tilt_deg:
         raise ConfigError(f"--tilt turns views that {table.path} states as they were taken: write it to its roll_deg.")
-    shifts, height = table.shifts * _pixels(table, source, selection), source.shape[0]
+    shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
     width = source.shape[1]
     if (far := np.abs(shifts[:, 0]) >= width).any():
@@ -90,9 +101,8 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     n = source.image_key.size
     every = np.full((n, 4), np.nan)
     every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
-    binning = selection.binning
-    pivot = ((height - 1) / 2 - rows_of(source, selection).start - (binning - 1) / 2) / binning
-    return ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, _said(table, shifts), pivot, binning)
+    pivot, said = pivot_of(source, selection), _said(table, shifts)
+    return ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, said, pivot, selection.binning)
 
 
 def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float:

@@ -20,7 +20,7 @@ from recon.auto import is_wider
 from recon.base.binning import bin_views
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, TimedMethod
 from recon.base.volume import Grid
-from recon.calibrate import calibrate
+from recon.machine_speed import measured_speeds
 from recon.methods import with_settings
 from recon.reconstruction import Reconstruction
 from recon.splatting.initialise import default_count
@@ -44,7 +44,7 @@ class Budgeted:
         prepared: the reconstructed views, with binned pixels if the choice bins them.
         choice, speeds: what was chosen, and the measurements behind it.
         because: why this method, in words; empty if there was no other.
-        seconds: of everything, calibration included.
+        seconds: of everything, small runs that measure the speed included.
     """
 
     result: Reconstruction
@@ -146,7 +146,7 @@ def within(
     """
     now, begin = control.now, control.now()
     data, geometry = prepared.projections.data, prepared.geometry
-    speeds = calibrate(data, geometry, Grid.matching(geometry), now)
+    speeds = measured_speeds(data, geometry, Grid.matching(geometry), now)
     unbinned = default_count(Grid.of_field(geometry, geometry.sample_pitch))  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}

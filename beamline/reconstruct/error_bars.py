@@ -48,10 +48,10 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
             f"--uncertainty parts the views into two halves and needs {LEAST_VIEWS} at least; here are "
             f"{geometry.n_views}. Leave it out, or take more views."
         )
-    if isinstance(method, FitMethod) and method.finish_sweeps(geometry) == 0:
+    if isinstance(method, FitMethod) and method.finish_sweeps == 0:
         raise ConfigError(
-            f"--uncertainty refits on voxels, and {method.name} has no finish there with --finish 0, or with rolled or "
-            "tilted views. Leave one of them out."
+            f"--uncertainty refits on voxels, and {method.name} has no finish there with --finish 0. Leave one of "
+            "them out."
         )
 
 

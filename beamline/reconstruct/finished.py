@@ -332,7 +332,7 @@ def _at_once(job: _Job, decided: Decisions) -> ReconOutcome:
         result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     reached, planned = (result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)
     # The sweeps of a finish follow the last step, and can be stopped as well.
-    finishes = isinstance(method, FitMethod) and method.finish_sweeps(prepared.geometry)
+    finishes = isinstance(method, FitMethod) and method.finish_sweeps > 0
     early = job.stop_latch.stopped if finishes else job.stop_latch.cut(reached, planned)
     said = {} if checkpoints.resume is None else {"resumed_from": str(checkpoints.resume)}
     return job.outcome(result, early, chosen, **said, **({"checkpoint_lost": lost} if lost else {}))

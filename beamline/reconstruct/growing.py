@@ -305,7 +305,7 @@ class ScanFollower:
         except ValueError as error:
             raise DataError(f"{self.source.path} cannot be reconstructed: {error}") from error
         volume, gaussians = self._fit.snapshot(), self._fit.gaussians
-        sweeps = self._options.streaming.finish_sweeps(prepared.geometry)
+        sweeps = self._options.streaming.finish_sweeps
         if sweeps and gaussians is not None and not stop_latch():
             data, geometry = prepared.projections.data, prepared.geometry
             use = DataUse(prepared.ray_weights())

@@ -38,9 +38,9 @@ from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.unexplained import unexplained
 
-# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
 _ROOM = 3.0  # times a volume: free disk from which on a second one is kept
 _ENDS = ("ended_early", "resumed_from", "checkpoint_lost")  # settings of an outcome that its event tells
+# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
 _ODD_VIEWS, _DIRECT = 1.5, 2.5
 
 

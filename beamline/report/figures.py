@@ -223,7 +223,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str) -> bytes:
         *_edges(grid.centre[2], grid.shape[2], grid.voxel_size),
         *_edges(grid.centre[1], grid.shape[1], grid.voxel_size)[::-1],
     )
-    length = _round_length(grid.shape[2] * grid.voxel_size / 5)
+    length = round_length(grid.shape[2] * grid.voxel_size / 5)
     panels = ((volume, "attenuation", "gray"), (deviation, "standard deviation", "magma"))
     for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
         image = shown.data[at]
@@ -237,7 +237,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str) -> bytes:
     return png(figure)
 
 
-def _round_length(length: float) -> float:
+def round_length(length: float) -> float:
     """The largest of 1, 2, 5 times a power of ten that is not longer."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(power * max(n for n in (1, 2, 5) if n * power <= length * (1 + 1e-9)))

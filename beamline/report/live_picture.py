@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from beamline.report.figures import GreyWindow, bright_centre, grey_window, png
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
 from recon.base.noise import noise_level
 from recon.base.volume import Volume
 
@@ -121,9 +121,7 @@ class _Panel:
 
     def _scale(self, figure: Figure, x: int, y: int, pixel: float, unit: str) -> None:
         """A bar of a round length, at most a third of the image."""
-        longest = pixel * self.pixels.shape[1] / 3
-        power = 10.0 ** math.floor(math.log10(longest))
-        length = max(n * power for n in (1, 2, 5) if n * power <= longest)
+        length = round_length(pixel * self.pixels.shape[1] / 3)
         bar = Line2D([x, x + length / pixel], [y, y], color="tab:orange", lw=3, transform=None, solid_capstyle="butt")
         figure.add_artist(bar)
         width, height = figure.get_size_inches() * _DPI

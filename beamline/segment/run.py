@@ -20,13 +20,13 @@ from beamline.segment.picture import picture_of
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volume_file import read_volume
+from beamline.storage.writers.recon_file import DEVIATION
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
 from recon.post.enhance import Box, enhanced, enhanced_deviation, inscribed_box, sample_circle
 from recon.post.particles import NECK, Particles, cleaned, measured, parted, volume_deviation
 
 _SIGNAL = "entry/data/data"  # where `beamline recon` and `simulate --truth` have the volume
-_DEVIATION = "entry/data/data_errors"  # where `beamline recon --uncertainty` has its standard deviation
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _deviation(options: SegmentOptions, box: Box) -> NDArray[np.float32] | None:
     if options.dataset not in (None, _SIGNAL) or not h5py.is_hdf5(options.volume):
         return None
     with hdf5.open_hdf5(options.volume) as file:
-        found = file.get(_DEVIATION)
+        found = file.get(f"entry/data/{DEVIATION}")
         return np.asarray(found[box], np.float32) if isinstance(found, h5py.Dataset) else None
 
 

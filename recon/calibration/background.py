@@ -28,6 +28,7 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.vectors import dot
 from recon.prep.background import LEAST_SIZE, coordinate, powers
 from recon.splatting.initialise import leaves_the_field
+from recon.voxels.held_out_weight import split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector, projection_lines, volume_lines
@@ -186,10 +187,8 @@ class _Views:
 
     def parts(self) -> tuple[_Views, _Views]:
         """Views to learn from, and one of six to judge by, evenly spread in angle."""
-        views = self.projector.geometry
-        order = np.argsort(np.mod(views.angles, views.period), kind="stable")
-        unseen = np.sort(order[_ONE_IN // 2 :: _ONE_IN])
-        return self.select(np.setdiff1d(order, unseen)), self.select(unseen)
+        seen, unseen = split_views(self.projector.geometry, _ONE_IN)
+        return self.select(seen), self.select(unseen)
 
     def less(self, coefficients: F64) -> F32:
         """The data less the background."""
@@ -235,9 +234,7 @@ class _Trial:
         """Sweeps of FISTA-TV; returns what the volume leaves of the views [view, row, col]."""
         views, data = self.views, self.views.less(self.coefficients)
         method = FistaTv(sweeps, _TV_WEIGHT)
-        self.volume = solve(
-            method, views.projector, data, weight=views.weight, start=self.volume, decide=self._decide
-        )  # fmt: skip
+        self.volume = solve(method, views.projector, data, weight=views.weight, start=self.volume, decide=self._decide)
         return np.asarray(data - views.projector.forward(self.volume.data))
 
     def errors(self, unseen: _Views) -> F64:

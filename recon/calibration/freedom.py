@@ -95,13 +95,13 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
         u = np.arange(cols) - geometry.axis_col - geometry.shifts[:, :1]
         v = np.arange(rows) - geometry.axis_row - geometry.shifts[:, 1:]
         turned = across * v[:, None, :].astype(np.float32) - down * u[:, :, None].astype(np.float32)
-        found["roll"] = np.asarray(turned / reach(geometry), np.float32)
+        found["roll"] = np.asarray(turned / edge_motion(geometry), np.float32)
     if tilted is not None:
-        found["tilt"] = np.asarray(tilted / reach(geometry), np.float32)
+        found["tilt"] = np.asarray(tilted / edge_motion(geometry), np.float32)
     return found
 
 
-def reach(geometry: Geometry) -> float:
+def edge_motion(geometry: Geometry) -> float:
     """Pixels by which an image's edge moves, a radian of roll or tilt."""
     return max(geometry.detector_shape) / 2
 
@@ -116,7 +116,7 @@ def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: f
         axis += mean
     if "axis" in limited:
         axis += float(limited["axis"][0])
-    turns = {name: float(limited[name][0]) / reach(geometry) for name in ("roll", "tilt") if name in limited}
+    turns = {name: float(limited[name][0]) / edge_motion(geometry) for name in ("roll", "tilt") if name in limited}
     limit = math.radians(30)
     return replace(
         geometry,

@@ -19,7 +19,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
-from recon.voxels.held_out_weight import busiest_rows
+from recon.voxels.held_out_weight import busiest_rows, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
@@ -74,9 +74,7 @@ def learn_gains(
     (rows, cols), n = geometry.detector_shape, geometry.n_views
     if n < LEAST_VIEWS or cols < LEAST_COLS:
         raise ValueError(f"{n} views of {cols} columns are too few; {LEAST_VIEWS} of {LEAST_COLS} are needed")
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    unseen = np.sort(order[_ONE_IN // 2 :: _ONE_IN])
-    seen = np.setdiff1d(order, unseen)
+    seen, unseen = split_views(geometry, _ONE_IN)
     found, height = np.zeros((rows, cols), np.float32), _height(geometry)
     busiest = busiest_rows(projections, height).start
     lowest = busiest % height - height * (busiest % height > 0)
@@ -112,8 +110,7 @@ def gains_memory(geometry: Geometry) -> int:
 def _height(geometry: Geometry) -> int:
     """Rows at a time: all, where rows do not see the same slice in all views."""
     rows = geometry.detector_shape[0]
-    apart = not geometry.is_cone and geometry.is_straight and not geometry.shifts[:, 1].any()
-    return min(_BAND, rows) if apart else rows
+    return min(_BAND, rows) if geometry.rows_show_slices else rows
 
 
 def _root(squares: F64) -> float:

@@ -11,6 +11,7 @@ the identity and ten steps suffice. CG starts from no change. So it does not mov
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +39,8 @@ class JointFit:
         data: [view, col, row], line integrals.
         known: [view, col, row] weights of rays; None: one for all.
         terms: of `freedom.TERMS`, which may change.
+        volume: the best so far.
+        turned: the data as a detector without roll would have taken them.
     """
 
     data: F32
@@ -162,9 +165,10 @@ def _ramp(images: F32) -> F32:
     return np.asarray(fft.irfft(spectrum, n, axis=1, workers=get_num_threads())[:, :cols])
 
 
-def _solved(model: _Model, free: dict[str, F32], weighed: object, left: F32, rounds: int) -> tuple[F32, dict[str, F64]]:
+def _solved(
+    model: _Model, free: dict[str, F32], weighed: Callable[[F32], F32], left: F32, rounds: int
+) -> tuple[F32, dict[str, F64]]:
     """The change of the volume, and of each free quantity: [view] for the places of views, [1] for the others."""
-    assert callable(weighed)
     first = model.adjoint(weighed(left))
     seen = model.forward(first)
     typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))

@@ -13,7 +13,7 @@ from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.calibration.freedom import TERMS, GeometryChange, reach
+from recon.calibration.freedom import TERMS, GeometryChange, edge_motion
 from recon.calibration.joint import JointFit, taller
 from recon.calibration.judge import Judge, better
 
@@ -29,7 +29,7 @@ _NOTHING = 0.03  # pixels at an image's edge, of the views given: a turn by less
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class LearntGeometry:
     """What was learnt of a geometry.
 
     Attributes:
@@ -73,7 +73,7 @@ def learn_geometry(
     terms: frozenset[str],
     progress: Callable[[int, int], None] = lambda n, total: None,
     known: F32 | None = None,
-) -> Learnt:
+) -> LearntGeometry:
     """The geometry by which a volume explains the views best, as far as views held out confirm it.
 
     Args:
@@ -137,10 +137,10 @@ def _confirmed(
     known: F32 | None,
     factor: int,
     tick: Callable[[], None],
-) -> Learnt:
+) -> LearntGeometry:
     """The part of a change that views held out confirm: the whole against none, then each term of it."""
     small, data = geometry.binned(factor), bin_views(projections, factor)
-    edge = reach(geometry)
+    edge = edge_motion(geometry)
     sizes = abs(change.axis), abs(change.roll) * edge, abs(change.tilt) * edge, float(np.abs(change.shifts).max())
     wanted = [term for term, size in zip(TERMS, sizes, strict=True) if size > _NOTHING]
     judge = Judge(
@@ -172,7 +172,7 @@ def _confirmed(
             if not better(after, without):
                 kept, after = rest, without
     asked = [term for term in wanted if term not in kept]
-    return Learnt(
+    return LearntGeometry(
         change.of(frozenset(kept)), tuple(kept), tuple(asked), float(np.median(before)), float(np.median(after))
     )
 

@@ -45,8 +45,9 @@ class FitMethod(Method, Protocol):
         """Number of steps of the fit; None if only `seconds` end it."""
         ...
 
-    def finish_sweeps(self, geometry: Geometry) -> int:
-        """Sweeps of the finish on these views."""
+    @property
+    def finish_sweeps(self) -> int:
+        """Sweeps of the finish; where views held out choose them, the fewest."""
         ...
 
 

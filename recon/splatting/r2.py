@@ -88,8 +88,8 @@ class R2:
         """Steps that end the fit; None where `seconds` alone do."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
-    def finish_sweeps(self, geometry: Geometry) -> int:
-        """Sweeps of the finish on these views."""
+    @property
+    def finish_sweeps(self) -> int:
         return SWEEPS if self.finish is None else self.finish
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:

@@ -106,7 +106,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         )
         geometry = geometry.seen_with(NO_WIDTH)
     begin, decide = now(), control.decide or Decisions(problem.seed)
-    sweeps = method.finish_sweeps(geometry)
+    sweeps = method.finish_sweeps
     held_out = tuple(problem.use.held_out)
     backend = backend_for(problem.device)
     used, kept_back = _split(geometry.n_views, held_out, method.early_stop)

@@ -51,10 +51,10 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
     return views, replace(grid, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
 
 
-def split_views(geometry: Geometry) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one of `ONE_IN` to judge by, evenly spread in angle."""
+def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Views to reconstruct from, and one of so many to judge by, evenly spread in angle."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    unseen = np.sort(order[ONE_IN // 2 :: ONE_IN])
+    unseen = np.sort(order[one_in // 2 :: one_in])
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
 
 

@@ -70,7 +70,7 @@ class Projector:
             )
         kernels = joseph_cpu if self.geometry.is_straight else posed_cpu
         found = [
-            (band, [_Rays(*kernels.ray_table(at, self.grid)) for at in moments(views)])
+            (band, [_Rays(*kernels.ray_table(at, self.grid)) for at in views_of_exposure(views)])
             for band, views in bands_of(self.geometry, self.grid)
         ]
         object.__setattr__(self, "_bands", found)
@@ -181,7 +181,7 @@ class Projector:
         )
 
 
-def moments(geometry: Geometry) -> list[Geometry]:
+def views_of_exposure(geometry: Geometry) -> list[Geometry]:
     """The views at angles spread evenly over their exposures (midpoint rule); one where the stage stands."""
     arc = geometry.width.arc
     if arc == 0:

@@ -24,8 +24,8 @@ OF_VIEWS: dict[str, str] = {
     "background": "beamline.projections.learnt_terms:without_learnt_background",
     "gains": "beamline.projections.learnt_terms:without_learnt_gains",
 }
-"""Terms that change line integrals: name, and `module:function` of ("views", "angles", "progress") to a
-StepDone, as `ScanStep.apply`. Each takes its line here."""
+"""Terms that change line integrals: name, and `module:function` that changes views in place, is
+told progress and returns a StepDone. Each takes its line here."""
 
 
 def _terms(text: str) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ class Calibrate:
         for term, place in OF_VIEWS.items():
             if term in self.terms:
                 module, function = place.split(":")
-                done.append(getattr(import_module(module), function)(views, angles, progress))
+                done.append(getattr(import_module(module), function)(views, progress))
         said = " ".join(each.said for each in done if each.said)
         values = {key: value for each in done for key, value in (each.parameters or {}).items()}
         return StepDone(said, {"calibrate": ",".join(self.terms), "calibrate_said": said, **values})

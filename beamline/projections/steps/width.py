@@ -49,7 +49,9 @@ def _arc(text: str) -> str:
         except ValueError:
             numbers = []
         if not (0 < len(numbers) <= 2 and all(map(math.isfinite, numbers)) and numbers[0] >= 0):
-            raise ValueError(f"{text!r} is neither auto, nor none, nor ARC[:SKEW] in degrees with ARC >= 0, e.g. 0.5")
+            raise ValueError(
+                f"{text!r} is neither auto, nor none, nor ARC[:READOUT] in degrees with ARC >= 0, e.g. 0.5"
+            )
     return text
 
 
@@ -60,7 +62,7 @@ class Width:
     Attributes:
         spread: "none": rays. "pixel": a pixel's own area. A number: that, and a Gaussian blur of so many pixels.
         arc: "auto": the motion that the file states, where it is a pixel or more. "none": the stage stood.
-            "ARC[:SKEW]": degrees during an exposure, and from the first row of the detector to its last.
+            "ARC[:READOUT]": degrees during an exposure, and from the first row of the detector to its last.
     """
 
     name: ClassVar[str] = "width"
@@ -75,15 +77,16 @@ class Width:
     arc: str = option(
         "--exposure-arc",
         "auto",
-        "Degrees that the stage turns during an exposure, and from the first row's readout to the last's (below 0: the "
-        "last row is read first). auto: as the file of a fly scan says, where that is 1 px or more. none: it stands.",
+        "Degrees that the stage turns: ARC during an exposure, READOUT from the first row's readout to the last's "
+        "(below 0: the last row is read first). auto: as the file of a fly scan says, where ARC is 1 px or more. none: "
+        "it stands.",
         parse=_arc,
-        metavar="auto|none|ARC[:SKEW]",
+        metavar="auto|none|ARC[:READOUT]",
     )
 
     @property
     def needs_finished(self) -> str:
-        if (self.spread, self.arc) == ("none", "auto") or (self.spread, self.arc) == ("none", "none"):
+        if self.spread == "none" and self.arc in ("auto", "none"):
             return ""
         return "--ray-width and --exposure-arc are for a finished scan"
 
@@ -128,7 +131,7 @@ class Width:
             *([f"the last row sees {turned[1]:.2g} degrees more than the first"] if motion.skew else []),
         ]  # fmt: skip
         parameters: dict[str, Value] = {
-            "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "row_skew_deg": turned[1],
+            "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
         }  # fmt: skip
         return seen, StepDone(f"In the model of the views {', '.join(said)}.", parameters)
 

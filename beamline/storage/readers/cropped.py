@@ -85,6 +85,10 @@ class CroppedSource(ScanSource):
         return self._base.finished
 
     @property
+    def row_period(self) -> float | None:
+        return self._base.row_period
+
+    @property
     def plan(self) -> Mapping[str, Any]:
         return self._base.plan
 

@@ -22,8 +22,8 @@ from beamline.storage.structure import require_harmless
 from recon.base.volume import Grid, Volume
 
 DEFINITION = "NXtomoproc"
-FBP = "fbp"
-"""Dataset beside the volume, with filtered back-projection of the same views."""
+FBP, DEVIATION = "fbp", "data_errors"
+"""Datasets beside the volume: filtered back-projection of the same views, and the standard deviation of each voxel."""
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
 _UNITS_OF_MODEL = {
@@ -110,7 +110,7 @@ def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
         stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
         file.require_taken()
     beside = {
-        "data_errors": (record.deviation, "standard deviation of each voxel"),
+        DEVIATION: (record.deviation, "standard deviation of each voxel"),
         FBP: (record.fbp, "filtered back-projection of the same views"),
     }
     for name, (values, meaning) in beside.items():
@@ -212,7 +212,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         metrics={name: float(node[()]) for name, node in process["metrics"].items()},
         history={name: np.asarray(node[()]) for name, node in process["history"].items()},
         model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
-        deviation=data.get("data_errors"),
+        deviation=data.get(DEVIATION),
         fbp=data.get(FBP),
     )
 

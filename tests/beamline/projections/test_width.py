@@ -64,7 +64,7 @@ def test_the_file_of_a_fly_scan_tells_its_motion(sense: float) -> None:
     assert done.parameters == {
         "ray_width": "none",
         "exposure_arc_deg": pytest.approx(sense * 1.6),
-        "row_skew_deg": pytest.approx(sense * 0.252),
+        "readout_arc_deg": pytest.approx(sense * 0.252),
     }
 
 

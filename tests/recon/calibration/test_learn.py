@@ -10,7 +10,7 @@ import pytest
 from recon.base.geometry import Geometry
 from recon.calibration.freedom import GeometryChange, knowable
 from recon.calibration.judge import better
-from recon.calibration.learn import Learnt, learn_geometry
+from recon.calibration.learn import LearntGeometry, learn_geometry
 from tests.recon.calibration.bodies import balls
 
 VIEWS, SHAPE = 60, (24, 48)
@@ -73,11 +73,11 @@ def test_a_change_is_of_its_terms_and_scales_with_pixels() -> None:
 
 def test_what_was_learnt_is_said_in_pixels_of_the_detector() -> None:
     change = GeometryChange(1.0, 0.0, 0.0, np.zeros((2, 2)))
-    assert Learnt(change, ("axis",), ("roll",), 0.4, 0.3).said(2) == (
+    assert LearntGeometry(change, ("axis",), ("roll",), 0.4, 0.3).said(2) == (
         "Geometry learnt: the axis moves by +2.00 px. Views held out deviate by 0.3 in place of 0.4. Roll: left as it "
         "was, views held out do not confirm a change."
     )
-    assert Learnt(GeometryChange.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
+    assert LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
 
 
 def test_better_means_better_in_most_views() -> None:

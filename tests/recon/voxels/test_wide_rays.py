@@ -18,7 +18,7 @@ from recon.kernels.cpu.spread import spread
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project, voxelize
 from recon.voxels.fbp import fbp
-from recon.voxels.projector import Projector, data_residual, moments
+from recon.voxels.projector import Projector, data_residual, views_of_exposure
 from tests.recon.voxels.balls import ball_views
 
 ANGLES = np.arange(9) * 0.37
@@ -63,7 +63,7 @@ def test_a_spread_has_its_variances_and_keeps_the_sum(rng: np.random.Generator) 
 def test_an_exposure_is_the_mean_of_its_moments(beam: Geometry, rng: np.random.Generator) -> None:
     turning, grid = beam.seen_with(RayWidth(arc=0.2)), Grid((8, 30, 33), 0.055)
     volume = rng.random(grid.shape, dtype=np.float32)
-    seen = moments(turning)
+    seen = views_of_exposure(turning)
     assert len(seen) == math.ceil(0.2 * beam.reach / beam.sample_pitch)  # a step of at most a pixel at the rim
     assert np.mean([one.angles - beam.angles for one in seen]) == pytest.approx(0)
     expected = np.mean([Projector(one.seen_with(RayWidth()), grid).forward(volume) for one in seen], axis=0)

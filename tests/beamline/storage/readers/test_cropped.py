@@ -55,6 +55,7 @@ class _Flagged:
 
     path, format, dtype, quantity = Path("scan.h5"), "nxtomo", np.dtype(np.uint16), "counts"
     shape, pixel_size_mm, energy_kev, cone, axis_col = (10, 100), None, None, None, 52.5
+    row_period = 2e-5
     image_key, angles, exposures = np.zeros(3, np.int32), np.zeros(3), np.ones(3)
 
     @property
@@ -63,6 +64,10 @@ class _Flagged:
         regions[1, 0] = 2, 6, 60, 70
         bits = np.array([0, 1 << TODAY[0].bit, 0], np.uint64)
         return FrameFlags(bits, TODAY, np.zeros((3, len(TODAY)), np.float32), regions)
+
+
+def test_rows_are_read_as_late_as_in_the_whole_scan() -> None:
+    assert CroppedSource(_Flagged(), (40, 100)).row_period == 2e-5  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])

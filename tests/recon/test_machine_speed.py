@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon import calibrate as module
+from recon import machine_speed as module
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.calibrate import calibrate
+from recon.machine_speed import measured_speeds
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count, first_volume
 from recon.splatting.settings import FitSettings
@@ -47,7 +47,7 @@ def test_every_beam_is_measured_by_its_own_pixels_at_the_axis(beam: str, monkeyp
     plain = module._step
     monkeypatch.setattr(module, "_step", lambda *said: spread.append(said[3]) or plain(*said))
     grid, ticks = Grid.matching(geometry), iter(range(100_000))
-    speeds = calibrate(_views(geometry), geometry, grid, lambda: float(next(ticks)))
+    speeds = measured_speeds(_views(geometry), geometry, grid, lambda: float(next(ticks)))
     # As many Gaussians as a fit would start from, within the field, and not wider than a few of its pixels.
     assert spread[0].n == default_count(Grid.of_field(geometry, 0.1)) == 2000
     assert np.abs(spread[0].means.numpy()[:, :2]).max() <= 0.1 * 60 / 2 * 1.5
@@ -67,7 +67,7 @@ def test_a_slab_of_some_views_is_scaled_to_the_whole(beam: str, monkeypatch: pyt
 
     monkeypatch.setattr(module, "first_volume", first)
     grid = Grid.matching(geometry)
-    speeds = calibrate(_views(geometry), geometry, grid, clock)
+    speeds = measured_speeds(_views(geometry), geometry, grid, clock)
     assert speeds.fbp == pytest.approx(np.prod(grid.shape) * geometry.n_views)
 
 
@@ -90,11 +90,11 @@ def test_shifted_views_are_measured_on_all_that_they_see() -> None:
     moved = Geometry.parallel(TURN / 2, SHAPE, 0.1, 29.5 - 50, axis_row=11.5 - 24, shifts=shifts)
     grid = Grid.matching(plain)
     assert Grid.for_fit(moved, grid) == Grid.for_fit(plain, grid)
-    speeds = calibrate(_views(plain), moved, grid, lambda: float(next(ticks)))
+    speeds = measured_speeds(_views(plain), moved, grid, lambda: float(next(ticks)))
     assert min(speeds.fbp, speeds.start, speeds.step, speeds.fill) > 0
 
 
 def test_views_of_nothing_are_refused() -> None:
     geometry = BEAMS["cone"]
     with pytest.raises(ValueError, match="no matter"):
-        calibrate(np.zeros((40, *SHAPE), np.float32), geometry, Grid.matching(geometry), lambda: 0.0)
+        measured_speeds(np.zeros((40, *SHAPE), np.float32), geometry, Grid.matching(geometry), lambda: 0.0)

@@ -1,4 +1,4 @@
-"""calibrate: the speed of this machine on a scan, from about a second of small runs, scaled to the whole."""
+"""measured_speeds: the speed of this machine on a scan, from about a second of small runs, scaled to the whole."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _STEP_VIEWS, _STEPS = 4, 6
 _SWEPT_ROWS = 64  # fewer rows take longer for each row: 1.5 times at 16
 
 
-def calibrate(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
+def measured_speeds(projections: F32, geometry: Geometry, grid: Grid, now: Clock) -> Speeds:
     """Measure each part of a reconstruction on a part of the scan.
 
     The first volume (FBP, or its replacement, see `first_volume`), placing and filling run on a slab of rows. The step
