@@ -77,7 +77,9 @@ def test_what_was_learnt_is_said_in_pixels_of_the_detector() -> None:
         "Geometry learnt: the axis moves by +2.00 px. Views held out deviate by 0.3 in place of 0.4. Roll: left as it "
         "was, views held out do not confirm a change."
     )
-    assert LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
+    assert (
+        LearntGeometry(GeometryChange.none(2), (), (), 0.4, 0.4).said().startswith("Geometry: the views show no error")
+    )
 
 
 def test_better_means_better_in_most_views() -> None:
