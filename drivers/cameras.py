@@ -23,11 +23,9 @@ class CameraDriver(Protocol):
 
     def __call__(self, settings: Any, clock: Clock) -> Camera:
         """The driver, connected. Raises DeviceError if there is no such camera."""
-        ...
 
     def timing_of(self, settings: Any, wanted: CameraSettings) -> CameraTiming:
         """The camera's timing, before it is connected. ValueError for settings that it would refuse."""
-        ...
 
 
 CAMERAS: Mapping[str, CameraDriver] = plugins("camera", ("dcam", "simulated_orca"), with_keys)

@@ -29,13 +29,7 @@ class OutputShutter:
     by_hand = False
 
     def __init__(
-        self,
-        output: DigitalOutput,
-        clock: Clock,
-        *,
-        open_high: bool = True,
-        settle: float = 0.0,
-        name: str = "shutter",
+        self, output: DigitalOutput, clock: Clock, *, open_high: bool = True, settle: float = 0.0, name: str = "shutter"
     ) -> None:
         self.name = name
         if not (math.isfinite(settle) and settle >= 0):

@@ -44,6 +44,11 @@ class DeviceError(Exception):
         parts = [f"{device}: {problem}", *(form.format(text) for form, text in said if text)]
         super().__init__(". ".join(part.rstrip(".") for part in parts) + ".")
 
+    def told_by(self, device: str, problem: str, **changed: str) -> DeviceError:
+        """The same error of a device that uses this one; `changed`: parts that it says differently."""
+        parts = ("request", "reply", "expected", "advice", "state", "wire")
+        return type(self)(device, problem, **({part: getattr(self, part) for part in parts} | changed))
+
 
 class DeviceTimeout(DeviceError):  # noqa: N818 - the name that operators know
     """A device did not answer, or no frame arrived, in the time allowed."""

@@ -59,11 +59,9 @@ class DigitalOutput(Protocol):
 
     def set(self, high: bool) -> None:
         """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
-        ...
 
     def get(self) -> bool | None:
         """Whether the line is high; None if the controller cannot read it back."""
-        ...
 
 
 class RotationStage(Protocol):
@@ -76,17 +74,14 @@ class RotationStage(Protocol):
 
     def to_counts(self, angle: float) -> int:
         """The nearest whole count to an angle in radians."""
-        ...
 
     def to_angle(self, counts: int) -> float: ...
 
     def position(self) -> float:
         """Radians, read from the device."""
-        ...
 
     def start_move(self, angle: float, speed: float) -> None:
         """Begin a move at `speed` (rad/s) and return at once. Refuses a target outside the limits."""
-        ...
 
     def start_home(self) -> None:
         """Begin the search for the reference and return at once; `wait` ends with it.
@@ -94,25 +89,20 @@ class RotationStage(Protocol):
         Raises:
             DeviceRefused: the stage has no reference, or it moves.
         """
-        ...
 
     def moving(self) -> bool: ...
 
     def wait(self, timeout: float) -> float:
         """Wait for the move to end; the position in rad. Raises DeviceTimeout, or DeviceError if it stopped short."""
-        ...
 
     def stop(self) -> None:
         """Decelerate and stand. Legal in every state."""
-        ...
 
     def abort(self) -> None:
         """Stop at once, without deceleration. Legal in every state."""
-        ...
 
     def arm(self, train: TriggerTrain) -> None:
         """Prepare the pulses. The stage must stand before the first one; nothing is emitted until it moves."""
-        ...
 
     def disarm(self) -> None: ...
 
@@ -122,11 +112,9 @@ class RotationStage(Protocol):
         Raises:
             DeviceRefused: the controller has no output to set, or this output gives the trigger pulses.
         """
-        ...
 
     def describe(self) -> dict[str, str | int | float]:
         """Identity and settings for the file's metadata."""
-        ...
 
     def close(self) -> None: ...
 
@@ -191,26 +179,21 @@ class Camera(Protocol):
 
     def configure(self, settings: CameraSettings) -> CameraSettings:
         """Apply and read back. Raises DeviceRefused if the camera cannot."""
-        ...
 
     @property
     def timing(self) -> CameraTiming: ...
 
     def arm(self, n_frames: int) -> None:
         """Allocate the ring and wait for triggers; framestamps start at 0."""
-        ...
 
     def software_trigger(self) -> None:
         """Expose one frame (trigger source SOFTWARE)."""
-        ...
 
     def next_frame(self, timeout: float) -> CameraFrame:
         """The oldest frame not yet taken. Raises DeviceTimeout when none comes within `timeout` s."""
-        ...
 
     def disarm(self) -> None:
         """Stop and free the ring; legal in every state."""
-        ...
 
     def describe(self) -> dict[str, str | int | float]: ...
 
@@ -256,7 +239,6 @@ class BeamMonitor(Protocol):
 
     def reading(self) -> BeamReading:
         """The present value, always finite. Raises DeviceTimeout, or DeviceError if the answer is not a number."""
-        ...
 
     def close(self) -> None: ...
 

@@ -10,8 +10,7 @@ from urllib.parse import urlsplit
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 
-MOST_BYTES = 1 << 20
-"""Bytes of a page that are read at most; the number must stand within them."""
+MOST_BYTES = 1 << 20  # Bytes of a page that are read at most; the number must stand within them
 _PIECE = 1 << 14
 
 

@@ -13,8 +13,7 @@ from drivers.base.protocols import BeamReading
 OVERFLOW = 9.9e37
 """SCPI instruments send 9.9e37 for "over range" and 9.91e37 for "not a number" (SCPI-99, section 7.2.1)."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
-_SHOWN = 200
-"""Characters of the text that an error shows."""
+_SHOWN = 200  # Characters of the text that an error shows
 
 
 class TextSource(Protocol):
@@ -25,7 +24,6 @@ class TextSource(Protocol):
 
     def text(self) -> str:
         """The current text. Raises DeviceTimeout, DeviceError."""
-        ...
 
     def close(self) -> None: ...
 

@@ -9,8 +9,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.dcam.codes import Cooler, Property
 from drivers.dcam.properties import Properties
 
-Progress = Callable[[float, str], None]
-"""Called with the sensor's temperature in °C and the cooler's status."""
+Progress = Callable[[float, str], None]  # Called with the sensor's temperature in °C and the cooler's status
 
 POLL = 1.0  # s
 STEADY_BAND, STEADY_FOR = 0.5, 60.0

@@ -15,8 +15,7 @@ from drivers.dcam.session import run_all
 from drivers.dcam.structures import BufFrame
 from drivers.frame_memory import FrameMemory
 
-START_TIMEOUT = 5.0
-"""s that a camera may take to start a capture."""
+START_TIMEOUT = 5.0  # s that a camera may take to start a capture
 
 
 class Ring:

@@ -23,8 +23,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 from drivers.serial.ports import open_port
 
-QUIET = 0.05
-"""s without a byte after which a line counts as silent."""
+QUIET = 0.05  # s without a byte after which a line counts as silent
 
 
 @dataclass(frozen=True)

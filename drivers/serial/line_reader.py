@@ -15,12 +15,9 @@ from typing import Any
 from drivers.base.clock import Clock
 
 LONGEST_LINE = 1024
-LONGEST_REPLY = 1 << 16
-"""Most characters of a reply of several lines."""
-RECENT_LINES = 6
-"""Lines that error messages quote."""
-RECENT_CHARACTERS = 40
-"""Characters of each of these lines."""
+LONGEST_REPLY = 1 << 16  # Most characters of a reply of several lines
+RECENT_LINES = 6  # Lines that error messages quote
+RECENT_CHARACTERS = 40  # Characters of each of these lines
 
 
 class Transcript:

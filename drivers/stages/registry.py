@@ -15,6 +15,7 @@ REGISTRY = {  # kind, as a configuration names it: class in the kind's module `s
     "pm16c": "PM16CStage",
     "pi_gcs": "PiGcsStage",
     "zaber": "ZaberStage",
+    "epics": "EpicsStage",
 }
 STAGES: Mapping[str, StageDriver] = {
     **{kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name) for kind, name in REGISTRY.items()},

@@ -17,12 +17,9 @@ from drivers.base.protocols import RotationStage, StageLimits
 from drivers.flat import flat_fields
 from drivers.serial.line import Probe, SerialLine
 
-FARTHEST = 1e9
-"""rad."""
-MOST = 2.0**53
-"""counts: the largest whole numbers that a float holds exactly."""
-ANGULAR = {"deg", "deg_s", "deg_s2"}
-"""Units of keys whose fields are in radians."""
+FARTHEST = 1e9  # rad
+MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
+ANGULAR = {"deg", "deg_s", "deg_s2"}  # Units of keys whose fields are in radians
 
 
 @dataclass(frozen=True)
@@ -157,11 +154,9 @@ class StageSettings(Protocol):
     @property
     def pulse_output(self) -> int | None:
         """Number of the digital output that the trigger pulses come from; None where no output can be set."""
-        ...
 
     def limits(self) -> StageLimits:
         """The stage's limits, as far as they are known before it is connected."""
-        ...
 
 
 class StageDriver(Protocol):
@@ -180,7 +175,6 @@ class StageDriver(Protocol):
             DeviceRefused: the settings do not fit the controller, or it is moving.
             DeviceError, DeviceTimeout: no contact.
         """
-        ...
 
     def halt(self, url: str, settings: Any, clock: Clock) -> None:
         """Stop the stage, also in a move of a program that has died; it may still slow down at return.
@@ -188,4 +182,3 @@ class StageDriver(Protocol):
         Raises:
             DeviceError, DeviceTimeout: no contact.
         """
-        ...

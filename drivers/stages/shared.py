@@ -62,10 +62,8 @@ class Stops:
             raise problem
 
 
-POLL = 0.02
-"""s between two status queries of a moving stage."""
-STOP_MARGIN = 2.0
-"""s beyond the longest deceleration after which a stop has failed."""
+POLL = 0.02  # s between two status queries of a moving stage
+STOP_MARGIN = 2.0  # s beyond the longest deceleration after which a stop has failed
 Status = TypeVar("Status")
 
 
@@ -111,11 +109,9 @@ class LineStage(RotationStage, Protocol):
 
     def _counts(self) -> int:
         """The present place, asked of the controller."""
-        ...
 
     def _send_stop(self, hard: bool) -> str:
         """Send a stop (hard: without deceleration); returns the command."""
-        ...
 
     @property
     def limits(self) -> StageLimits:

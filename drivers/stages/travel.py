@@ -9,8 +9,7 @@ from fractions import Fraction
 from drivers.base.errors import DeviceRefused, DeviceTimeout
 from drivers.base.protocols import StageLimits, TriggerTrain
 
-ROUNDING = 1e-6
-"""counts: tolerance of a spacing, because speeds in degrees are rounded floats."""
+ROUNDING = 1e-6  # counts: tolerance of a spacing, because speeds in degrees are rounded floats
 
 
 def counts_in(seconds: float, limits: StageLimits) -> int:
@@ -156,13 +155,12 @@ class Travel:
             state=f"It was left moving and is at {self.degrees(counts)}",
         )
 
-    def not_stopped(self, timeout: float, counts: int, request: str, reply: str = "") -> DeviceTimeout:
+    def not_stopped(self, timeout: float, counts: int, request: str) -> DeviceTimeout:
         """The error of a stop if the stage does not stand within `timeout` s."""
         return DeviceTimeout(
             self.name,
             f"still moving {timeout:.1f} s after the stop command",
             request=request,
-            reply=reply,
             advice="Abort, or use the emergency stop",
             state=f"It is moving, at {self.degrees(counts)}",
         )

@@ -12,6 +12,7 @@ REGISTRY = {  # kind, as in `drivers.stages.registry`: class in the kind's modul
     "pm16c": "PM16CBuild",
     "pi_gcs": "PiGcsBuild",
     "zaber": "ZaberBuild",
+    "epics": "EpicsBuild",
 }
 
 

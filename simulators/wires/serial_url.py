@@ -14,8 +14,7 @@ from serial.serialutil import PortNotOpenError, SerialBase, SerialException, to_
 from simulators.wires.wire import Wire
 
 SCHEME = "sim://"
-POLL = 1e-3
-"""s on the device's clock between two checks for a missing reply."""
+POLL = 1e-3  # s on the device's clock between two checks for a missing reply
 
 if "simulators.wires" not in serial.protocol_handler_packages:
     serial.protocol_handler_packages.append("simulators.wires")
@@ -44,6 +43,10 @@ class _Ports:
             self._open[name] = self._wires[name]
             return self._wires[name]
 
+    def find(self, name: str) -> Wire | None:
+        with self._lock:
+            return self._wires.get(name)
+
     def close(self, name: str, wire: Wire) -> None:
         with self._lock:
             if self._open.get(name) is wire:
@@ -57,6 +60,11 @@ def register(name: str, wire: Wire) -> str:
     """Plug a simulated device in; returns the URL that opens it. It replaces a device of the same name."""
     _PORTS.plug(name, wire)
     return SCHEME + name
+
+
+def plugged(url: str) -> Wire | None:
+    """The simulated device of a URL, for drivers that exchange no bytes; None if nothing is plugged in there."""
+    return _PORTS.find(url[len(SCHEME) :])
 
 
 class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no types

@@ -16,11 +16,9 @@ class Wire(Protocol):
 
     def receive(self, data: bytes) -> None:
         """Bytes from the host, in pieces of any size."""
-        ...
 
     def transmit(self) -> bytes:
         """Bytes sent by now and not taken yet."""
-        ...
 
 
 class Controller(Wire, Protocol):
@@ -28,7 +26,6 @@ class Controller(Wire, Protocol):
 
     def output_is_high(self, number: int) -> bool:
         """The level of a digital output; False if no output has that number."""
-        ...
 
 
 class Build(Protocol):
@@ -41,8 +38,6 @@ class Build(Protocol):
         Raises:
             ValueError: the simulated controller cannot have a setting; the message names it and the reason.
         """
-        ...
 
     def controller(self, clock: Clock, line: TriggerLine) -> Controller:
         """The controller with its trigger output wired to `line`, which also learns the sample's true angle."""
-        ...

@@ -69,3 +69,10 @@ def test_refusals_name_the_legal_values(changes: dict[str, object], problem: str
 
 def test_nothing_to_refuse() -> None:
     assert orca_quest.refusal(_settings(roi=(2160, 3936, 144, 160), binning=4)) == ""
+
+
+def test_the_second_model_reads_ultra_quiet_at_its_printed_rate() -> None:
+    quiet = orca_quest.timing(_settings(exposure=34e-6, readout="ultra_quiet"), "coaxpress", "C15550-22UP")
+    assert 1 / quiet.min_period == pytest.approx(25.4, rel=0.005)
+    standard = [orca_quest.timing(_settings(), "coaxpress", model) for model in orca_quest.LINE_TIMES]
+    assert standard[0] == standard[1]

@@ -17,8 +17,7 @@ from drivers.stages.settings import Wiring
 from drivers.stages.shared import while_it_moves
 
 COUNT = r"([+-]\d{7,10})"
-STATUS_SINCE = (1, 47)
-"""Firmware."""
+STATUS_SINCE = (1, 47)  # Firmware
 ENDINGS = {0x80: "emergency stop", 0x40: "stop command", 0x20: "limit", 0x10: "error"}
 STOPS = {ENDINGS[0x80], ENDINGS[0x40]}
 

@@ -17,10 +17,8 @@ from drivers.stages.settings import Wiring
 
 PROBE = Probe("STQ?", r"[RL][0-4]")
 STOPPED_NOTE = r"STOP[0-9A-F]"
-MEMORY = 0.12
-"""Longest time, s, until a setting takes effect."""
-LOOK = 0.02
-"""s between two checks of this."""
+MEMORY = 0.12  # Longest time, s, until a setting takes effect
+LOOK = 0.02  # s between two checks of this
 T = TypeVar("T")
 
 

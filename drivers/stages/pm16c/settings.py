@@ -10,10 +10,8 @@ from drivers.base.protocols import StageLimits
 from drivers.stages.pm16c.train import Pm16cFirstPulse, PulseWidths
 from drivers.stages.settings import StageFigures, Wiring, key
 
-MAX_SPEED = 5_000_000
-"""pulses/s."""
-MAX_COUNT = 2_147_483_647
-"""Largest position, trigger point and limit, either way."""
+MAX_SPEED = 5_000_000  # pulses/s
+MAX_COUNT = 2_147_483_647  # Largest position, trigger point and limit, either way
 E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
 _TRIED = (m / 10 * 10.0**e for m in E24 for e in range(-2, 4))
 RATES = sorted((ms for ms in _TRIED if 0.0155 < ms < 1005), reverse=True)

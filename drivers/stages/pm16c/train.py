@@ -9,8 +9,7 @@ from enum import StrEnum
 from drivers.base.protocols import StageLimits, TriggerTrain
 from drivers.stages.travel import counts_in
 
-MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}
-"""Pulse width in s, the widest first -> TMGM mode."""
+MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}  # Pulse width in s, the widest first -> TMGM mode
 
 
 @dataclass(frozen=True)

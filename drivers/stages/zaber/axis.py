@@ -26,12 +26,9 @@ from drivers.stages.zaber.packet import (
 )
 from drivers.stages.zaber.settings import ZaberSettings
 
-PROBE_ID, STOP_ID, IDS = 98, 99, 98
-"""Ordinary commands count their ids from 0 to 97."""
-REPEATS = 3
-"""How often a command is sent again if the device answers AGAIN."""
-PAUSE = 0.05
-"""s before that."""
+PROBE_ID, STOP_ID, IDS = 98, 99, 98  # Ordinary commands count their ids from 0 to 97
+REPEATS = 3  # How often a command is sent again if the device answers AGAIN
+PAUSE = 0.05  # s before that
 TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 """Most digits of a position; a longer number is impossible for an axis and for a float."""
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
@@ -40,8 +37,6 @@ KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of the device."""
-
     number: str
     serial: str
     firmware: str
@@ -122,7 +117,6 @@ class ZaberAxis:
         return low, high
 
     def get(self, setting: str, form: str = NUMBER) -> str:
-        """A setting of the axis."""
         return self.ask_axis(f"get {setting}", form).data
 
     def set(self, setting: str, value: str | int) -> None:

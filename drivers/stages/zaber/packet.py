@@ -56,8 +56,7 @@ ENDINGS = {
     "NI": Meaning("movement interrupted", "Find who stopped it"),
 }
 """Flags that can explain why a move ended early, beside those of faults."""
-UNREFERENCED = frozenset({"WR", "WH"})
-"""Flags of an axis that does not know its reference."""
+UNREFERENCED = frozenset({"WR", "WH"})  # Flags of an axis that does not know its reference
 REASONS = {
     "AGAIN": "it asks to repeat, again and again",
     "AXISONLY": "this is asked of an axis only",

@@ -9,8 +9,7 @@ from drivers.base.protocols import StageLimits
 from drivers.stages.settings import StageFigures, Wiring, key
 from drivers.stages.zaber.train import PulseSettings, TriggerUse
 
-SPEED_UNIT = 1.6384
-"""Native speed of one microstep/s; of acceleration it is a ten-thousandth for one microstep/s²."""
+SPEED_UNIT = 1.6384  # Native speed of one microstep/s; of acceleration it is a ten-thousandth for one microstep/s²
 
 
 @dataclass(frozen=True)

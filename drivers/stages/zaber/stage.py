@@ -20,8 +20,7 @@ from drivers.stages.zaber.packet import meaning_of
 from drivers.stages.zaber.pulses import ZaberOutput, ZaberPulses
 from drivers.stages.zaber.settings import ZaberSettings
 
-STANDING_IN_PLACE = 10.0
-"""s beyond twice the time of a short move after which it has failed."""
+STANDING_IN_PLACE = 10.0  # s beyond twice the time of a short move after which it has failed
 
 
 class ZaberStage(LineStage):

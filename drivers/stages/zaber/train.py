@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.settings import key
 
-SHORTEST = 1e-3
-"""Least s between two fires of a trigger [from memory: firmware checks about this often]."""
+SHORTEST = 1e-3  # Least s between two fires of a trigger [from memory: firmware checks about this often]
 
 
 @dataclass(frozen=True)
@@ -28,8 +27,7 @@ class TriggerUse:
 
     measured: bool = key(False, "Pulses by the encoder, not by the commanded position.")
     chained: bool = key(
-        True,
-        "An action may enable another trigger; false: arming turns the stage to one step before the first pulse.",
+        True, "An action may enable another trigger; false: arming turns the stage to one step before the first pulse."
     )
     fires_when_enabled: bool = key(False, "A distance trigger fires where it is enabled, too.")
     starter: int = key(1, gt=0)

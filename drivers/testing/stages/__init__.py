@@ -8,13 +8,13 @@ import pytest
 
 from drivers.testing.stages.bench import Build, StageBench, StageKind
 from drivers.testing.stages.moves import Moves
-from drivers.testing.stages.trains import Trains
+from drivers.testing.stages.trains import NoTrains, Trains
 
-__all__ = ["Build", "StageBench", "StageConformance", "StageKind"]
+__all__ = ["Build", "StageBench", "StageConformance", "StageKind", "StepStageConformance"]
 
 
-class StageConformance(Moves, Trains):
-    """A subclass gives the fixtures `kind` and `build`; the stage of `build` stands at angle 0."""
+class _Suite:
+    """The fixtures of a suite."""
 
     @pytest.fixture
     def kind(self) -> StageKind:
@@ -32,3 +32,11 @@ class StageConformance(Moves, Trains):
         bench = build()
         yield bench
         bench.stage.close()
+
+
+class StageConformance(_Suite, Moves, Trains):
+    """A subclass gives the fixtures `kind` and `build`; the stage of `build` stands at angle 0."""
+
+
+class StepStageConformance(_Suite, Moves, NoTrains):
+    """The same for a stage without a trigger output (`StageKind.triggers` is False)."""

@@ -29,11 +29,9 @@ class Cable(Protocol):
 
     def next_after(self, time: float) -> EmittedPulse | None:
         """The first pulse strictly later than `time`, even where that is still to come; None where there is none."""
-        ...
 
     def angle_at(self, time: float) -> float:
         """The true angle in rad."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +45,7 @@ class StageKind:
         homes: it has a reference, within its limits.
         turning_back_ends: a train ends if the stage turns back inside it; otherwise its rest comes later.
         disarms_moving: a train can be ended while the stage moves.
+        triggers: it has a trigger output; without one its suite is `StepStageConformance`.
     """
 
     width: float | None = 100e-6
@@ -55,6 +54,7 @@ class StageKind:
     homes: bool = True
     turning_back_ends: bool = True
     disarms_moving: bool = True
+    triggers: bool = True
 
 
 @dataclass

@@ -205,3 +205,14 @@ class Trains:
         bench.go(10.0)
         assert bench.pulse_counts() == [bench.counts(1.0) + k * bench.counts(0.5) for k in range(10)]
         bench.stage.close()
+
+
+class NoTrains:
+    """The law of a stage without a trigger output."""
+
+    def test_a_train_is_refused_and_the_stage_moves_all_the_same(self, bench: StageBench) -> None:
+        with pytest.raises(DeviceRefused, match="Nothing has moved"):
+            bench.stage.arm(bench.train(1.0, 1.0, 3))
+        bench.stage.disarm()
+        assert bench.go(5.0) == pytest.approx(5.0, abs=bench.count)
+        assert bench.pulses() == []

@@ -57,8 +57,7 @@ class PiGcsBox:
         return code
 
 
-Action = Callable[[PiGcsBox, list[str]], list[str] | None]
-"""A command with its arguments."""
+Action = Callable[[PiGcsBox, list[str]], list[str] | None]  # A command with its arguments
 
 
 def _integer(text: str) -> int:

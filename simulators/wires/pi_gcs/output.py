@@ -19,8 +19,7 @@ from enum import StrEnum
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
 
-SLACK = 1e-6
-"""counts: largest error of a position by the decimals on the wire."""
+SLACK = 1e-6  # counts: largest error of a position by the decimals on the wire
 
 
 class FirstPulse(StrEnum):
@@ -171,7 +170,6 @@ class WiredOutput:
         self._schedule(move, now, owed)
 
     def begin(self, move: TrapezoidMove, zero: int, now: float) -> None:
-        """The axis begins a move."""
         owed = self._settle(now)
         self._done_until, self._zero = move.start, zero
         self._schedule(move, now, owed)

@@ -19,8 +19,7 @@ from simulators.wires.zaber.axis import Rejected
 
 OUTPUTS, TRIGGERS, ACTIONS = 4, 6, 2
 UNLIMITED = -1
-DEEPEST = 2 * TRIGGERS
-"""Triggers may set each other off so often at one moment; more count as a circle."""
+DEEPEST = 2 * TRIGGERS  # Triggers may set each other off so often at one moment; more count as a circle
 
 
 @dataclass(frozen=True)

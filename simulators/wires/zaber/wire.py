@@ -21,8 +21,7 @@ from simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
 from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
 from simulators.wires.zaber.triggers import OUTPUTS
 
-LONGEST_PACKET = 80
-"""Bytes of a packet; a longer one is ignored."""
+LONGEST_PACKET = 80  # Bytes of a packet; a longer one is ignored
 LONGEST_WORD = 50
 LINE_ENDS = re.compile(rb"[\r\n]+")
 

@@ -1,0 +1,241 @@
+"""Process variables, or records by their fields, over PVAccess (p4p) or Channel Access (aioca)."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NoReturn, Protocol
+
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+
+INVALID = 3
+"""The severity of a value that the IOC does not vouch for: its hardware does not answer, or it was never set."""
+UNREACHABLE = (
+    "Check the name, that its IOC runs, and which hosts are asked: EPICS_PVA_ADDR_LIST for pva://, EPICS_CA_ADDR_LIST "
+    "for ca://"
+)
+
+
+@dataclass(frozen=True)
+class PvValue:
+    """A value, with its label if it is a choice, and its alarm: 0 none, 1 minor, 2 major, 3 INVALID."""
+
+    value: float | str
+    label: str = ""
+    severity: int = 0
+
+    @property
+    def text(self) -> str:
+        """The value without its label."""
+        return self.value if isinstance(self.value, str) else repr(self.value)
+
+    def __str__(self) -> str:
+        return self.label or f"{self.value}"
+
+    def is_one(self, wanted: float | str) -> bool:
+        """Whether it is this number, text or label."""
+        return wanted in (self.value, self.label) if self.label else self.value == wanted
+
+
+class ProcessVariable(Protocol):
+    """A process variable, or a record whose fields have suffixes such as ".RBV"."""
+
+    name: str
+
+    def read(self, *suffixes: str) -> list[PvValue]:
+        """The present values. Raises DeviceTimeout: one does not answer in time; DeviceError: it cannot be read."""
+
+    def write(self, suffix: str, value: float | str) -> None:
+        """Set a value, before any later read. Raises DeviceTimeout, DeviceError: it refuses.
+
+        Channel Access does not say whether a disabled record (DISP) took it; only a later read shows it.
+        """
+
+    def close(self) -> None:
+        """Later reads and writes raise DeviceError."""
+
+
+def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
+    """The channel behind pva://NAME or ca://NAME. It is not asked yet.
+
+    Args:
+        device: its name in errors.
+        timeout: s, of each read and write.
+
+    Raises:
+        DeviceRefused: the address is of another kind.
+        DeviceError: the library for it is not installed.
+    """
+    if problem := url_problem(url):
+        raise DeviceRefused(device, problem, state="Nothing was asked")
+    scheme, _, name = url.partition("://")
+    try:
+        return OPENERS[scheme.lower()](name, device, timeout)
+    except ImportError as error:
+        raise DeviceError(
+            device,
+            f"{url} needs the library {error.name}, which is not installed",
+            advice='pip install "splatline[epics]"',
+            state="Nothing was asked",
+        ) from error
+
+
+def url_problem(url: str) -> str:
+    """Reason for which a URL names no process variable; "" if it names one."""
+    scheme, _, name = url.partition("://")
+    legal = scheme.lower() in OPENERS and name and not any(letter.isspace() for letter in name)
+    return "" if legal else f"{url!r} names no process variable; expected pva://NAME (PVAccess) or ca://NAME"
+
+
+def refuse_invalid(device: str, name: str, value: PvValue, state: str = "") -> None:
+    """Raise DeviceError if the IOC does not vouch for a value."""
+    if value.severity >= INVALID:
+        raise DeviceError(
+            device,
+            f"{name} has an INVALID alarm: its IOC does not vouch for the value",
+            reply=str(value),
+            advice="Look at the record in its own screen: the IOC has lost its controller, or the record was never set",
+            state=state,
+        )
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """What a channel says when it fails."""
+
+    device: str
+    timeout: float
+
+    def silent(self, names: str) -> NoReturn:
+        raise DeviceTimeout(
+            self.device, f"no answer within {self.timeout:g} s", request=names, advice=UNREACHABLE
+        ) from None
+
+    def refused(self, request: str, reply: object) -> NoReturn:
+        raise DeviceError(
+            self.device,
+            "the process variable refuses the request",
+            request=request,
+            reply=str(reply),
+            advice="Check its access rights and that its record is enabled (DISP, DISA)",
+        ) from None
+
+    def closed(self) -> NoReturn:
+        raise DeviceError(self.device, "the connection is closed", state="Nothing was asked")
+
+
+class PvaChannel:
+    """Implements `ProcessVariable` over PVAccess."""
+
+    def __init__(self, name: str, device: str, timeout: float) -> None:
+        from p4p.client.thread import Context
+
+        self.name, self._errors, self._timeout = name, _Errors(device, timeout), timeout
+        self._context: Any = Context("pva")
+
+    def read(self, *suffixes: str) -> list[PvValue]:
+        names = [self.name + suffix for suffix in suffixes]
+        found = self._asked().get(names, timeout=self._timeout, throw=False)
+        if silent := [name for name, value in zip(names, found, strict=True) if _is_silence(value)]:
+            self._errors.silent(", ".join(silent))
+        for name, value in zip(names, found, strict=True):
+            if isinstance(value, Exception):
+                self._errors.refused(name, value)
+        return [_of_pva(value) for value in found]
+
+    def write(self, suffix: str, value: float | str) -> None:
+        name = self.name + suffix
+        (result,) = self._asked().put([name], [value], timeout=self._timeout, throw=False)
+        if _is_silence(result):
+            self._errors.silent(name)
+        if isinstance(result, Exception):
+            self._errors.refused(f"{name} = {value}", result)
+
+    def close(self) -> None:
+        context, self._context = self._context, None
+        if context is not None:
+            context.close()
+
+    def _asked(self) -> Any:
+        return self._context if self._context is not None else self._errors.closed()
+
+
+def _is_silence(found: object) -> bool:
+    from p4p.client.thread import Disconnected
+
+    return isinstance(found, TimeoutError | Disconnected)
+
+
+def _of_pva(found: Any) -> PvValue:
+    severity = int(getattr(found, "severity", 0))
+    choices: Any = getattr(getattr(found, "raw", None), "value", None)
+    if (labels := getattr(choices, "choices", None)) is not None:
+        index = int(choices.index)
+        return PvValue(float(index), labels[index] if index < len(labels) else "", severity)
+    # str() of a p4p text has its time before it
+    return PvValue(str.__str__(found) if isinstance(found, str) else float(found), "", severity)
+
+
+_CA_SILENCE = (80, 192)  # ECA_TIMEOUT and ECA_DISCONN of caerr.h
+
+
+class CaChannel:
+    """Implements `ProcessVariable` over Channel Access."""
+
+    def __init__(self, name: str, device: str, timeout: float) -> None:
+        import aioca
+
+        self.name, self._errors, self._timeout = name, _Errors(device, timeout), timeout
+        self._ca: Any = aioca
+
+    def read(self, *suffixes: str) -> list[PvValue]:
+        ca, names = self._asked(), [self.name + suffix for suffix in suffixes]
+        found = _waited(ca.caget(names, format=ca.FORMAT_CTRL, timeout=self._timeout, throw=False))
+        if silent := [value.name for value in found if not value.ok and value.errorcode in _CA_SILENCE]:
+            self._errors.silent(", ".join(silent))
+        for value in found:
+            if not value.ok:
+                self._errors.refused(value.name, value)
+        return [_of_ca(value) for value in found]
+
+    def write(self, suffix: str, value: float | str) -> None:
+        ca, name = self._asked(), self.name + suffix
+        result = _waited(ca.caput(name, value, timeout=self._timeout, throw=False))
+        if not result.ok:
+            if result.errorcode in _CA_SILENCE:
+                self._errors.silent(name)
+            self._errors.refused(f"{name} = {value}", result)
+
+    def close(self) -> None:
+        """The process keeps its circuits: others may use them."""
+        self._ca = None
+
+    def _asked(self) -> Any:
+        return self._ca if self._ca is not None else self._errors.closed()
+
+
+def _of_ca(found: Any) -> PvValue:
+    severity = int(found.severity)
+    if (labels := getattr(found, "enums", None)) is not None:
+        index = int(found)
+        return PvValue(float(index), labels[index] if index < len(labels) else "", severity)
+    return PvValue(str(found) if isinstance(found, str) else float(found), "", severity)
+
+
+@cache
+def _loop() -> asyncio.AbstractEventLoop:
+    """The event loop of Channel Access, in a thread of its own, once a process."""
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, name="channel access", daemon=True).start()
+    return loop
+
+
+def _waited(asked: Any) -> Any:
+    return asyncio.run_coroutine_threadsafe(asked, _loop()).result()
+
+
+OPENERS: dict[str, Callable[[str, str, float], ProcessVariable]] = {"pva": PvaChannel, "ca": CaChannel}
+"""Scheme of a URL -> what opens it; a simulation adds its own."""

@@ -1,0 +1,119 @@
+"""Shutter and beam monitor behind process variables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceTimeout
+from drivers.epics.channel import ProcessVariable, open_channel, refuse_invalid
+
+POLL = 0.05  # s between looks at a shutter that moves
+NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
+
+
+@dataclass(frozen=True)
+class ShutterPvs:
+    """The process variables of a shutter, as pva://NAME or ca://NAME.
+
+    Attributes:
+        open_pv, open_value: what is written to open it; `close_pv` and `close_value` likewise.
+        status_pv: where the blade itself is read; it is open at `status_open`, a number, a text or a label.
+        timeout: s, for each answer.
+        travel: s that the status may take to follow.
+    """
+
+    open_pv: str
+    close_pv: str
+    status_pv: str
+    open_value: float | str = 1
+    close_value: float | str = 0
+    status_open: float | str = 1
+    timeout: float = 2.0
+    travel: float = 10.0
+
+
+class PvShutter:
+    """Implements `drivers.base.protocols.Shutter`. Opening and closing end when the status says so.
+
+    `close` always writes, even if the status says closed.
+
+    Raises:
+        DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.
+    """
+
+    by_hand = False
+
+    def __init__(self, pvs: ShutterPvs, clock: Clock, name: str = "shutter") -> None:
+        self.name = name
+        self._pvs, self._clock = pvs, clock
+        with ExitStack() as opened:
+
+            def channel(url: str) -> ProcessVariable:
+                found = open_channel(url, name, pvs.timeout)
+                opened.callback(found.close)
+                return found
+
+            self._opener, self._closer, self._status = map(channel, (pvs.open_pv, pvs.close_pv, pvs.status_pv))
+            _ = self.is_open()
+            self._disconnect: Callable[[], None] = opened.pop_all().close
+
+    def open(self) -> None:
+        if not self.is_open():
+            self._put(self._opener, self._pvs.open_value, True)
+
+    def close(self) -> None:
+        self._put(self._closer, self._pvs.close_value, False)
+
+    def is_open(self) -> bool:
+        """What the status says. Raises DeviceTimeout, DeviceError: it does not answer, or its alarm is INVALID."""
+        (status,) = self._status.read("")
+        refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
+        return status.is_one(self._pvs.status_open)
+
+    def disconnect(self) -> None:
+        """The shutter stays as it is."""
+        self._disconnect()
+
+    def _put(self, channel: ProcessVariable, value: float | str, wanted: bool) -> None:
+        request = f"{channel.name} = {value}"
+        try:
+            channel.write("", value)
+            deadline = self._clock.now() + self._pvs.travel
+            while (late := self.is_open() is not wanted) and self._clock.now() < deadline:
+                self._clock.sleep(POLL)
+        except DeviceError as cause:
+            raise cause.told_by(self.name, cause.problem, request=request, state=NOT_KNOWN) from cause
+        if late:
+            (status,) = self._status.read("")
+            raise DeviceTimeout(
+                self.name,
+                f"it did not {'open' if wanted else 'close'} within {self._pvs.travel:g} s",
+                request=request,
+                reply=f"{self._status.name} is {status}",
+                expected=f"{'' if wanted else 'another value than '}{self._pvs.status_open}",
+                advice="Check its permit, its interlock and the ring, and that this computer may write to it",
+                state=NOT_KNOWN,
+            )
+
+
+class PvSource:
+    """Implements `drivers.beam_monitors.reading.TextSource`: the number of a process variable as text.
+
+    Raises:
+        DeviceRefused: an address of another kind.
+    """
+
+    def __init__(self, url: str, timeout: float, name: str = "beam monitor") -> None:
+        self.request, self._name = url, name
+        self._channel = open_channel(url, name, timeout)
+
+    def text(self) -> str:
+        (value,) = self._channel.read("")
+        refuse_invalid(self._name, self._channel.name, value)
+        return value.text
+
+    def close(self) -> None:
+        self._channel.close()

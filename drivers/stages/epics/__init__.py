@@ -1,0 +1,1 @@
+"""A motor record of EPICS as a stage."""

@@ -1,0 +1,257 @@
+"""EPICS motor record as a stage, over PVAccess or Channel Access (Mooney and Sluiter, motor record reference, R7).
+
+The record has no trigger output: a configuration with it takes step scans. A value written to VAL sets DMOV to 0 before
+any later read. A move is over when DMOV is 1; RBV then says whether it arrived.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from contextlib import closing
+from dataclasses import dataclass
+from typing import NoReturn
+
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused
+from drivers.base.protocols import DigitalOutput, TriggerTrain
+from drivers.epics.channel import PvValue, open_channel, refuse_invalid
+from drivers.stages.epics.settings import EpicsSettings, Search
+from drivers.stages.shared import LineStage, Stops, until_standing, while_it_moves
+from drivers.stages.travel import Travel
+
+HOMED = 0x4000 | 0x0080
+"""MSTA: the reference was found, or it stands there."""
+FAULTS = {  # bit of MSTA: what it says, what to do
+    0x0200: ("the IOC lost its controller, or that reports a fault", "Look at the controller and at the IOC's shell"),
+    0x1000: ("the IOC has no contact with its controller", "Check the controller's power and its cable to the IOC"),
+    0x0040: ("it slipped or stalled", "Find what blocks it before moving on"),
+    0x0004: ("it is at its upper limit switch", "Move away from the switch by hand or in the record's own screen"),
+    0x2000: ("it is at its lower limit switch", "Move away from the switch by hand or in the record's own screen"),
+}
+GO, USE = "Go", "Use"
+"""Labels of SPMG and SET with which a value written to VAL moves the motor."""
+
+
+@dataclass(frozen=True)
+class MotorStatus:
+    """What the record says: its place in its unit, whether it is done moving, and MSTA."""
+
+    place: float
+    done: bool
+    bits: int
+
+    @property
+    def fault(self) -> tuple[str, str]:
+        """What MSTA says is wrong and what to do; empty texts without a fault."""
+        found = [said for bit, said in FAULTS.items() if self.bits & bit]
+        return (", ".join(text for text, _ in found), found[0][1]) if found else ("", "")
+
+
+class EpicsStage(LineStage):
+    """Opening checks unit, step size, limits and speed of the record. VELO and ACCL are set for each move; closing
+    restores them, and lets a move under way end by itself.
+
+    Args:
+        url: pva://NAME or ca://NAME of the record.
+    """
+
+    Settings = EpicsSettings
+
+    def __init__(self, url: str, settings: EpicsSettings, clock: Clock, name: str = "stage") -> None:
+        self.name = name
+        self._clock, self._url, self._settings = clock, url, settings
+        self._travel = Travel(name, settings.limits())
+        self._stops = Stops(name, self._send_stop)
+        self._target: int | None = None
+        self._searching, self._stops_before = False, 0
+        self._last = ""
+        self._channel = open_channel(url, name, settings.timeout)
+        self._kept: dict[str, float] = {}
+        try:
+            self._model = self._checked()
+        except BaseException:
+            self._channel.close()
+            raise
+
+    @staticmethod
+    def halt(url: str, settings: EpicsSettings, clock: Clock) -> None:
+        with closing(open_channel(url, "stage", settings.timeout)) as channel:
+            channel.write(".STOP", 1)
+
+    def start_move(self, angle: float, speed: float) -> None:
+        target = self._travel.target(angle)
+        if not 0 < speed <= self.limits.max_speed * (1 + 1e-12) or math.degrees(speed) < self._slowest:
+            raise self._travel.no_such_speed(speed, f"{self._slowest:g} deg/s or more")
+        self._stops_before = self._stops.count
+        with self._stops.none_while("the move"):
+            self._standing("a move")
+            self._refuse_unless_it_would_go()
+            self._target, self._searching = None, False
+            self._write(".VELO", math.degrees(speed))
+            self._write(".ACCL", speed / self.limits.acceleration)
+            place = target * 360 / self.limits.counts_per_turn
+            self._last = f"{self._channel.name}.VAL = {place:.10g}"
+            self._write(".VAL", place)
+            (refused,) = self._read(".LVIO")
+            if refused.value:
+                raise DeviceRefused(
+                    self.name,
+                    f"the record refuses {self._travel.degrees(target)}: beyond its own limits (LVIO)",
+                    request=self._last,
+                    advice="Compare HLM and LLM of the record with low_deg and high_deg",
+                    state="Nothing has moved",
+                )
+        self._target = target
+
+    def start_home(self) -> None:
+        """Soft limits do not hold on the way."""
+        if self._settings.search is Search.NONE:
+            raise DeviceRefused(
+                self.name,
+                "it has no reference to search (search: none)",
+                advice="Set devices.stage.search to forward or reverse, or home it in the record's own screen",
+                state="Nothing has moved",
+            )
+        self._stops_before = self._stops.count
+        with self._stops.none_while("the search for the reference"):
+            self._standing("a search for the reference")
+            self._refuse_unless_it_would_go()
+            self._last = f"{self._channel.name}{self._settings.search.field} = 1"
+            self._write(self._settings.search.field, 1)
+        self._target, self._searching = None, True
+
+    def moving(self) -> bool:
+        return not self._status().done
+
+    def wait(self, timeout: float) -> float:
+        until_standing(self._clock, self.moving, bool, timeout)
+        status = self._status()  # read anew: RBV may have been read before DMOV became 1
+        counts, target = self._counts_of(status), self._target
+        aim = "its reference" if self._searching else "" if target is None else self._travel.degrees(target)
+        if not status.done:
+            raise self._travel.still_moving(timeout, counts, aim, self._last)
+        stopped = self._stops.count != self._stops_before
+        if self._searching:
+            arrived = not stopped and bool(status.bits & HOMED)
+        else:
+            arrived = target is None or abs(counts - target) <= self._settings.tolerance
+        fault, advice = status.fault
+        if not arrived or (aim and fault):
+            self._failed(f"it stopped short of {aim}" if not arrived else f"a fault at {aim}", counts, fault, advice)
+        self._searching = False
+        return self.to_angle(counts)
+
+    def abort(self) -> None:
+        """As `stop`: the record has nothing faster, and the controller slows down as it does for every stop."""
+        self.stop()
+
+    def arm(self, train: TriggerTrain) -> None:
+        raise DeviceRefused(
+            self.name,
+            "a motor record gives no trigger pulses",
+            advice="Use scan.mode: step, or a stage whose controller gives pulses",
+            state="Nothing has moved and nothing was sent",
+        )
+
+    def disarm(self) -> None:
+        """Nothing is ever armed."""
+
+    def digital_output(self, number: int) -> DigitalOutput:
+        raise DeviceRefused(
+            self.name, f"a motor record has no digital output {number}", advice="Use shutter.kind: epics"
+        )
+
+    def describe(self) -> dict[str, str | int | float]:
+        return {
+            "model": self._model,
+            "port": self._url,
+            "trigger_output": "none",
+            **self._travel.described(),
+        }
+
+    def close(self) -> None:
+        with contextlib.suppress(DeviceError):  # a record that is gone, or closed already
+            for suffix, value in self._kept.items():
+                self._channel.write(suffix, value)
+        self._kept = {}
+        self._channel.close()
+
+    def _counts(self) -> int:
+        return self._counts_of(self._status())
+
+    def _counts_of(self, status: MotorStatus) -> int:
+        return round(status.place * self.limits.counts_per_turn / 360)
+
+    def _send_stop(self, hard: bool) -> str:
+        self._channel.write(".STOP", 1)
+        return f"{self._channel.name}.STOP = 1"
+
+    def _status(self) -> MotorStatus:
+        place, done, bits = self._read(".RBV", ".DMOV", ".MSTA")
+        return MotorStatus(float(place.value), bool(done.value), int(bits.value))
+
+    def _read(self, *suffixes: str) -> list[PvValue]:
+        """Values that the IOC vouches for."""
+        found = self._channel.read(*suffixes)
+        for suffix, value in zip(suffixes, found, strict=True):
+            refuse_invalid(self.name, self._channel.name + suffix, value, "Whether it moves is not known")
+        return found
+
+    def _write(self, suffix: str, value: float) -> None:
+        self._channel.write(suffix, value)
+
+    def _standing(self, purpose: str) -> None:
+        status = self._status()
+        if not status.done:
+            raise while_it_moves(self.name, purpose, self._counts_of(status))
+
+    def _refuse_unless_it_would_go(self) -> None:
+        """Refuses a record that takes a place without a move: stopped by SPMG, or to be redefined by SET."""
+        for suffix, wanted in ((".SPMG", GO), (".SET", USE)):
+            (found,) = self._read(suffix)
+            if found.label != wanted:
+                raise DeviceRefused(
+                    self.name,
+                    f"{self._channel.name}{suffix} is {found}, so that the record would not move",
+                    expected=wanted,
+                    advice="Set it in the record's own screen; somebody may have stopped this motor on purpose",
+                    state="Nothing has moved",
+                )
+
+    def _failed(self, problem: str, counts: int, fault: str, advice: str) -> NoReturn:
+        raise DeviceError(
+            self.name,
+            problem,
+            request=self._last,
+            expected="to stand there without a fault",
+            advice=advice or "Find who or what stopped it before moving on",
+            state=f"It stands at {self._travel.degrees(counts)}, {counts} counts: {fault or 'no reason given'}",
+        )
+
+    def _checked(self) -> str:
+        """What the record moves; refuses a record that does not fit the settings. Remembers what moves change."""
+        fields = (".EGU", ".MRES", ".HLM", ".LLM", ".VMAX", ".VBAS", ".VELO", ".ACCL", ".DESC")
+        unit, step, high, low, fastest, slowest, velocity, seconds, about = self._read(*fields)
+        settings, per_unit = self._settings, self.limits.counts_per_turn / 360
+        greatest = math.degrees(self.limits.max_speed)
+        wrong = ""
+        if unit.value != settings.unit:
+            wrong, advice = f"its unit (EGU) is {unit.value!r}, expected {settings.unit!r}", "Correct unit or EGU"
+        elif abs(abs(float(step.value)) * per_unit - 1) > 1e-6:
+            wrong = f"its step (MRES) is {step.value:g} {settings.unit}, expected {1 / per_unit:g}"
+            advice = "Set counts_per_turn to 360 / MRES"
+        elif 0 < float(fastest.value) < greatest * (1 - 1e-9):
+            wrong = f"its greatest speed (VMAX) is {fastest.value:g}, below {greatest:g} {settings.unit}/s"
+            advice = "Set max_speed_deg_s to it, or less"
+        if wrong:
+            problem = f"the record {self._channel.name} does not fit: {wrong}"
+            raise DeviceRefused(self.name, problem, advice=advice, state="Nothing has moved")
+        if float(high.value) > float(low.value):  # both 0: the record has no soft limits
+            low_counts = math.ceil(float(low.value) * per_unit - 1e-6)
+            high_counts = math.floor(float(high.value) * per_unit + 1e-6)
+            self._travel.refuse_narrower(low_counts, high_counts, "widen LLM and HLM of the record")
+        self._standing("opening")
+        self._slowest = max(float(slowest.value), 0.0)
+        self._kept = {".VELO": float(velocity.value), ".ACCL": float(seconds.value)}
+        return f"EPICS motor record {self._channel.name} ({about.value})"

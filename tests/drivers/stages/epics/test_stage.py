@@ -1,0 +1,151 @@
+"""A motor record that does not fit, is stopped by a person, meets a switch, loses its controller or its IOC."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+from uuid import uuid4
+
+import pytest
+
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.stages.epics.settings import EpicsSettings
+from drivers.stages.epics.stage import EpicsStage
+from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.epics.wire import MotorRecord
+from simulators.wires.serial_url import register
+from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
+from tests.drivers.stages.epics.test_conformance import USUAL
+from tests.drivers.stages.flat_settings import flat
+
+SPEED = math.radians(10)
+
+
+def _record(**build: Any) -> tuple[MotorRecord, str, TickingClock]:
+    clock = TickingClock()
+    record = record_of(clock, TriggerLine(clock), **build)
+    return record, register(f"epics-{uuid4().hex}", record), clock
+
+
+def _stage(url: str, clock: TickingClock, **settings: Any) -> EpicsStage:
+    return EpicsStage(url, flat(EpicsSettings, **(USUAL | settings)), clock)
+
+
+@pytest.mark.parametrize(
+    ("build", "said"),
+    [
+        ({"unit": "mm"}, r"its unit \(EGU\) is 'mm', expected 'deg'"),
+        ({"counts_per_turn": 36_000}, r"its step \(MRES\) is 0.01 deg, expected 0.001"),
+        ({"fastest": 20.0}, r"its greatest speed \(VMAX\) is 20, below 30 deg/s"),
+        ({"low": -5.0, "high": 99.0}, r"limited to -5.0000 deg to 99.0000 deg.*widen LLM and HLM"),
+    ],
+)
+def test_a_record_that_does_not_fit_is_refused_before_anything_is_written(build: dict[str, Any], said: str) -> None:
+    record, url, clock = _record(**build)
+    before = dict(record.state)
+    with pytest.raises(DeviceRefused, match=f"{said}.*Nothing has moved"):
+        _stage(url, clock)
+    assert record.state == before
+
+
+def test_a_linear_axis_is_taken_in_its_own_unit() -> None:
+    record, url, clock = _record(unit="mm", low=-5.0, high=100.0)
+    stage = _stage(url, clock, unit="mm")
+    stage.start_move(math.radians(12.5), SPEED)
+    stage.wait(60)
+    assert record.state[".VAL"] == pytest.approx(12.5)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [(".SPMG", 0.0, r"m?\.SPMG is Stop"), (".SPMG", 1.0, "is Pause"), (".SET", 1.0, "is Set")],
+)
+def test_a_record_that_would_take_a_place_without_a_move_is_refused(field: str, value: float, said: str) -> None:
+    record, url, clock = _record()
+    stage = _stage(url, clock)
+    record.state[field] = value
+    with pytest.raises(DeviceRefused, match=f"{said}.*on purpose.*Nothing has moved"):
+        stage.start_move(0.1, SPEED)
+    assert record.state[".VAL"] == 0.0 and record.motor.position() == 0
+
+
+def test_limits_that_were_narrowed_meanwhile_are_told() -> None:
+    record, url, clock = _record(low=-10.0, high=110.0)
+    stage = _stage(url, clock)
+    record.state[".HLM"] = 5.0
+    with pytest.raises(DeviceRefused, match=r"LVIO.*HLM and LLM.*Nothing has moved"):
+        stage.start_move(math.radians(20), SPEED)
+    assert not stage.moving()
+
+
+def test_a_limit_switch_ends_the_move_with_its_name() -> None:
+    _, url, clock = _record(switch_at=10_000)
+    stage = _stage(url, clock)
+    stage.start_move(math.radians(20), SPEED)
+    with pytest.raises(DeviceError, match=r"stopped short of 20.*Move away.*stands at 10.0000 deg.*upper limit switch"):
+        stage.wait(60)
+
+
+def test_a_stop_by_another_client_is_not_taken_for_done() -> None:
+    record, url, clock = _record()
+    stage = _stage(url, clock)
+    stage.start_move(math.radians(20), SPEED)
+    clock.sleep(1)
+    record.write(".STOP", 1)
+    with pytest.raises(DeviceError, match=r"stopped short of 20.*who or what stopped it"):
+        stage.wait(60)
+
+
+def test_a_controller_that_is_lost_is_never_taken_for_standing() -> None:
+    record, url, clock = _record()
+    stage = _stage(url, clock)
+    stage.start_move(math.radians(20), SPEED)
+    record.broken = True
+    for act in (stage.moving, stage.position, lambda: stage.wait(60)):
+        with pytest.raises(
+            DeviceError, match=r"RBV has an INVALID alarm.*its own screen.*Whether it moves is not known"
+        ):
+            act()
+
+
+def test_speed_and_acceleration_are_those_before_once_it_is_closed() -> None:
+    record, url, clock = _record()
+    stage = _stage(url, clock)
+    stage.start_move(math.radians(20), SPEED)
+    assert (record.state[".VELO"], record.state[".ACCL"]) == pytest.approx((10, 10 / 60))
+    stage.close()
+    assert (record.state[".VELO"], record.state[".ACCL"]) == (1.0, 0.2)
+
+
+def test_halt_stops_the_move_of_a_program_that_died() -> None:
+    record, url, clock = _record()
+    _stage(url, clock).start_move(math.radians(20), SPEED)
+    clock.sleep(1)
+    EpicsStage.halt(url, flat(EpicsSettings, **USUAL), clock)
+    clock.sleep(1)
+    assert not record.motor.moving() and record.motor.position() < 15_000
+
+
+def test_it_gives_no_pulses_and_no_output() -> None:
+    _, url, clock = _record()
+    stage = _stage(url, clock)
+    with pytest.raises(DeviceRefused, match=r"no digital output 2.*shutter.kind: epics"):
+        stage.digital_output(2)
+    assert not stage.limits.trigger_output
+
+
+def test_an_ioc_that_never_was_or_is_gone_is_an_error_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("p4p")
+    clock = TickingClock()
+    record = record_of(clock, TriggerLine(clock))
+    with serve_pva(record, clock, monkeypatch) as ioc:
+        with pytest.raises(DeviceTimeout, match=r"stage: no answer within 0.3 s.*nobody\.EGU.*EPICS_PVA_ADDR_LIST"):
+            _stage("pva://nobody", clock, timeout=0.3)
+        stage = _stage(f"pva://{PREFIX}", clock, timeout=1.0)
+        stage.start_move(math.radians(20), SPEED)
+        ioc.stop()
+        with pytest.raises(DeviceTimeout, match=r"no answer within 1 s.*T:\.RBV"):
+            stage.wait(60)
+        with pytest.raises(DeviceTimeout):
+            stage.stop()
+        stage.close()
