@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.masks import masked
 from recon.base.method import Progress, ReconProblem, RunControl
@@ -30,10 +30,7 @@ from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
 
-F32 = NDArray[np.float32]
-
-SWEEPS = 8
-"""Sweeps over the views, at least, where no number is given."""
+SWEEPS = 8  # Sweeps over the views, at least, where no number is given
 
 SUBSETS, TV_STEPS = 9, 3
 

@@ -43,12 +43,10 @@ class FitMethod(Method, Protocol):
     @property
     def planned_steps(self) -> int | None:
         """Number of steps of the fit; None if only `seconds` end it."""
-        ...
 
     @property
     def finish_sweeps(self) -> int:
         """Sweeps of the finish; where views held out choose them, the fewest."""
-        ...
 
 
 @runtime_checkable
@@ -57,4 +55,3 @@ class StreamingMethod(FitMethod, Protocol):
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit of views with the geometry of `template`, whose angles are ignored."""
-        ...

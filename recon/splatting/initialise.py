@@ -25,7 +25,7 @@ from recon.voxels.direct import direct
 from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector
-from recon.voxels.view_weights import angular_weights, covers_the_circle
+from recon.voxels.view_weights import angular_weights, missing_arc
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
@@ -139,7 +139,7 @@ def without_wild_pixels(projections: NDArray[np.float32]) -> NDArray[np.float32]
 def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Grid, start: Start = "fbp") -> Volume:
     """A quick volume to draw Gaussians from, 1/mm, without the effect of wild pixels (see `without_wild_pixels`).
 
-    "fbp": FBP or FDK; a short scan of a cone, which FDK does not cover, gets a few sweeps of OS-SIRT with TV instead.
+    "fbp": FBP or FDK; too short a scan of a cone for FDK gets a few sweeps of OS-SIRT with TV instead.
     "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
     ramp.
     """
@@ -161,7 +161,7 @@ def sweeps_of_start(geometry: Geometry, start: Start) -> float:
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:
-    return start == "tv" or (geometry.is_cone and not covers_the_circle(geometry.angles))
+    return start == "tv" or (geometry.is_cone and missing_arc(geometry) > 0)
 
 
 def sample_gaussians(
@@ -252,10 +252,7 @@ def neighbour_distance(means: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def scale_to_data(
-    gaussians: Gaussians,
-    projections: NDArray[np.float32],
-    geometry: Geometry,
-    rays: RayModel | None = None,
+    gaussians: Gaussians, projections: NDArray[np.float32], geometry: Geometry, rays: RayModel | None = None
 ) -> Gaussians:
     """The same Gaussians with all densities times k, k = <Aρ, P> / <Aρ, Aρ> over a few views.
 

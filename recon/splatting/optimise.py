@@ -1,8 +1,8 @@
-"""The fit over an explicit state: init, step, run_steps; it prints nothing, reads no clock, can stop after any step."""
+"""The fit over an explicit state: init, step; it prints nothing, reads no clock, can stop after any step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -71,10 +71,7 @@ def problem_of(
 
 
 def init(
-    gaussians: Gaussians,
-    seed: int | np.random.Generator,
-    growth: float = 1.0,
-    backend: Backend[Any] | None = None,
+    gaussians: Gaussians, seed: int | np.random.Generator, growth: float = 1.0, backend: Backend[Any] | None = None
 ) -> FitState:
     """A fresh state; the Gaussians are copied as float32, in an order that keeps neighbours together in memory.
 
@@ -140,21 +137,6 @@ def step(
     policy = settings.policy
     if policy is not None and state.step % policy.every == 0 and policy.start <= fraction < policy.stop:
         _grow(state, problem, policy)
-    return state
-
-
-def run_steps(
-    state: FitState,
-    problem: FitProblem,
-    settings: FitSettings,
-    steps: int,
-    on_step: Callable[[FitState], bool] | None = None,
-) -> FitState:
-    """`steps` steps on a full schedule; `on_step` may end it early by returning True."""
-    for k in range(steps):
-        step(state, problem, settings, k / max(1, steps))
-        if on_step is not None and on_step(state):
-            break
     return state
 
 

@@ -1,4 +1,4 @@
-"""FitProblem: the data of a fit on the device that fits them, in units in which published rates and weights hold."""
+"""FitProblem: the data of a fit on the device that fits them, in the units of published rates and weights."""
 
 from __future__ import annotations
 
@@ -178,8 +178,5 @@ def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> F
         known = tuple(None if bool((w == 1).all()) else backend.array(w) for w in weights)
     maps = tuple(loss.target_maps(image, w) for image, w in zip(images, known, strict=True))
     return replace(
-        problem,
-        images=problem.images + images,
-        target_maps=problem.target_maps + maps,
-        weights=problem.weights + known,
+        problem, images=problem.images + images, target_maps=problem.target_maps + maps, weights=problem.weights + known
     )

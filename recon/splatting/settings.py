@@ -12,8 +12,7 @@ from recon.base.volume import Grid
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.problem import FitProblem, Loss
 
-NAMES = ("means", "log_scales", "quaternions", "raw")
-"""Parameters of the model, in the order of their rates."""
+NAMES = ("means", "log_scales", "quaternions", "raw")  # Parameters of the model, in the order of their rates
 
 # Total variation is a prior: its weight grows with the noise of a pixel (variance), and falls with a Gaussian's pixels.
 # Factor and bounds from scans of four kinds with 25 to 90 views, see docs/notes/exploration.md.

@@ -101,7 +101,6 @@ class StreamingFit:
 
     @property
     def settings(self) -> FitSettings:
-        """Settings of the fit."""
         return self._settings
 
     @property

@@ -109,7 +109,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     sweeps = method.finish_sweeps
     held_out = tuple(problem.use.held_out)
     backend = backend_for(problem.device)
-    used, kept_back = _split(geometry.n_views, held_out, method.early_stop)
+    used, kept_back = split_views(geometry.n_views, held_out, method.early_stop)
     data, weights = masked(problem.projections, problem.use.weights)
     if weights is not None:  # only ratios of weights mean something: total variation has a weight of its own
         weights = weights / np.float32(_usual(weights, data))
@@ -274,7 +274,7 @@ def _usual(weights: F32, data: F32) -> float:
     return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))
 
 
-def _split(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def split_views(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     if any(isinstance(view, bool | np.bool_) for view in held_out):
         raise ValueError("held_out must be the numbers of views, got a mask of booleans: use numpy.flatnonzero of it")
     kept_back = np.unique(np.array([operator.index(view) for view in held_out], np.intp))

@@ -19,7 +19,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, FitSettings, growth
 from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
-from tests.recon.helpers import as_leaves, gradients, in_double
+from tests.recon.helpers import as_leaves, gradients, in_double, run_steps
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (22, 26), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
@@ -48,7 +48,7 @@ def test_a_disturbed_model_finds_back_to_the_data(random_gaussians: Make, rng: n
     state = fit.init(start, 0)
     expected = voxelize(truth, GRID).numpy()
     before = np.sqrt(((voxelize(start, GRID).numpy() - expected) ** 2).mean())
-    fit.run_steps(state, problem, PLAIN, 600)
+    run_steps(state, problem, PLAIN, 600)
     after = np.sqrt(((fit.volume_of(state, GRID, PLAIN).data - expected) ** 2).mean())
     assert after < 0.2 * before
     assert state.residual < 0.03
@@ -58,7 +58,7 @@ def test_the_same_seed_gives_the_same_bits(random_gaussians: Make, rng: np.rando
     truth = random_gaussians(30, extent=8.0)
     settings = FitSettings(policy=DensityPolicy(start=0, every=5, threshold=1e-9))
     problem, start = _problem(truth, settings), _disturbed(truth, rng)
-    ends = [fit.run_steps(fit.init(start, 7, growth(settings)), problem, settings, 20).parameters for _ in range(2)]
+    ends = [run_steps(fit.init(start, 7, growth(settings)), problem, settings, 20).parameters for _ in range(2)]
     for name in NAMES:
         np.testing.assert_array_equal(ends[0][name], ends[1][name])
     assert ends[0]["raw"].size == 45  # the policy grew the model to its limit
@@ -73,7 +73,7 @@ def test_units_do_not_matter(random_gaussians: Make, rng: np.random.Generator, u
     def loss(factor: float) -> float:
         scaled = [replace_unit(g, factor) for g in (truth, start)]
         problem = _problem(scaled[0], PLAIN)
-        return fit.run_steps(fit.init(scaled[1], 0), problem, PLAIN, 10).loss
+        return run_steps(fit.init(scaled[1], 0), problem, PLAIN, 10).loss
 
     assert loss(unit) == pytest.approx(loss(1.0), rel=1e-3)
 
@@ -161,7 +161,7 @@ def test_copies_start_without_momentum_and_without_statistic(random_gaussians: M
     truth = random_gaussians(30, extent=8.0)
     settings = FitSettings(policy=DensityPolicy(start=0, stop=2, every=5, threshold=1e-9))
     state = fit.init(_disturbed(truth, rng), 7, 1.5)
-    fit.run_steps(state, _problem(truth, settings), settings, 5)
+    run_steps(state, _problem(truth, settings), settings, 5)
     assert state.n == 45 and not state.statistic.any() and state.statistic.shape == (45,)
     for moments in (state.first, state.second):
         assert (np.abs(moments["log_scales"]).sum(axis=1) == 0).sum() == 15
@@ -172,7 +172,7 @@ def test_density_control_keeps_to_its_window(random_gaussians: Make, rng: np.ran
     settings = FitSettings(policy=DensityPolicy(start=0.4, stop=0.6, every=1, threshold=1e-9))
     counts: list[int] = []
     state = fit.init(_disturbed(truth, rng), 7, 10.0)
-    fit.run_steps(state, _problem(truth, settings), settings, 10, lambda s: bool(counts.append(s.n)))
+    run_steps(state, _problem(truth, settings), settings, 10, lambda s: bool(counts.append(s.n)))
     assert counts[:4] == [20] * 4 and counts[3] < counts[4] < counts[5] and counts[5:] == [counts[5]] * 5
 
 
@@ -182,10 +182,10 @@ def test_the_threshold_is_held_against_the_mean_over_steps(
 ) -> None:
     truth = random_gaussians(20, extent=8.0)
     start, problem = _disturbed(truth, rng), _problem(truth, PLAIN)
-    total = fit.run_steps(fit.init(start, 7), problem, PLAIN, 2).statistic.max()  # of two steps, so twice the mean
+    total = run_steps(fit.init(start, 7), problem, PLAIN, 2).statistic.max()  # of two steps, so twice the mean
     policy = DensityPolicy(start=0, stop=2, every=2, threshold=share * float(total), prune_below=0)
     settings = replace(PLAIN, policy=policy)
-    assert (fit.run_steps(fit.init(start, 7, 2.0), problem, settings, 2).n > 20) == grows
+    assert (run_steps(fit.init(start, 7, 2.0), problem, settings, 2).n > 20) == grows
 
 
 @pytest.mark.parametrize("length", [1e-3, 1e3])
@@ -202,7 +202,7 @@ def test_the_unit_of_length_does_not_matter(random_gaussians: Make, rng: np.rand
         ]
         data = project(scaled[0], views).numpy()
         problem = fit.problem_of(data, views, Grid.matching(views), 0.7 / factor, settings)
-        return fit.run_steps(fit.init(scaled[1], 0), problem, settings, 10).loss
+        return run_steps(fit.init(scaled[1], 0), problem, settings, 10).loss
 
     assert loss(length) == pytest.approx(loss(1.0), rel=1e-3)
 
@@ -224,7 +224,7 @@ def test_values_that_are_not_finite_pull_at_nothing(random_gaussians: Make) -> N
     marred[:, 3:6, 4:8], other[:, 3:6, 4:8] = np.nan, np.inf
     start = replace(g, means=g.means + 0.1)
     runs = [
-        fit.run_steps(fit.init(start, 0), fit.problem_of(d, VIEWS, GRID, 1.0, PLAIN), PLAIN, 5) for d in (marred, other)
+        run_steps(fit.init(start, 0), fit.problem_of(d, VIEWS, GRID, 1.0, PLAIN), PLAIN, 5) for d in (marred, other)
     ]  # fmt: skip
     for name in NAMES:
         assert np.isfinite(runs[0].parameters[name]).all()
@@ -287,7 +287,7 @@ def test_views_of_nothing_leave_a_model_to_go_on_with(random_gaussians: Make) ->
     policy = DensityPolicy(start=0, stop=2, every=10, prune_below=1e3)
     settings = FitSettings(policy=policy)
     empty = np.zeros((VIEWS.n_views, *VIEWS.detector_shape), np.float32)
-    state = fit.run_steps(fit.init(g, 0), fit.problem_of(empty, VIEWS, GRID, 1.0, settings), settings, 25)
+    state = run_steps(fit.init(g, 0), fit.problem_of(empty, VIEWS, GRID, 1.0, settings), settings, 25)
     assert state.n == 10 and state.step == 25
     assert all(np.isfinite(values).all() for values in state.parameters.values())
 
@@ -307,7 +307,7 @@ def test_quaternions_are_brought_to_length_one_without_a_turn(
     states = []
     for every in (100, 3):
         monkeypatch.setattr(fit, "_NORMALISE", every)
-        states.append(fit.run_steps(fit.init(start, 0), problem, PLAIN, 3))
+        states.append(run_steps(fit.init(start, 0), problem, PLAIN, 3))
     kept, brought = states
     q, unit = kept.parameters["quaternions"], brought.parameters["quaternions"]
     length = np.linalg.norm(q, axis=1, keepdims=True)

@@ -16,6 +16,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import coarser, extend, make_problem
 from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project
+from tests.recon.helpers import run_steps
 
 VIEWS = Geometry.parallel([0.0, 0.9, 2.0], (12, 18), 0.5)
 GRID = Grid.matching(VIEWS)
@@ -103,8 +104,8 @@ def test_a_fit_goes_on_beside_values_that_no_matter_explains(rng: np.random.Gene
         settings = FitSettings(policy=None, tv_size=6, coarse=2, coarse_until=0.5)
         problem = fit.problem_of(data, VIEWS, GRID, 0.2, settings)
         rough = coarser(problem, 2, "l1", 0.25)
-        state = fit.run_steps(fit.init(start, 0), rough, settings, 4)
-        ends.append(fit.run_steps(state, problem, settings, 4).parameters)
+        state = run_steps(fit.init(start, 0), rough, settings, 4)
+        ends.append(run_steps(state, problem, settings, 4).parameters)
     for name in NAMES:
         assert np.isfinite(ends[1][name]).all()
         np.testing.assert_array_equal(ends[0][name], ends[1][name])

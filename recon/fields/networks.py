@@ -1,0 +1,173 @@
+"""Networks from points to density: encodings of a point, a small perceptron, attention along line segments.
+
+All take points [line, sample, 3] in 0..1 of the field's box and give density [line, sample] in the field's unit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import gelu, leaky_relu, silu
+from torch.nn.utils import skip_init
+
+from recon.kernels.cpu import hash_grid
+
+Activation = Callable[[Tensor], Tensor]
+_SMALL = 1e-4  # first features of a hash grid
+_LEAST = 1e-3  # of the highest density, at the start
+_HEADS, _HEAD, _SEGMENT, _WIDER = 8, 4, 2, 4  # heads, numbers of each, samples of a segment, width of its perceptron
+
+
+class HashGrid(nn.Module):
+    """Multiresolution hash grid (Müller et al. 2022): `levels` of 16, 32, ... cubes an edge, two features each.
+
+    A level has at most 2^log2_table entries. On the CPU numba gathers and scatters, elsewhere torch does.
+    """
+
+    def __init__(self, levels: int, log2_table: int, features: int = 2, coarsest: int = 16) -> None:
+        super().__init__()
+        sides = coarsest * 2 ** np.arange(levels, dtype=np.int64) + 1
+        sizes = np.minimum(sides**3, 2**log2_table)
+        self.sides, self.firsts = sides, np.concatenate(([0], np.cumsum(sizes)))
+        self.table = nn.Parameter(torch.empty(int(self.firsts[-1]), features))
+        self.width = levels * features
+
+    def forward(self, points: Tensor) -> Tensor:
+        if points.is_cuda:
+            return gather_in_torch(points, self.table, self.sides, self.firsts)
+        encoded: Tensor = _Gather.apply(points, self.table, self.sides, self.firsts)
+        return encoded
+
+    def start(self, rng: torch.Generator) -> None:
+        nn.init.uniform_(self.table, -_SMALL, _SMALL, rng)
+
+
+class _Gather(torch.autograd.Function):
+    """`hash_grid.gather`; its slopes are added to `table.grad` in place, without a table for each part of a batch."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, table: Tensor, sides: NDArray[Any], firsts: NDArray[Any]) -> Tensor:
+        flat = np.ascontiguousarray(points.detach().reshape(-1, 3).numpy())
+        out = np.empty((len(flat), sides.size * table.shape[1]), np.float32)
+        hash_grid.gather(flat, table.detach().numpy(), sides, firsts, out)
+        ctx.given = flat, table, sides, firsts
+        return torch.from_numpy(out).reshape(*points.shape[:-1], -1)
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> Any:
+        flat, table, sides, firsts = ctx.given
+        if table.grad is None:
+            table.grad = torch.zeros_like(table)
+        given = np.ascontiguousarray(slopes[0].reshape(len(flat), -1).numpy())
+        hash_grid.scatter(flat, given, sides, firsts, table.grad.numpy())
+        return None, None, None, None
+
+
+def gather_in_torch(points: Tensor, table: Tensor, sides: NDArray[Any], firsts: NDArray[Any]) -> Tensor:
+    """Features [..., levels * features] of points [..., 3], by torch with its own slopes."""
+    found = []
+    corners = torch.tensor([[(n >> k) & 1 for k in range(3)] for n in range(8)], device=points.device)
+    primes = torch.tensor(hash_grid.PRIMES, device=points.device)
+    for level, side in enumerate(sides.tolist()):
+        first, size = int(firsts[level]), int(firsts[level + 1] - firsts[level])
+        at = points[..., None, :] * (side - 2) + 0.5
+        low = at.floor()
+        corner = low.long() + corners
+        weight = torch.where(corners > 0, at - low, 1 - (at - low)).prod(-1)
+        if side**3 <= size:
+            entry = corner[..., 0] + side * (corner[..., 1] + side * corner[..., 2])
+        else:
+            mixed = corner * primes
+            entry = (mixed[..., 0] ^ mixed[..., 1] ^ mixed[..., 2]) & (size - 1)
+        found.append((weight[..., None] * table[first + entry]).sum(-2))
+    return torch.cat(found, -1)
+
+
+class Waves(nn.Module):
+    """Fourier features: a point's coordinates, and their sines and cosines of `bands` octaves from one wave an edge."""
+
+    def __init__(self, bands: int) -> None:
+        super().__init__()
+        self.bands, self.width = bands, 3 + 6 * bands
+
+    def forward(self, points: Tensor) -> Tensor:
+        octaves = 2 * math.pi * 2.0 ** torch.arange(self.bands, device=points.device)
+        phases = ((points - 0.5)[..., None] * octaves).flatten(-2)
+        return torch.cat((points - 0.5, phases.sin(), phases.cos()), -1)
+
+
+class LineAttention(nn.Module):
+    """Attention within segments of two samples of a line, then a perceptron (Cai et al. 2024, SAX-NeRF, Lineformer)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        inner = _HEADS * _HEAD
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(2))
+        self.mix = skip_init(nn.Linear, width, 3 * inner, bias=False)
+        self.out = skip_init(nn.Linear, inner, width, bias=False)
+        self.places = nn.Parameter(torch.zeros(_SEGMENT, _SEGMENT, _HEADS))
+        sizes = width, _WIDER * width, _WIDER * width, width
+        self.wide = nn.ModuleList(skip_init(nn.Linear, a, b, bias=False) for a, b in pairwise(sizes))
+
+    def forward(self, x: Tensor) -> Tensor:
+        lines, samples, width = x.shape
+        pairs = x.reshape(lines * samples // _SEGMENT, _SEGMENT, width)
+        mixed = self.mix(self.norms[0](pairs)).unflatten(-1, (3, _HEADS, _HEAD))
+        asked, keys, values = mixed.unbind(2)
+        scores = (asked[:, :, None] * keys[:, None]).sum(-1) / math.sqrt(_HEAD) + self.places
+        shares = scores.softmax(2)
+        pairs = pairs + self.out((shares[..., None] * values[:, None]).sum(2).flatten(-2))
+        y = self.norms[1](pairs)
+        for layer in self.wide[:-1]:
+            y = gelu(layer(y))
+        return (pairs + self.wide[-1](y)).reshape(lines, samples, width)
+
+
+class Field(nn.Module):
+    """Encoding, four linear layers with the encoding joined again before the third one, density.
+
+    Args:
+        attention: line segments attend after the second layer.
+        highest: density is this times a sigmoid; None: no limit to either side.
+    """
+
+    def __init__(
+        self, encoding: HashGrid | Waves, width: int, *, waves: bool, attention: bool, highest: float | None
+    ) -> None:
+        super().__init__()
+        self.encoding, self.highest = encoding, highest
+        sizes = (encoding.width, width), (width, width), (width + encoding.width, width), (width, 1)
+        self.layers = nn.ModuleList(skip_init(nn.Linear, *size) for size in sizes)
+        self.attention = LineAttention(width) if attention else None
+        self.activation: Activation = silu if waves else leaky_relu
+
+    def forward(self, points: Tensor) -> Tensor:
+        odd = points.shape[1] % _SEGMENT if self.attention is not None else 0
+        encoded = self.encoding(torch.cat((points, points[:, -odd:]), 1) if odd else points)
+        x = self.activation(self.layers[1](self.activation(self.layers[0](encoded))))
+        if self.attention is not None:
+            x = self.attention(x)
+        x = self.activation(self.layers[2](torch.cat((x, encoded), -1)))
+        raw = self.layers[3](x).squeeze(-1)
+        density = raw if self.highest is None else self.highest * raw.sigmoid()
+        return density[:, : points.shape[1]]
+
+    def start(self, rng: torch.Generator, mean: float) -> None:
+        """First values, all from `rng`, but for the density: about `mean`, or a sigmoid would soon be flat."""
+        for part in self.modules():
+            if isinstance(part, nn.Linear):
+                for values in part.parameters(recurse=False):
+                    nn.init.uniform_(values, -(part.in_features**-0.5), part.in_features**-0.5, rng)
+            elif isinstance(part, HashGrid):
+                part.start(rng)
+        share = 0.0 if self.highest is None else min(max(mean / self.highest, _LEAST), 0.5)
+        with torch.no_grad():
+            *_, bias = self.layers[-1].parameters()
+            bias.fill_(mean if self.highest is None else math.log(share / (1 - share)))
