@@ -24,6 +24,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_by_views import axis_by_views
+    from recon.fields.methods import NAF, IntraTomo, SaxNerf
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from recon.voxels.projector import Projector
 
 __all__ = [
+    "NAF",
     "R2",
     "AsdPocs",
     "Auto",
@@ -59,6 +61,7 @@ __all__ = [
     "Gaussians",
     "Geometry",
     "Grid",
+    "IntraTomo",
     "Kernel",
     "OsSirtTv",
     "Progress",
@@ -70,6 +73,7 @@ __all__ = [
     "References",
     "RunControl",
     "Sart",
+    "SaxNerf",
     "Sirt",
     "StreamingFit",
     "Volume",

@@ -31,12 +31,12 @@ def _candidates() -> tuple[Method, ...]:
 class Auto:
     """Tries methods on a part of the scan, and reconstructs the whole by the one that predicts unseen views best.
 
-    The part is a slab of 32 rows where most matter is; of a cone the rows in its middle, or all rows at half the
-    resolution. One of eight views is held out. There is no trial with fewer than 16 views: the first candidate
-    takes them. A sample wider than the field, which only a fit models, is not tried either. A volume that is too smooth
-    misses the edges of unseen views, one that follows the noise misses them by its noise; so neither is preferred.
-    Where methods are level, the first one is taken that leaves no structure in its own views. docs/choosing.md has all
-    rules and their reasons.
+    The part is a slab of 32 rows where most matter is, with 8 rows where the sample is weakest. A cone's part is the
+    rows in its middle, or all rows at half the resolution. One of eight views is held out. There is no trial with
+    fewer than 16 views: the first candidate takes them. A sample wider than the field, which only a fit models, is not
+    tried either. A volume that is too smooth misses the edges of unseen views, one that follows the noise misses them
+    by its noise; so neither is preferred. Where methods are level, the first one is taken that leaves no structure in
+    its own views. docs/choosing.md has all rules and their reasons.
 
     Attributes:
         candidates: the methods, by preference.

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, RunControl
@@ -16,12 +16,8 @@ from recon.prep.align import AxisError, AxisEstimate
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
-F32 = NDArray[np.float32]
-
-COLS = 128
-"""Columns that show the axis to 0.05 of their pixels; more cost time."""
-VIEWS = 90
-"""Views that are enough."""
+COLS = 128  # Columns that show the axis to 0.05 of their pixels; more cost time
+VIEWS = 90  # Views that are enough
 _LEAST_VIEWS = 12
 _ONE_IN = 3  # views held out
 _WIDEST = 0.1875  # of the columns to either side of the start

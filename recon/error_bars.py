@@ -22,8 +22,7 @@ from recon.voxels.iterative import IterativeMethod, solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
-HALO = 8
-"""Slices beside a slab, at least, that its error bars need."""
+HALO = 8  # Slices beside a slab, at least, that its error bars need
 LEAST_VIEWS = 8
 
 _EXTRA = 0.5  # half of the views weigh so much more, the others so much less

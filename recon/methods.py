@@ -42,13 +42,14 @@ REGISTRY: dict[str, MethodEntry] = {
     "asd-pocs": MethodEntry("recon.voxels.methods.asd_pocs", "AsdPocs"),
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
+    "naf": MethodEntry("recon.fields.methods", "NAF", compared=False),
+    "intratomo": MethodEntry("recon.fields.methods", "IntraTomo", compared=False),
+    "sax-nerf": MethodEntry("recon.fields.methods", "SaxNerf", compared=False),
 }
 
-DEFAULT = "r2"
-"""The default method."""
+DEFAULT = "r2"  # The default method
 
-BASELINE = "fbp"
-"""Reports compare all methods with this one."""
+BASELINE = "fbp"  # Reports compare all methods with this one
 
 
 def names() -> tuple[str, ...]:

@@ -119,7 +119,8 @@ def reconstruct(
         for an argument that the method does not take: views held out, a device, checkpoints, or these views.
 
     Warns:
-        UserWarning: angles look like degrees, or projections like counts; the reconstruction goes on.
+        UserWarning: angles look like degrees, projections like counts, or, for a method that keeps no voxel below 0,
+            like line integrals of the other sign. The reconstruction goes on.
     """
     if isinstance(method, type):
         raise ValueError(
@@ -140,6 +141,8 @@ def reconstruct(
                 "-log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
                 stacklevel=2,
             )
+    if not getattr(chosen, "allow_negative", True):
+        _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     begin = control.now()
     found = chosen.run(ReconProblem(data, geometry, grid or Grid.matching(geometry), use, seed, device), control)
@@ -147,6 +150,18 @@ def reconstruct(
         found.volume, control.now() - begin, found.history, found.method or chosen.name, found.gaussians,
         MappingProxyType(dict(found.settings)), found.checkpoint,
     )  # fmt: skip
+
+
+def _warn_of_negative(data: NDArray[np.float32]) -> None:
+    some = data[:: max(1, len(data) // 16)]
+    some = some[np.isfinite(some)]
+    if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
+        warnings.warn(
+            f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
+            "matter are above 0: -log of the transmission. This method keeps no voxel below 0: change the sign, or set "
+            "allow_negative",
+            stacklevel=3,
+        )
 
 
 def _refuse_one_side(geometry: Geometry) -> None:

@@ -13,6 +13,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, RunControl, candidates_of
 from recon.base.volume import Grid
+from recon.fields.train import FieldMethod
 from recon.methods import with_settings
 from recon.reconstruction import reconstruct
 from recon.splatting.fit_method import FitMethod
@@ -37,6 +38,7 @@ _FEW_ROWS = 16  # of FBP and fits
 _FIT_COLS, _FIT_VIEWS = 128, 108
 _FBP_COLS, _FBP_VIEWS = 512, 180
 _STEPS = 12  # of a small fit
+_FIELD_STEPS = 3  # of a small fit of a neural field
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
         return _of_iterations(method, method.iterations, extent, now)
     if isinstance(method, FitMethod):
         return _of_fit(method, extent, now)
+    if isinstance(method, FieldMethod):
+        return _of_field(method, extent, now)
     candidates = candidates_of(method)
     if candidates[0] is method:
         return _of_direct(method, extent, now)
@@ -118,6 +122,24 @@ def _of_direct(method: Method, extent: Extent, now: Clock) -> float:
         times.append(now() - begin)
     share = min(times) / fbp_nanoseconds(views, cols, _FEW_ROWS)
     return share * sum(fbp_nanoseconds(extent.views, extent.cols, height) for height in extent.heights)
+
+
+def _of_field(method: FieldMethod, extent: Extent, now: Clock) -> float:
+    """A step costs as many samples as its rays have, and slices of the volume two fifths of that a voxel."""
+    geometry, data = _sample(_FIT_VIEWS, _FIT_COLS)
+    tried = with_settings(method, {"seconds": None, "early_stop": False})
+
+    def took(steps: int) -> float:
+        begin = now()
+        reconstruct(data, geometry, with_settings(tried, {"steps": steps}))
+        return now() - begin
+
+    took(1)
+    short, long = took(2), took(2 + _FIELD_STEPS)
+    step = max(long - short, long / 4) / _FIELD_STEPS * method.samples_of(extent.cols) / method.samples_of(_FIT_COLS)
+    steps, beside = method.steps * step * len(extent.heights), extent.rows * extent.cols**2
+    steps = steps if method.seconds is None else min(steps, method.seconds)
+    return steps + short * beside / (_FEW_ROWS * _FIT_COLS**2)
 
 
 def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:

@@ -19,14 +19,22 @@ from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.noise import median_deviation
 from recon.base.volume import Grid, Volume
-from recon.voxels.held_out_weight import LEAST_VIEWS, ONE_IN, busiest_rows, slab_of, split_views
+from recon.voxels.held_out_weight import (
+    LEAST_VIEWS,
+    ONE_IN,
+    busiest_rows,
+    middle_of_cone,
+    slab_of,
+    split_views,
+)
 from recon.voxels.projector import Projector
 from recon.voxels.unexplained import LIMIT, unexplained
 
 ROWS = 32  # rows of a slab; enough for total variation along z
 _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 _MATTER = 0.1  # share of the largest line integrals
-_ENOUGH = 0.5  # share of the matter in the fullest rows
+_FULL_TO_WEAK, _FEWEST = 4, 8  # ratio of rows; rows that TV along z needs
+_WEAK = 0.05  # share of the fullest rows, from which on rows show the sample
 _ERRORS, _NEAR = 2.0, 1.04  # standard errors, and the factor, within which residuals count as equal
 
 
@@ -118,7 +126,7 @@ def predicts_best(
 
     def scores() -> list[Score]:
         shown = next((volume for score, volume in found if score.method.traits.direct), None)
-        return [replace(score, loses=shown is not None and _loses(volume, shown)) for score, volume in found]
+        return [replace(score, loses=shown is not None and _loses(volume, shown, part)) for score, volume in found]
 
     regular = [at for at in order or range(len(methods)) if at != spare]
     for at in regular:
@@ -197,8 +205,12 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
     if not geometry.is_cone:
         if rows <= height:
             return problem, "all rows"
-        slab = busiest_rows(masked(data[:: max(1, len(data) // 8)])[0], height)
-        return _of_rows(problem, slab, *slab_of(geometry, problem.grid, slab.start, slab.stop))
+        some = masked(data[:: max(1, len(data) // 8)])[0]
+        apart = geometry.rows_show_slices and not geometry.skew
+        taken = _full_and_weak_rows(some, height, _lit_rows(problem)) if apart else [busiest_rows(some, height)]
+        count = sum(each.stop - each.start for each in taken)
+        first = taken[0].start if len(taken) == 1 else 0  # rows that were put together lie anywhere
+        return _of_rows(problem, taken, *slab_of(geometry, problem.grid, first, first + count))
     if min(rows, cols) < _SMALLEST:
         return problem, "all rows"
     middle = _middle_rows(problem, height)
@@ -212,31 +224,50 @@ def part_of(problem: ReconProblem, height: int = ROWS) -> tuple[ReconProblem | N
     return coarse, "binned 2 x 2"
 
 
+def _lit_rows(problem: ReconProblem) -> NDArray[np.bool_] | None:
+    """[row] whether some view has a ray of weight there; None: all have."""
+    weights = problem.use.weights
+    return None if weights is None else np.asarray((weights != 0).any(axis=(0, 2)))
+
+
+def _full_and_weak_rows(some: F32, height: int, lit: NDArray[np.bool_] | None) -> list[slice]:
+    """Rows of line integrals [view, row, col]: so many where the sample is fullest, and some where it is weakest.
+
+    Rows that are not lit were filled from others and are never the weakest.
+    """
+    full, few = busiest_rows(some, height), height // _FULL_TO_WEAK
+    matter = some.mean(axis=0, dtype=np.float64).std(axis=1)  # 0 where there is air alone, whatever its level
+    if lit is not None:
+        matter[~lit] = 0
+    matter[matter < _WEAK * matter.max()] = np.inf
+    sums = np.convolve(matter, np.ones(few), "valid")
+    first = int(np.argmin(sums))
+    if few < _FEWEST or math.isinf(sums[first]) or (full.start <= first + few and first <= full.stop):
+        return [full]
+    return sorted([slice(first, first + few), full], key=attrgetter("start"))
+
+
 def _middle_rows(problem: ReconProblem, height: int) -> tuple[ReconProblem, str] | None:
     """So many rows in the middle of a cone and the box that holds their rays; None if they have little matter."""
-    geometry, grid = problem.geometry, problem.grid
-    first = round(geometry.axis_row - (height - 1) / 2)
-    rows = slice(first, first + height)
-    moved = np.abs(geometry.shifts[:, 1]).max() > 1
-    if moved or first < 0 or rows.stop > geometry.detector_shape[0]:
-        return None
     some = masked(problem.projections[:: max(1, len(problem.projections) // 8)])[0]
-    if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
+    found = middle_of_cone(problem.geometry, problem.grid, some, height)
+    if found is None:
         return None
-    views = geometry.rows(rows.start, rows.stop)
-    # At the far side of the field.
-    tall = ((height + 1) * geometry.sample_pitch + 2 * geometry.lean) * (1 + geometry.reach / geometry.sod)
-    slices = math.ceil(tall / grid.spacing[0])
-    box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
-    return _of_rows(problem, rows, views, box)
+    rows, views, box = found
+    return _of_rows(problem, [rows], views, box)
 
 
-def _of_rows(problem: ReconProblem, rows: slice, views: Geometry, grid: Grid) -> tuple[ReconProblem, str]:
+def _of_rows(problem: ReconProblem, rows: Sequence[slice], views: Geometry, grid: Grid) -> tuple[ReconProblem, str]:
+    """The problem of some rows, put together."""
     weights = problem.use.weights
-    use = DataUse(None if weights is None else np.ascontiguousarray(weights[:, rows]))
-    cut = np.ascontiguousarray(problem.projections[:, rows])
+    cut = _rows_of(problem.projections, rows)
+    use = DataUse(None if weights is None else _rows_of(weights, rows))
     part = replace(problem, projections=cut, geometry=views, grid=grid, use=use)
-    return part, f"rows {rows.start} to {rows.stop - 1}"
+    return part, "rows " + " and ".join(f"{r.start} to {r.stop - 1}" for r in rows)
+
+
+def _rows_of(data: F32, rows: Sequence[slice]) -> F32:
+    return np.concatenate([data[:, some] for some in rows], axis=1)
 
 
 def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
@@ -259,9 +290,10 @@ def _residuals(volume: Volume, problem: ReconProblem) -> F64:
     return found if found.size else np.full(1, np.inf)
 
 
-def _loses(volume: F32, shown: F32) -> bool:
+def _loses(volume: F32, shown: F32, problem: ReconProblem) -> bool:
     """The volume lost weak matter that this one, of a direct method, shows."""
-    beside = compare(volume, shown)
+    lit = _lit_rows(problem) if problem.geometry.rows_show_slices else None
+    beside = compare(volume, shown, lit if lit is not None and lit.size == len(volume) else None)
     return beside is not None and beside.lost is not None
 
 

@@ -26,7 +26,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.back_project import compile_gridding
 from recon.voxels.fbp import is_gridded
-from recon.voxels.view_weights import covers_the_circle
+from recon.voxels.view_weights import cone_weights, missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
 _LEAN, _SHIFT = 0.1, 0.3  # radians; pixels
@@ -55,13 +55,16 @@ def warm_up(
     Raises:
         ValueError: the method does not take such views.
     """
+    method = method or R2()
+    if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
+        cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
     data, views = toy_of(geometry)
     weights = None
     if weighted:
         weights = np.ones(data.shape, np.float32)
         weights[::2, 3, 4] = 0  # views with and without go different ways
     with _counted(on_kernel or (lambda n: None)):
-        reconstruct(data, views, (method or R2()).toy(), device=device, use=DataUse(weights))
+        reconstruct(data, views, method.toy(), device=device, use=DataUse(weights))
         if geometry is not None and is_gridded(geometry, Grid.matching(geometry), "hann"):
             compile_gridding()
 
@@ -123,7 +126,7 @@ def _views_like(geometry: Geometry | None) -> Geometry:
     if geometry is None or not geometry.is_cone:
         views = Geometry.parallel(np.linspace(0, np.pi, _VIEWS, endpoint=False), _SHAPE)
     else:
-        turn = 2 * np.pi if covers_the_circle(geometry.angles) else np.pi
+        turn = 2 * np.pi if missing_arc(geometry) == 0 else np.pi
         pitch = geometry.pixel_pitch * geometry.detector_shape[1] / _SHAPE[1]  # the same field
         angles = np.linspace(0, turn, _VIEWS, endpoint=False)
         views = Geometry.cone(angles, _SHAPE, pitch, geometry.sod, geometry.sdd)
@@ -138,8 +141,5 @@ def _views_like(geometry: Geometry | None) -> Geometry:
 def _blob(views: Geometry) -> Gaussians:
     width = 2 * views.sample_pitch
     return Gaussians.from_physical(
-        np.zeros((1, 3)),
-        np.array([width]),
-        np.array([0.2 / width]),
-        kernel=FitSettings().kernel,
+        np.zeros((1, 3)), np.array([width]), np.array([0.2 / width]), kernel=FitSettings().kernel
     )

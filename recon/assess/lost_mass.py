@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_opening, find_objects, gaussian_filter, label
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, find_objects, gaussian_filter, label
 
 from recon.base.arrays import F32
 from recon.base.noise import air_level
@@ -18,6 +19,7 @@ _LEAST_AIR = 100  # blocks
 _LEFT = 0.5  # share of FBP's density: a voxel with less has lost it
 _CORE = 3, 5, 5  # blocks along z, y and x of the boxes that a region is made of
 _LEAST = 64  # blocks of a region
+_BESIDE = 2  # blocks beside slices without beam that these are smoothed into
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Comparison:
     kept: float = 1.0
 
 
-def compare(volume: F32, reference: F32) -> Comparison | None:
+def compare(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) -> Comparison | None:
     """The air of a volume, and the largest region in which it lost weak matter that the reference shows.
 
     Both in blocks of voxels, so that a volume that lies on disk takes little memory. A region is a union of boxes
@@ -46,6 +48,7 @@ def compare(volume: F32, reference: F32) -> Comparison | None:
     Args:
         volume: [z, y, x], of any method.
         reference: [z, y, x], FBP or FDK.
+        seen: [z], slices of rows that got beam, which alone are compared: in others FBP shows a filling. None: all.
 
     Returns:
         None if the reference shows no air.
@@ -55,12 +58,16 @@ def compare(volume: F32, reference: F32) -> Comparison | None:
     shown, found = _blocks(reference, factor), _blocks(volume, factor)
     ny, nx = shown.shape[1:]
     y, x = np.mgrid[:ny, :nx]
-    inside = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
+    disc = np.hypot(y - (ny - 1) / 2, x - (nx - 1) / 2) <= _RIM * min(ny, nx) / 2
+    inside = np.repeat(disc[None], len(shown), axis=0)
+    if seen is not None:
+        blocks = seen[: len(shown) * factor].reshape(-1, factor).all(axis=1)
+        inside &= binary_erosion(blocks, iterations=_BESIDE, border_value=1)[:, None, None]
     smooth = [min(_SMOOTH, n / 8) for n in shown.shape]
     shown, found = (gaussian_filter(values, smooth, mode="nearest") for values in (shown, found))
     if not inside.any():
         return None
-    level, noise = air_level(shown[:, inside])
+    level, noise = air_level(shown[inside])
     matter = (shown - level > _SIGMAS * noise) & inside
     air = inside & ~binary_dilation(matter, iterations=_MARGIN)
     if noise == 0 or air.sum() < _LEAST_AIR:

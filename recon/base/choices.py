@@ -6,8 +6,7 @@ from typing import Literal
 
 from recon.base.kernel import Kernel
 
-AUTO = "auto"
-"""Name of the choice among methods, `recon.Auto`."""
+AUTO = "auto"  # Name of the choice among methods, `recon.Auto`
 
 Filter = Literal["ram-lak", "shepp-logan", "hann"]
 Loss = Literal["l1", "l2", "poisson"]
@@ -17,20 +16,15 @@ Rings = Literal["none", "auto", "sort", "vo", "wavelet"]
 FlatFields = Literal["groups", "dynamic"]
 Start = Literal["fbp", "tv", "published"]
 
-KERNEL = Kernel.COMPACT
-"""Shape of a fit's Gaussians."""
+KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
 
-DEFAULT_STEPS = 400
-"""Steps of a fit before a finish on voxels."""
+DEFAULT_STEPS = 400  # Steps of a fit before a finish on voxels
 
-SHORT_STEPS = 200
-"""Steps if the noise of the views hides the gain of more steps."""
+SHORT_STEPS = 200  # Steps if the noise of the views hides the gain of more steps
 
-NECK = 0.8
-"""Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
+NECK = 0.8  # Two parts are one particle if the neck between them has at least this share of the narrower part's width
 
-N_GAUSSIANS, SIDE = 50_000, 256
-"""Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view."""
+N_GAUSSIANS, SIDE = 50_000, 256  # Of the standard case of `recon.bench`: Gaussians, and rows and columns of a view
 
 FEW_PHOTONS = 100
 """Photons in a pixel of the open beam; with fewer, counts are better than logarithms (docs/notes/exploration.md)."""

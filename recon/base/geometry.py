@@ -42,7 +42,7 @@ _SHORT_OF_SOURCE = 0.7  # share of sod: the corners of a box of this half width 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Geometry of a set of views; construct it with `Geometry.parallel` or `Geometry.cone`.
+    """Geometry of a set of views; construct it with `Geometry.parallel`, `Geometry.cone` or `Geometry.fan`.
 
     Attributes:
         angles: float64 [view], radians, any order, any range.
@@ -71,6 +71,13 @@ class Geometry:
     tilt: F64
     width: RayWidth = NO_WIDTH
     skew: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.skew) or (self.skew and not (self.is_straight and not self.is_cone)):
+            raise ValueError(
+                f"a skew of {self.skew:.3g} rad a row: expected a finite one, of straight views of a parallel beam. "
+                "Leave it at 0 for a cone, and for rolled or tilted views"
+            )
 
     @classmethod
     def parallel(
@@ -120,6 +127,29 @@ class Geometry:
             angles, detector_shape, pixel_pitch, axis_col, axis_row, float(sod), float(sdd), shifts, roll, tilt
         )  # fmt: skip
 
+    @classmethod
+    def fan(
+        cls,
+        angles: ArrayLike,
+        cols: int,
+        pixel_pitch: float,
+        sod: float,
+        sdd: float,
+        axis_col: float | None = None,
+        *,
+        shifts: ArrayLike | None = None,
+    ) -> Geometry:
+        """Fan beam onto a flat line of `cols` pixels: a cone of one row, in the plane of the source.
+
+        Args:
+            shifts: [view], pixels along the line.
+
+        Raises:
+            ValueError: as `cone`.
+        """
+        moved = None if shifts is None else np.stack([np.asarray(shifts, np.float64), np.zeros(np.size(angles))], 1)
+        return cls.cone(angles, (1, cols), pixel_pitch, sod, sdd, axis_col, axis_row=0.0, shifts=moved)
+
     def __repr__(self) -> str:
         low, high = np.rad2deg((self.angles.min(), self.angles.max()))
         beam = f"cone {self.sod:.6g}:{self.sdd:.6g}" if self.is_cone else "parallel"
@@ -156,7 +186,7 @@ class Geometry:
 
     @property
     def lean(self) -> float:
-        """mm by which roll and tilt move a point of the field along the rows at most, measured at the rotation axis."""
+        """Largest displacement by roll and tilt, from row to row, of a point of the field: mm at the rotation axis."""
         across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))
         return self.reach * float(across.max())
 
@@ -271,11 +301,6 @@ class Geometry:
             ValueError: a skew that is not finite, or of a cone, or of rolled or tilted views: slices of the volume then
                 belong to no row.
         """
-        if not math.isfinite(skew) or (skew and not (self.is_straight and not self.is_cone)):
-            raise ValueError(
-                f"a skew of {skew:.3g} rad a row: expected a finite one, of straight views of a parallel beam. Leave "
-                "it at 0 for a cone, and for rolled or tilted views"
-            )
         return replace(self, width=width, skew=float(skew))
 
     def at_row(self, row: float) -> Geometry:

@@ -169,15 +169,12 @@ class Method(Protocol):
         Raises:
             ValueError: the method does not take these views, settings or data.
         """
-        ...
 
     def toy(self) -> Self:
         """The same method with as little work as still runs each of its kernels."""
-        ...
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Most bytes that `run` takes beside the projections, and beside their weights if they are `weighted`."""
-        ...
 
 
 @runtime_checkable
@@ -186,7 +183,6 @@ class DividedMethod(Method, Protocol):
 
     def for_part(self, share: float, of_time: float) -> Self:
         """The method for this share of a volume, in this share of its seconds."""
-        ...
 
 
 @runtime_checkable
@@ -195,7 +191,6 @@ class PresetMethod(Method, Protocol):
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """The method with the settings of a preset, for a grid with `default_count` Gaussians by default."""
-        ...
 
 
 @runtime_checkable
@@ -204,7 +199,15 @@ class TimedMethod(Method, Protocol):
 
     def in_time(self, projections: F32, geometry: Geometry, seed: int, left: Callable[[], float]) -> Self:
         """Start the method on these views; the result runs within the seconds that are then `left`."""
-        ...
+
+
+@runtime_checkable
+class BoundedMethod(Method, Protocol):
+    """A method with a setting for the time of its whole run."""
+
+    @property
+    def seconds(self) -> float | None:
+        """None: the time does not end it."""
 
 
 @runtime_checkable
@@ -214,12 +217,10 @@ class CheckpointedMethod(Method, Protocol):
     @property
     def planned_steps(self) -> int | None:
         """Number of steps; None if a time ends the method."""
-        ...
 
     @property
     def made_by(self) -> tuple[Any, Mapping[str, Plain]]:
         """All settings that determine the steps, which a resumed run must share: a dataclass, and more by name."""
-        ...
 
 
 def candidates_of(method: Method) -> tuple[Method, ...]:

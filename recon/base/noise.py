@@ -12,11 +12,16 @@ from scipy.ndimage import gaussian_filter, median_filter
 from scipy.signal import find_peaks
 
 from recon.base.arrays import F32
+from recon.base.geometry import Geometry
 
 _MEDIAN = 0.6745  # median of |x| for a normal variable x with standard deviation 1
 _VIEWS = 16  # looked at
 _LOW, _HIGH = 3, 4  # orders of the differences; the higher is the finer
 _LARGEST_BLUR = 1.5  # pixels
+_CLEARLY = 1.15  # structure is taken for noise, where the noise beside it is less by so much
+_BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
+_LEAST_FIELD = 0.4  # of the columns, on the shorter side of the axis
+_EVEN, _MARGIN = 0.02, 1.1  # of a step between views; of the bound
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
 _SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
 _CLIPPED, _ROUNDS = 4.0, 20  # standard deviations of air, rounds
@@ -50,6 +55,69 @@ def noise_level(images: F32) -> float:
     by_chance = 2 / math.sqrt(some.size)  # white noise has a ratio of 1 give or take this
     at = int(np.searchsorted(-ratios, -min((high / low + by_chance) ** (2 / axes), 1.0)))
     return low * float(gains[min(at, gains.size - 1)]) ** (axes / 2)
+
+
+def noise_beside_structure(lines: F32, geometry: Geometry) -> float:
+    """`noise_level`, or what is less: the noise where no sample has structure.
+
+    While the stage turns by an angle, a point at most R pixels off the axis moves by R times this angle at most. So a
+    sample has no harmonics of order k in the angle at column frequencies below k / R (the bow-tie of a sinogram:
+    Rattey & Lindgren 1981, IEEE Trans. Acoust. 29, 994; of a fan: Mazin & Pelc 2010, Med. Phys. 37, 2674). Noise has
+    them, however fine the sample is. Views must be straight and evenly spread over a full turn, or half a turn of a
+    parallel beam. Their number must exceed a third of the columns (half of that for half a turn), about.
+
+    Args:
+        lines: [view, col, row]; rows with NaN are not used.
+    """
+    found, few = noise_level(lines), _beyond_the_bow_tie(lines, geometry)
+    return few if few * _CLEARLY < found else found
+
+
+def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
+    """Standard deviation of white noise with the same power there; infinite where it cannot be told."""
+    order = _evenly_spread(geometry)
+    cols = geometry.detector_shape[1]
+    axis = geometry.axis_col + geometry.shifts[:, 0]
+    half = int(min(axis.min(), cols - 1 - axis.max()))
+    rows = np.flatnonzero(np.isfinite(lines).all(axis=(0, 1)))
+    if order is None or not geometry.is_straight or geometry.skew or half < _LEAST_FIELD * cols or not rows.size:
+        return math.inf
+    rows = rows[:: -(-rows.size // _BOW_TIE_ROWS)]
+    middle = round(float(axis.mean()))
+    at = np.arange(max(0, middle - half), min(cols, middle + half + 1))
+    window = np.hanning(at.size + 2)[1:-1]
+    bins = np.arange(2, 2 + _BOW_TIE_BINS)
+    omega = 2 * np.pi * bins / at.size
+    waves = window[:, None] * np.exp(-1j * omega * (at[:, None] - middle))
+    spectrum = np.einsum("vcr,cm->vmr", lines[order][:, at][:, :, rows], waves, optimize=True)
+    spectrum *= np.exp(1j * omega * (axis[order, None] - middle))[:, :, None]
+    theta = np.unwrap(geometry.angles[order])
+    if np.ptp(theta) < 1.01 * np.pi:  # the views of the other half turn are these, mirrored
+        spectrum = np.concatenate((spectrum, spectrum.conj()))
+    count = len(spectrum)
+    power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
+    reach = half + 0.5 + float(np.ptp(axis))
+    off = reach * geometry.sample_pitch / geometry.sod
+    bound = _MARGIN * reach / (1 - off) * (omega + 4 * np.pi / at.size) + 2 if off < 1 else np.full(bins.size, np.inf)
+    free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
+    few = power[free]
+    return math.sqrt(float(few.mean())) if few.size >= _LEAST_POWERS else math.inf
+
+
+def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
+    """Views in the order of their angles, if these divide a full turn evenly, or half a turn of a parallel beam."""
+    theta = np.mod(geometry.angles, 2 * np.pi)
+    order = np.argsort(theta, kind="stable")
+    gaps = np.diff(theta[order], append=theta[order[0]] + 2 * np.pi)
+    order = np.roll(order, -1 - int(np.argmax(gaps)))  # from behind the widest gap on
+    steps = np.mod(np.diff(theta[order]), 2 * np.pi)
+    if steps.size < 3 or np.ptp(steps) > _EVEN * steps.mean():
+        return None
+    for period in (2 * np.pi,) if geometry.is_cone else (np.pi, 2 * np.pi):
+        for views in (order.size, order.size - 1):  # a view at the end of the turn may repeat the first
+            if abs(views * steps.mean() - period) < _EVEN * period / views:
+                return order[:views]
+    return None
 
 
 def median_deviation(images: NDArray[np.floating[Any]]) -> float:

@@ -28,7 +28,7 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.vectors import dot
 from recon.prep.background import LEAST_SIZE, coordinate, powers
 from recon.splatting.initialise import leaves_the_field
-from recon.voxels.held_out_weight import split_views
+from recon.voxels.held_out_weight import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector, projection_lines, volume_lines
@@ -49,7 +49,7 @@ _FIRST, _SWEEPS, _ROUNDS = 9, 3, 24
 _DENSE, _LONGEST = 0.2, 10.0  # of the density unit; factor of a step
 _NEARER = 0.99  # of the residual of views held out: what a further round has to bring
 _BETTER, _MEAN_BETTER = 0.9, 0.75  # shares of the mean square of views held out that a drift, or a mean, must reach
-_SURE = 2.0  # standard errors of the gain
+_SURE = 2.0  # see `beyond_chance`
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,11 +246,9 @@ class _Trial:
     def beats(self, other: _Trial, unseen: _Views, share: float) -> bool:
         """It leaves less than a share of what another leaves of views held out, and its background is large enough."""
         ours, theirs = self.errors(unseen), other.errors(unseen)
-        gain = theirs - ours
         change = np.tensordot(self.coefficients - other.coefficients, self.views.terms, 1)
         large = float(np.sqrt(np.mean(np.square(change)))) >= LEAST_SIZE
-        sure = gain.mean() > _SURE * gain.std() / math.sqrt(gain.size - 1)
-        if large and sure and ours.mean() < share * theirs.mean():
+        if large and beyond_chance(theirs - ours, _SURE) and ours.mean() < share * theirs.mean():
             return True
         self.coefficients = other.coefficients
         return False

@@ -102,7 +102,7 @@ def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset
 
 
 def edge_motion(geometry: Geometry) -> float:
-    """Pixels by which an image's edge moves, a radian of roll or tilt."""
+    """Displacement of an image's edge by roll or tilt, in pixels a radian."""
     return max(geometry.detector_shape) / 2
 
 

@@ -1,13 +1,13 @@
 """Gains of pixels, learnt with the volume: a constant of each pixel in all views, which makes a ring.
 
 A few sweeps of FISTA-TV and the median of the residual over the views alternate, see `ring_offsets`. Total variation
-keeps rings out of the volume, and bodies in it. What cannot be told apart is left alone. A gain near the axis looks
-like a body on the axis, a stripe of all rows like the wall of a can. What changes slowly along a row is density.
+keeps rings out of the volume, and bodies in it. Three sorts of gain stay in
+the views. A gain near the axis looks like a body on the axis. A stripe of all rows looks like the wall of a can. A
+slow change along a row looks like density.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
-from recon.voxels.held_out_weight import busiest_rows, split_views
+from recon.voxels.held_out_weight import beyond_chance, busiest_rows, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
@@ -32,7 +32,7 @@ _BAND, _HALO = 16, 4  # rows at a time; rows beside them that tell a stripe of a
 _ONE_IN = 6  # views held out
 _TV_WEIGHT = 1e-3  # three times as much takes a sixth of a ball on the axis
 _FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
-_BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; standard errors of the gain
+_BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; see `beyond_chance`
 _VOLUMES, _RAYS, _WEIGHTS = 8.5, 7.0, 5.0  # float32 copies at most
 
 
@@ -92,9 +92,7 @@ def learn_gains(
             plain, _ = band.learn(seen, gains=False)
             none = np.zeros_like(pixels)
             without, left = band.errors(plain, none, unseen, own), band.errors(volume, pixels, unseen, own)
-            gain = without - left
-            sure = gain.mean() > _SURE * gain.std() / math.sqrt(gain.size - 1)
-            if not (sure and left.mean() < _BETTER * without.mean()):
+            if not (beyond_chance(without - left, _SURE) and left.mean() < _BETTER * without.mean()):
                 return LearntGains(np.zeros_like(found), _root(without), _root(left), False)
     return LearntGains(found, _root(without), _root(left), True)
 

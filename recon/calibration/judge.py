@@ -17,6 +17,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
+from recon.voxels.held_out_weight import beyond_chance
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
@@ -25,7 +26,7 @@ _SWEEPS, _TV_WEIGHT = 6, 3e-3
 _EDGE = 1  # row at either end, in which rays of leaning views leave the slices seen
 _SMOOTH = 4.0  # pixels
 _LEAST = 0.002  # share of the squared deviation that a better geometry takes away
-_SURE = 2.0  # standard errors of that share, from view to view
+_SURE = 2.0  # see `beyond_chance`
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,5 +82,4 @@ def _without_smooth(image: F32) -> F64:
 def better(one: F64, other: F64) -> bool:
     """The first deviations [view] are surely less than the second, by the scatter from view to view."""
     share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
-    error = float(share.std(ddof=1)) / np.sqrt(share.size)
-    return bool(share.mean() > max(_LEAST, _SURE * error))
+    return bool(share.mean() > _LEAST) and beyond_chance(share, _SURE)

@@ -17,15 +17,14 @@ from recon.calibration.freedom import TERMS, GeometryChange, edge_motion
 from recon.calibration.joint import JointFit, taller
 from recon.calibration.judge import Judge, better
 
-COLS, ROWS = 320, 96
-"""Pixels that show the geometry; more cost time."""
-_LEAST_VIEWS = 12
+COLS, ROWS = 320, 96  # Pixels that show the geometry; more cost time
+LEAST_VIEWS = 12
 _FEWEST = 20  # columns of the coarsest pixels
 _AXIS_STEPS, _AXIS_ROUNDS = 4, 8  # the axis alone comes first: from far off, views would move in its place
 _STEPS = 6, 4, 3  # of Gauss-Newton, from the coarsest pixels on
 _ROUNDS = 16  # of conjugate gradients in each
 _FARTHEST = 2.0  # binned pixels that anything moves in a step
-_NOTHING = 0.03  # pixels at an image's edge, of the views given: a turn by less is none
+_NOTHING = 0.03  # pixels at an image's edge, of the views given; smaller changes are dropped
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +84,8 @@ def learn_geometry(
     Raises:
         ValueError: fewer than twelve views, or views without matter.
     """
-    if geometry.n_views < _LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few; {_LEAST_VIEWS} are needed")
+    if geometry.n_views < LEAST_VIEWS:
+        raise ValueError(f"{geometry.n_views} views are too few; {LEAST_VIEWS} are needed")
     if not projections.any():
         raise ValueError("the views show no matter")
     factors = _factors(*geometry.detector_shape)

@@ -91,12 +91,7 @@ def in_front(means: Tensor, geometry: Geometry, view: int) -> Tensor:
 
 
 def affine_error(
-    means: Tensor,
-    scales: Tensor,
-    quaternions: Tensor,
-    geometry: Geometry,
-    view: int,
-    kernel: Kernel = Kernel.GAUSSIAN,
+    means: Tensor, scales: Tensor, quaternions: Tensor, geometry: Geometry, view: int, kernel: Kernel = Kernel.GAUSSIAN
 ) -> Tensor:
     """ε [n], the estimate of `cpu.footprints` for the relative L2 error of a cone's affine footprints; no gradient."""
     means, scales, quaternions = means.detach(), scales.detach(), quaternions.detach()

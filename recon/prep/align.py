@@ -16,16 +16,7 @@ from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
 from recon.base.units import warn_of_degrees
-from recon.prep.axis_search import (
-    AGREE,
-    MOST_ROWS,
-    Floats,
-    Search,
-    few_rows,
-    lowest,
-    optimum,
-    within,
-)
+from recon.prep.axis_search import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
 from recon.prep.axis_search import AxisError as AxisError
 from recon.prep.axis_search import AxisEstimate as AxisEstimate
 from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Search = tuple[float, float] | None
 
-MOST_ROWS = 16
-"""Rows that are enough for 0.1 px."""
-AGREE = 1.0
-"""Two independent estimates no farther apart than this (px) are the same axis."""
+MOST_ROWS = 16  # Rows that are enough for 0.1 px
+FEWEST_COLS = 8  # Columns that an axis can be found from
+AGREE = 1.0  # Two independent estimates no farther apart than this (px) are the same axis
 
 
 class AxisError(ValueError):

@@ -11,6 +11,7 @@ from scipy import fft
 
 from recon.prep.axis_search import (
     AGREE,
+    FEWEST_COLS,
     AxisError,
     AxisEstimate,
     Floats,
@@ -53,9 +54,9 @@ def axis_from_sinogram(sinogram: NDArray[np.floating], angles: Floats, search: S
     if sinogram.ndim not in (2, 3) or theta.shape != sinogram.shape[:1]:
         raise ValueError(f"sinogram {sinogram.shape} must be [view, col] or [view, row, col] for angles {theta.shape}")
     data = few_rows(sinogram[:, None] if sinogram.ndim == 2 else sinogram)
-    if len(theta) < 4 or data.shape[2] < 8:
+    if len(theta) < 4 or data.shape[2] < FEWEST_COLS:
         raise ValueError(
-            f"{len(theta)} views of {data.shape[2]} columns are too few to find an axis; 4 of 8 are needed"
+            f"{len(theta)} views of {data.shape[2]} columns are too few to find an axis; 4 of {FEWEST_COLS} are needed"
         )
     if not (np.isfinite(data).all() and np.isfinite(theta).all()):
         raise ValueError("sinogram or angles hold NaN or infinite values; correct them first")

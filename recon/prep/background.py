@@ -15,11 +15,9 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 from recon.base.arrays import F32, F64, Mask
 from recon.base.noise import air_level
 
-HIGHEST = 3
-"""Order of the polynomials in column and row, at most."""
+HIGHEST = 3  # Order of the polynomials in column and row, at most
 
-LEAST_SIZE = 0.005
-"""Root mean square of the surfaces, in line integrals, from which on they are removed by default."""
+LEAST_SIZE = 0.005  # Root mean square of the surfaces, in line integrals, from which on they are removed by default
 
 _SMOOTH = 1.5  # voxels; smoothing raises weak matter above the noise
 _SIGMAS, _MARGIN = 5.0, 4  # standard deviations of the smoothed air; voxels around matter that count as matter

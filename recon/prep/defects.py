@@ -13,8 +13,7 @@ from recon.base.masks import NEIGHBOURS, Image
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
 _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and standard errors of its median
-SHADOW_REACH = 5
-"""Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row."""
+SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
 
 

@@ -22,6 +22,8 @@ from recon.prep.phase import HC
 
 _LEAST_KEV, _MOST_KEV = 0.1, 800.0
 _DECREMENT = 0.0004151791  # keV² cm³/mol: classical electron radius x (hc)² x Avogadro's number / 2 pi
+_ELECTRON_KEV = 510.99895
+_JOULE_PER_KEV = 1.602176634e-16
 _NODES = 513  # energies of a tube
 _SOFTEST_KEV, _NOTHING = 1.0, 1e-7  # a tube's lowest energy; the share of its light below which an energy is left out
 _LP30 = {"LiPF6": 151.9, "C3H4O3": 574.05, "C3H6O3": 574.05}  # g/l: 1 mol/l in equal masses of two carbonates
@@ -79,6 +81,26 @@ def mass_attenuation(name: str, energies: ArrayLike) -> F64:
     for z, share in _fractions(name).items():
         total += share * np.array([xraylib.CS_Total(z, float(energy)) for energy in e.flat])
     return total.reshape(e.shape)
+
+
+def absorbed_dose(name: str, energy_kev: float, photons_per_mm2: float) -> float:
+    """Gray at the surface that photons of one energy enter: fluence x energy x absorption of energy.
+
+    Absorbed are the energies of photoelectrons and of Compton electrons. Fluorescence counts as absorbed, which is too
+    much by up to a quarter just above an edge. Inside, the dose is less by the attenuation above. xraylib's own
+    coefficient (CS_Energy) is not used: for water at 20 keV it is 30 % below NIST's.
+
+    Raises:
+        ValueError: as `delta_beta`, or an energy outside 1 to 200 keV.
+    """
+    if not 1.0 <= energy_kev <= 200.0:
+        raise ValueError(f"a dose is known from 1 to 200 keV; got {energy_kev:g} keV")
+    kept = energy_kev / (_ELECTRON_KEV + 2.1 * energy_kev)  # mean share of a Compton electron, to 2 % (Klein-Nishina)
+    absorbed = sum(  # cm²/g
+        share * (xraylib.CS_Photo(z, energy_kev) + kept * xraylib.CS_Compt(z, energy_kev))
+        for z, share in _fractions(name).items()
+    )
+    return float(photons_per_mm2 * 1e2 * energy_kev * _JOULE_PER_KEV * absorbed * 1e3)
 
 
 def tube_spectrum(kv: float, filters: Mapping[str, float]) -> tuple[F64, F64]:

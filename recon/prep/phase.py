@@ -11,8 +11,7 @@ from scipy import fft
 
 from recon.base.arrays import F32
 
-HC = 1.239841984e-6
-"""keV mm: wavelength in mm times photon energy (CODATA 2018)."""
+HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
 _REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
 
 

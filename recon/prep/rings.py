@@ -224,23 +224,6 @@ def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
     return 4 * (rows * cols + _COPIES * (padded if rings == "wavelet" else views * cols))
 
 
-def ring_score(image: NDArray[np.floating], axis: tuple[float, float], width: int = 9) -> float:
-    """Rings of a slice: standard deviation of means along circles about the axis, less their median over `width` radii.
-
-    Args:
-        image: [y, x].
-        axis: (y, x) in voxels, on which the rings are centred.
-    """
-    y, x = np.indices(image.shape)
-    radius = np.rint(np.hypot(y - axis[0], x - axis[1])).astype(int)
-    reach = min(image.shape) // 2 - 2
-    inside = (radius < reach) & np.isfinite(image)
-    count = np.bincount(radius[inside], minlength=reach)
-    means = np.bincount(radius[inside], image[inside], minlength=reach) / np.maximum(count, 1)
-    off = (means - _around(means, width))[width:]  # short circles about the axis are structure
-    return float(off.std())
-
-
 def _noise(values: NDArray[np.floating]) -> float:
     """Standard deviation from view to view, robustly by second differences."""
     return float(_ROBUST * np.median(np.abs(np.diff(values, 2, axis=0))) / math.sqrt(6))

@@ -1,4 +1,4 @@
-"""find_tilt: the angle by which the rotation axis leans in the detector's plane, from its column in bands of rows."""
+"""find_tilt: how far the rotation axis leans in the detector's plane, from its column in bands of rows."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 
 from recon.base.arrays import F64
 from recon.prep.align import opposite_curves
+from recon.prep.axis_search import FEWEST_COLS
 from recon.prep.axis_wedge import wedge_curves
 
-STEEPEST = math.radians(5)
-"""Largest tilt of the search, radians."""
+STEEPEST = math.radians(5)  # Largest tilt of the search, radians
 FEWEST_BANDS = 4
 _DEEP = 0.2  # least difference of the logarithm of the mismatch between the found axes and typical ones
 _FLOOR = 1e-3  # least mismatch that counts
@@ -57,13 +57,15 @@ def find_tilt(bands: NDArray[np.floating], heights: F64, angles: F64) -> TiltEst
         angles: [view], radians.
 
     Raises:
-        ValueError: fewer than 4 bands, or bands that do not show the axis.
+        ValueError: fewer than 4 bands or 8 columns, or bands that do not show the axis.
     """
     data, heights = np.asarray(bands, np.float64), np.asarray(heights, np.float64)
     if data.ndim != 3 or heights.shape != data.shape[1:2] or len(angles) != len(data):
         raise ValueError(f"bands {data.shape} must be [view, band, col] for {heights.shape} heights")
     if not np.isfinite(data).all():
         raise ValueError("bands hold NaN or infinite values; correct them first")
+    if data.shape[2] < FEWEST_COLS:
+        raise ValueError(f"{data.shape[2]} columns show no axis; {FEWEST_COLS} are needed")
     if len(heights) < FEWEST_BANDS or not np.ptp(heights) > 0:
         raise ValueError(f"{len(heights)} bands of rows; {FEWEST_BANDS} at different heights are needed")
     for curves_of in (wedge_curves, opposite_curves):

@@ -15,7 +15,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import Filter, fbp, fbp_memory
 from recon.voxels.fdk import fdk
 from recon.voxels.posed_direct import posed_direct
-from recon.voxels.view_weights import covers_the_circle
+from recon.voxels.view_weights import missing_arc
 
 
 @dataclass(frozen=True)
@@ -75,5 +75,5 @@ def direct(
 
 
 def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: a cone must cover the full circle."""
-    return not geometry.is_cone or covers_the_circle(geometry.angles)
+    """Whether FBP or FDK takes these views: a cone needs a full circle, or a short scan (`missing_arc`)."""
+    return not geometry.is_cone or missing_arc(geometry) == 0

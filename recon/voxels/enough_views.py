@@ -145,5 +145,5 @@ class _ByTheNoise:
     iterations: int = _SWEEPS
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        weight = NoiseBalance.of(problem, x, modelled=False)
+        weight = NoiseBalance.of(problem, x, modelled=False, evenly=False)
         return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=_SUBSETS, tv_steps=_TV_STEPS)

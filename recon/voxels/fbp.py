@@ -23,15 +23,7 @@ from recon.base.choices import Filter as Filter
 from recon.base.geometry import Geometry
 from recon.base.slabs import bands_of, slices_of
 from recon.base.volume import Grid
-from recon.voxels.back_project import (
-    SLICES,
-    by_gridding,
-    columns_of,
-    gridding,
-    gridding_pays,
-    nanoseconds,
-    ray_by_ray,
-)
+from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, nanoseconds, ray_by_ray
 from recon.voxels.view_weights import ray_weights
 
 _VIEWS = 32  # filtered at a time

@@ -1,4 +1,4 @@
-"""Filtered back-projection of a cone beam over a full circle (Feldkamp, Davis & Kress 1984), in 1/mm."""
+"""Filtered back-projection of a cone beam (Feldkamp, Davis & Kress 1984), in 1/mm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.fbp import Filter, filter_projections
 from recon.voxels.projector import volume_slices
-from recon.voxels.view_weights import circle_weights, fan_shares
+from recon.voxels.view_weights import cone_weights
 
 F64 = NDArray[np.float64]
 
@@ -77,8 +77,8 @@ def fdk(
 
     Exact in the plane of the source. Above and below, values fall off with the square of the cone's angle, and flat
     interfaces across the axis blur. A full turn must see the whole width of the object, on one side of the axis or on
-    both (see `fan_shares`). Matter that it cuts off brightens the rim. A voxel that a view does not see gets nothing
-    from it.
+    both (see `fan_shares`). A short scan, of 180 degrees and the fan's angle or more, must see it in every view (see
+    `cone_weights`). Matter that views cut off brightens the rim. A voxel that a view does not see gets nothing from it.
 
     Args:
         projections: float32 [view, row, col], line integrals (dimensionless).
@@ -91,7 +91,7 @@ def fdk(
         float32 [z, y, x], 1/mm.
 
     Raises:
-        ValueError: for a parallel beam, rolled or tilted views, a short scan, or an unknown filter. Also for a shape
+        ValueError: for a parallel beam, rolled or tilted views, too short a scan, an unknown filter. Also for a shape
             that does not belong to the geometry, values that are not finite, or a box that reaches the source.
     """
     expected = (geometry.n_views, *geometry.detector_shape)
@@ -109,14 +109,14 @@ def fdk(
         raise ValueError(
             f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
         )
-    weights, (shares, (before, after)) = circle_weights(geometry.angles), fan_shares(geometry)
+    weights, (before, after) = cone_weights(geometry)
     z, y, x = grid.coordinates()
     rows, cols = geometry.detector_shape
     volume = np.zeros((y.size, x.size, z.size), np.float32)
     slab = max(1, _SLAB_BYTES // (4 * rows * cols))
     for start in range(0, geometry.n_views, slab):
         part = geometry.select(slice(start, start + slab))
-        rays = weights[start : start + slab, None] * shares
+        rays = weights[start : start + slab]
         prepared = _prepared(projections[start : start + slab], part, rays, (before, after), filter)
         if not np.isfinite(prepared).all():
             raise ValueError("projections hold NaN or infinite values; correct them before reconstruction")

@@ -8,13 +8,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
+from recon.base.noise import median_deviation
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import bregman, ordered_fista
 from recon.voxels.projector import Projector
+from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
 
 ONE_IN = 8  # views held out
@@ -28,6 +30,10 @@ _ROUNDS = 3  # of sweeps, at most
 _BREGMAN_TRIALS = 3
 MOST_SWEEPS = _ROUNDS * _AT_ONCE
 """Sweeps of a finish, where views held out prefer them."""
+_CONE_OCTAVES = 10
+_COARSE, _FEWEST_ROWS = 1.2, 4 * _ROWS  # voxels in pixels, from which on it pays; of fewer rows trials cost too much
+_AS_WELL = 1.03  # of the least residual: heavier weights, and less noise, at no loss (docs/choosing.md)
+_MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
 
 # Weights of the two runs of `bregman`, in that of one run. Then by how much the residual of views held out has to fall;
@@ -51,11 +57,35 @@ def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geom
     return views, replace(grid, shape=shape, centre=centre, slice_pitch=slab.spacing[0])
 
 
+def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
+    """So many rows in the middle of a cone, as a geometry, and the box that holds their rays.
+
+    None: views are displaced along the rows, or these rows show little of the matter in `data` [view, row, col].
+    """
+    first = round(geometry.axis_row - (height - 1) / 2)
+    rows = slice(first, first + height)
+    if np.abs(geometry.shifts[:, 1]).max() > 1 or first < 0 or rows.stop > geometry.detector_shape[0]:
+        return None
+    some = data[:: max(1, len(data) // 8)]
+    if np.abs(some[:, rows]).sum() < _ENOUGH * np.abs(some[:, busiest_rows(some, height)]).sum():
+        return None
+    # At the far side of the field.
+    tall = ((height + 1) * geometry.sample_pitch + 2 * geometry.lean) * (1 + geometry.reach / geometry.sod)
+    slices = math.ceil(tall / grid.spacing[0])
+    box = replace(grid, shape=(slices, *grid.shape[1:]), centre=(0.0, *grid.centre[1:]))
+    return rows, geometry.rows(rows.start, rows.stop), box
+
+
 def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Views to reconstruct from, and one of so many to judge by, evenly spread in angle."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
+
+
+def beyond_chance(gains: F64, errors: float) -> bool:
+    """The mean of gains [view held out] is more than so many of its standard errors, by their scatter."""
+    return float(gains.mean()) > errors * float(gains.std(ddof=1)) / math.sqrt(gains.size)
 
 
 def busiest_rows(data: F32, height: int) -> slice:
@@ -89,13 +119,17 @@ def _can_hold_out(geometry: Geometry) -> bool:
 
 
 def choose_weight(
-    problem: VoxelProblem, start: F32, *, modelled: bool, unmodelled: float | None = None
+    problem: VoxelProblem, start: F32, *, modelled: bool, unmodelled: float | None = None, of_cones: bool = False
 ) -> NoiseBalance | float:
-    """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`."""
+    """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`.
+
+    `of_cones`: views of a cone are held out, too.
+    """
 
     def chosen() -> list[float]:
         balance = NoiseBalance.of(problem, start, modelled, unmodelled)
-        found = preferred_weight(problem, balance.first) if unmodelled is None else None
+        judged = heaviest_weight if of_cones and problem.projector.geometry.is_cone else preferred_weight
+        found = judged(problem, balance.first) if unmodelled is None else None
         return [balance.first, balance.noise] if found is None else [found]
 
     first, *noise = problem.decide("weight", chosen)
@@ -132,6 +166,34 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     curvature = lighter - 2 * here + heavier
     vertex = (lighter - heavier) / (2 * curvature) if min(lighter, heavier) > here else 0.0
     return float(first * 2 ** (best + vertex))
+
+
+def heaviest_weight(problem: VoxelProblem, first: float) -> float | None:
+    """The heaviest weight of a cone, in octaves from `first`, that predicts views held out nearly as well as the best.
+
+    Coarse voxels cannot explain edges of the views. A volume that tries has ripples, which views held out hardly show.
+    Their residual is flat over two octaves, and the best volume lies at the heavy end. The residual is the median
+    deviation on rays through matter; the root mean square would be that of edges. Volumes are of the middle rows.
+
+    None where `first` is as good as any, and as `preferred_weight`. Also where voxels are as fine as pixels, rows are
+    few, or the middle ones show little matter: a fan took nine times as long, and had the same weight.
+    """
+    geometry, grid = problem.projector.geometry, problem.projector.grid
+    pays = grid.voxel_size >= _COARSE * geometry.sample_pitch and geometry.detector_shape[0] >= _FEWEST_ROWS
+    pays = pays and geometry.n_views >= LEAST_VIEWS and first > 0
+    trial = _Trial.of_cone(problem) if pays and problem.trial_goes_on() else None
+    if trial is None:
+        return None
+    least, heaviest = math.inf, None
+    for octave in range(_CONE_OCTAVES):
+        error = trial(first * 2.0**octave)
+        if math.isinf(error):  # the trials were ended
+            return None
+        least = min(least, error)
+        if error > _AS_WELL * least:
+            break
+        heaviest = octave
+    return first * 2.0**heaviest if heaviest else None
 
 
 def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
@@ -192,8 +254,17 @@ class _Trial:
         """The trial of the rows with most matter, from those slices of `start` [y, x, z]; None: from FBP."""
         geometry, grid = problem.projector.geometry, problem.projector.grid
         rows = busiest_rows(problem.data.swapaxes(1, 2), _ROWS)
-        views, box = slab_of(geometry, grid, rows.start, rows.stop)
+        return cls._of_rows(problem, rows, *slab_of(geometry, grid, rows.start, rows.stop), start)
 
+    @classmethod
+    def of_cone(cls, problem: VoxelProblem) -> _Trial | None:
+        """The trial of the middle rows, from their FDK; None as `middle_of_cone`."""
+        geometry, grid = problem.projector.geometry, problem.projector.grid
+        found = middle_of_cone(geometry, grid, problem.data.swapaxes(1, 2), _ROWS)
+        return None if found is None else cls._of_rows(problem, *found, None)
+
+    @classmethod
+    def _of_rows(cls, problem: VoxelProblem, rows: slice, views: Geometry, box: Grid, start: F32 | None) -> _Trial:
         def of_views(chosen: NDArray[np.intp]) -> VoxelProblem:
             def cut(rays: F32) -> F32:
                 return np.ascontiguousarray(rays[chosen][:, :, rows])
@@ -208,12 +279,14 @@ class _Trial:
                 decide=Decisions(),
             )
 
-        seen, unseen = split_views(geometry)
+        seen, unseen = split_views(views)
         trial = of_views(seen)
         if start is not None:
             return cls(trial, np.ascontiguousarray(start[:, :, rows]), of_views(unseen))
         first = trial.filtered("hann")
-        assert first is not None  # views of a parallel beam
+        if first is None:  # no direct method takes these views
+            depth, height, width = box.shape
+            first = np.zeros((height, width, depth), np.float32)
         return cls(trial, np.maximum(first, 0, out=first), of_views(unseen))
 
     def _go_on(self, sweep: int, residual: float) -> bool:
@@ -233,9 +306,15 @@ class _Trial:
         return math.inf if self._ended else self.error(x)
 
     def error(self, x: F32) -> float:
-        """Root mean square of what slices [y, x, z] leave of the views held out; infinite where these weigh nothing."""
+        """Root mean square of what slices [y, x, z] leave of the views held out; infinite where these weigh nothing.
+
+        Of a cone: the median deviation, on rays through matter.
+        """
         if self._unseen.weight is not None and not self._unseen.weight.any():
             return math.inf
         left = self._unseen.projector.forward_lines(x)
         left -= self._unseen.data
+        if self._unseen.projector.geometry.is_cone:
+            matter = self._unseen.data > _MATTER * np.percentile(self._unseen.data, 99)
+            return median_deviation(whitened(left, self._unseen.weight)[matter]) or math.inf
         return math.sqrt(float(np.average(np.square(left, dtype=np.float64), weights=self._unseen.weight)))

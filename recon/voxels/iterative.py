@@ -16,6 +16,7 @@ from dataclasses import fields, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numba import get_num_threads, set_num_threads
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
@@ -24,6 +25,8 @@ from recon.base.method import MethodResult, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.voxel_problem import VoxelProblem
+
+_SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait for each other more than they work
 
 
 @runtime_checkable
@@ -35,7 +38,6 @@ class IterativeMethod(Protocol):
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
-        ...
 
 
 def solve(
@@ -63,7 +65,7 @@ def solve(
         on_iteration: called with each iteration's number, from 1, and ||A x - p|| / ||p|| (rays weighed) before its
         correction; the volume afterwards is better. CGLS, ASD-POCS: of the volume afterwards. The iterations end
         if it returns something true.
-        on_trial: called after each sweep of a trial, by which a method chooses its weight on some rows. If it returns
+        on_trial: called after each sweep of a trial; trials on some rows choose a method's weight. If it returns
         something true, the trials end, and the iterations follow.
         decide: keeps decisions that follow from the whole data, and has the seed of the order of views and subsets.
 
@@ -92,7 +94,13 @@ def solve(
         decide,
         lambda: on_trial is None or not on_trial(),
     )
-    found = method.iterate(problem, lines)
+    threads = get_num_threads()
+    try:
+        if projector.grid.shape[0] == 1:
+            set_num_threads(max(1, min(threads, lines.size // _SHARE)))
+        found = method.iterate(problem, lines)
+    finally:
+        set_num_threads(threads)
     return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
 
 

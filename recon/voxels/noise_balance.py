@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.noise import median_deviation, noise_level
+from recon.base.noise import median_deviation, noise_beside_structure, noise_level
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.sweeps import whitened
 from recon.voxels.tv import difference_weights
@@ -33,7 +33,6 @@ _KNOWN_BEFORE = 2.5
 # Where only the residual shows it: what it adds to the weight and the largest factor, chosen by eye. A tooth with rings
 # gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A battery in a field too narrow, with a black
 # band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
-_SETTLED = 3  # sweeps after which the residual is looked at
 _FOUND, _MOST_BY_FOUND = 1.75, 5.0
 _TOO_NOISY = 1.5  # times a model's residual: larger "noise" is fine structure
 
@@ -46,20 +45,23 @@ class NoiseBalance:
     of a ray: as if each voxel's change were drawn from a Laplace distribution of the mean change. After each sweep it
     is the first weight times (σ / s)³, at most four times it, where s is the noise-like part of the residual. It rises
     where the residual has less noise than the data, since then the volume has taken it up. Rings and errors of the
-    geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So from the third
-    sweep on the weight is 1 + 1.75² ((s / σ)² - 1.05²) times the first, at most five times. Here s is the least so far,
-    so that the weight only falls.
+    geometry or of the air, which no volume explains, make s large and bend the volume as noise does. So from sweep
+    `settled` on the weight is 1 + 1.75² ((s / σ)² - 1.05²) times the first, at most five times. Here s is the least so
+    far, so that the weight only falls.
 
     Attributes:
         first: the weight to begin with.
-        noise: of a ray, with which the residual is compared: `noise_level` of the data. For many views it is up to 1.3
-            times that (π / 2 times the columns determine a slice). Then little of the noise fits into a volume.
+        noise: of a ray, with which the residual is compared: `noise_beside_structure` of the data. For many views it is
+            up to 1.3 times that (π / 2 times the columns determine a slice). Then little of it fits into a volume.
         counted: what no volume explains was known before, and is in the first weight.
+        settled: sweeps after which the residual is looked at. Before, a method that has not converged seems to leave
+            what no volume explains. Then the weight would be too heavy, and the residual large, up to the end.
     """
 
     first: float
     noise: float
     counted: bool = False
+    settled: int = 3
     value: float = field(init=False)
     _sweeps: int = field(default=0, init=False)
     _least: float = field(default=math.inf, init=False)
@@ -68,7 +70,9 @@ class NoiseBalance:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, modelled: bool, unmodelled: float | None = None) -> NoiseBalance:
+    def of(
+        cls, problem: VoxelProblem, start: F32, modelled: bool, unmodelled: float | None = None, evenly: bool = True
+    ) -> NoiseBalance:
         """For a problem that starts from the volume `start` [y, x, z], not zero.
 
         Args:
@@ -76,9 +80,11 @@ class NoiseBalance:
                 structure, or a scan of few rows, makes too large.
             unmodelled: standard deviation of what no voxels explain of the views, in units of the noise, where it is
                 known. It is large at few rays, so that the first weight rises with its square.
+            evenly: evenly spread views may tell noise from structure. Without it the noise of few and of many of the
+                views is alike.
         """
         data = whitened(problem.data, problem.weight)
-        noise = noise_level(data)
+        noise = noise_beside_structure(data, problem.projector.geometry) if evenly else noise_level(data)
         if modelled:
             left = whitened(problem.data - problem.projector.forward_lines(start), problem.weight)
             noise = min(noise, _TOO_NOISY * noise_level(left))
@@ -98,7 +104,7 @@ class NoiseBalance:
             return self.value
         self._least = min(self._least, deviation / self.noise)
         factor = float(np.clip((self.noise / deviation) ** _POWER, 1.0, _MOST))
-        if self._sweeps >= _SETTLED and not self.counted and self._least > EXPLAINED:
+        if self._sweeps >= self.settled and not self.counted and self._least > EXPLAINED:
             factor = min(1 + _FOUND**2 * (self._least**2 - EXPLAINED**2), _MOST_BY_FOUND)
         self.value = self.first * factor
         return self.value

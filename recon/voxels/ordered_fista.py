@@ -24,13 +24,7 @@ _LEAST_VIEWS = 12  # least views of a subset: fewer have other eigenvectors than
 
 
 def ordered_fista(
-    problem: VoxelProblem,
-    x: F32,
-    weight: NoiseBalance | float,
-    *,
-    sweeps: int,
-    subsets: int,
-    tv_steps: int,
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, *, sweeps: int, subsets: int, tv_steps: int
 ) -> F32:
     """min ½||A x - p||² + μ TV(x), x >= 0, by steps from a subset of the views each, with momentum and restarts.
 

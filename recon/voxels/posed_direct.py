@@ -21,7 +21,7 @@ from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.fbp import Filter, ramp
 from recon.voxels.projector import volume_slices
-from recon.voxels.view_weights import circle_weights, fan_shares, ray_weights
+from recon.voxels.view_weights import cone_weights, ray_weights
 
 _f = np.float32
 _SLAB_BYTES = 128 * 2**20  # filtered views held at a time
@@ -82,11 +82,7 @@ def posed_direct(
         raise ValueError(
             f"the box reaches {reach:.4g} mm from the rotation axis, the source stands at {geometry.sod:.4g}"
         )
-    if geometry.is_cone:
-        shares, zeros = fan_shares(geometry)
-        weights = circle_weights(geometry.angles)[:, None] * shares
-    else:
-        weights, zeros = ray_weights(geometry)
+    weights, zeros = cone_weights(geometry) if geometry.is_cone else ray_weights(geometry)
     weights = weights * np.cos(geometry.tilt)[:, None]
     z, y, x = grid.coordinates()
     rows, cols = geometry.detector_shape

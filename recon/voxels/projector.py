@@ -27,6 +27,7 @@ from recon.base.slabs import bands_of
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu import cone as cone_cpu
 from recon.kernels.cpu import joseph as joseph_cpu
+from recon.kernels.cpu import one_slice as one_slice_cpu
 from recon.kernels.cpu import posed as posed_cpu
 from recon.kernels.cpu.lines import rows_from_slices, slices_from_rows, swap_last
 from recon.kernels.cpu.spread import spread
@@ -40,10 +41,11 @@ _MOST_LOOKS = 16
 
 
 class _Rays(NamedTuple):
-    """Rays of all views at one moment of their exposures, through a band of slices: `joseph` or `posed.ray_table`."""
+    """Rays of all views at one moment of their exposures, through a band of slices: the kernels' `ray_table`."""
 
     table: NDArray[np.float64]
     axes: NDArray[Any]  # of the planes that sample each ray, as the kernels count them
+    views: NDArray[np.float64] = np.empty(0)  # of a cone
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +70,8 @@ class Projector:
                 f"the box reaches {reach:.4g} mm from the rotation axis, but the source stands at "
                 f"{self.geometry.sod:.4g} mm: give a smaller grid"
             )
-        kernels = joseph_cpu if self.geometry.is_straight else posed_cpu
         found = [
-            (band, [_Rays(*kernels.ray_table(at, self.grid)) for at in views_of_exposure(views)])
+            (band, [self._rays(at) for at in views_of_exposure(views)])
             for band, views in bands_of(self.geometry, self.grid)
         ]
         object.__setattr__(self, "_bands", found)
@@ -133,21 +134,31 @@ class Projector:
             if not whole:
                 out[..., band] = found
 
+    def _rays(self, views: Geometry) -> _Rays:
+        if not self.geometry.is_straight:
+            return _Rays(*posed_cpu.ray_table(views, self.grid))
+        kernels = cone_cpu if self.geometry.is_cone else joseph_cpu
+        return _Rays(*kernels.ray_table(views, self.grid))
+
     def _look(self, volume: F32, rays: _Rays, out: F32) -> None:
         if not self.geometry.is_straight:
-            posed_cpu.forward(volume, *rays, out)
+            posed_cpu.forward(volume, *rays[:2], out)
+        elif self._in_one_slice():
+            one_slice_cpu.forward(volume[:, :, 0], *rays[:2], out[:, :, 0])
         elif self.geometry.is_cone:
-            cone_cpu.forward(volume, *rays, *self._heights(), self.geometry.pixel_pitch, out)
+            cone_cpu.forward(volume, *rays, out)
         else:
-            joseph_cpu.forward(volume, *rays, out)
+            joseph_cpu.forward(volume, *rays[:2], out)
 
     def _look_back(self, projections: F32, rays: _Rays, out: F32) -> None:
         if not self.geometry.is_straight:
-            posed_cpu.adjoint(projections, *rays, out)
+            posed_cpu.adjoint(projections, *rays[:2], out)
+        elif self._in_one_slice():
+            one_slice_cpu.adjoint(projections[:, :, 0], *rays[:2], out[:, :, 0])
         elif self.geometry.is_cone:
-            cone_cpu.adjoint(projections, *rays, *self._heights(), self.geometry.pixel_pitch, out)
+            cone_cpu.adjoint(projections, *rays, out)
         else:
-            joseph_cpu.adjoint(projections, *rays, out)
+            joseph_cpu.adjoint(projections, *rays[:2], out)
 
     def _spread(self, lines: F32) -> F32:
         """Lines [view, col, row] with the width of a pixel; its own transpose."""
@@ -166,6 +177,13 @@ class Projector:
         rows, middle = self._heights()
         step = self.geometry.pixel_pitch / self.grid.spacing[0]
         return middle - rows * step, step
+
+    def _in_one_slice(self) -> bool:
+        """All rays of straight views run in the plane of the only slice: a parallel beam, or a fan."""
+        if self.grid.shape[0] > 1 or not self.geometry.is_cone:
+            return self.grid.shape[0] == 1
+        rows, middle = self._heights()
+        return self.geometry.detector_shape[0] == 1 and middle == 0 and not rows.any()
 
     def _to_rows(self) -> bool:
         """The kernels give rows of the detector, not lines of slices: each ray has a height of its own, or slice k lies

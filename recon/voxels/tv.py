@@ -14,12 +14,7 @@ def difference_weights(grid: Grid) -> tuple[float, float, float]:
     return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
 
 
-_TURNS: tuple[tuple[int, ...], ...] = (
-    (),
-    (1, 2),
-    (0, 2),
-    (0, 1),
-)  # axes that are reversed: four mirror images, in turn
+_TURNS: tuple[tuple[int, ...], ...] = (), (1, 2), (0, 2), (0, 1)  # axes that are reversed: four mirror images
 
 
 class TotalVariationProx:
@@ -33,15 +28,20 @@ class TotalVariationProx:
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
-        self._dual = np.zeros((3, *shape), np.float32)
-        self._scratch = tv_cpu.dual_scratch(shape)
-        self._weights, self._nonnegative, self._steps = weights, nonnegative, steps
+        # Of one slice the kernels see [y, z, x]: the last axis is the vector's.
+        self._order = (0, 2, 1) if shape[2] == 1 else (0, 1, 2)
+        self._shape = (shape[self._order[0]], shape[self._order[1]], shape[self._order[2]])
+        self._dual = np.zeros((3, *self._shape), np.float32)
+        self._scratch = tv_cpu.dual_scratch(self._shape)
+        self._weights = (weights[self._order[0]], weights[self._order[1]], weights[self._order[2]])
+        self._nonnegative, self._steps = nonnegative, steps
         self._turn = 0
 
     def __call__(self, x: F32, threshold: float) -> None:
         """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
+        x = x.reshape(self._shape)
         if threshold > 0:
-            reversed_axes = _TURNS[self._turn]
+            reversed_axes = self._reversed(_TURNS[self._turn])
             tv_cpu.mirror(x, reversed_axes)
             for _ in range(self._steps):
                 tv_cpu.dual_step(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch)
@@ -56,6 +56,11 @@ class TotalVariationProx:
         The differences, which the dual field holds, stay: only which three of them belong to a voxel changes.
         """
         before, self._turn = self._turn, (self._turn + 1) % len(_TURNS)
-        axes = tuple(set(_TURNS[before]) ^ set(_TURNS[self._turn]))
+        axes = self._reversed(tuple(set(_TURNS[before]) ^ set(_TURNS[self._turn])))
         for axis, part in enumerate(self._dual):
-            tv_cpu.mirror(part, axes, axis)
+            if self._shape[axis] > 1:  # else there are no differences
+                tv_cpu.mirror(part, axes, axis)
+
+    def _reversed(self, axes: tuple[int, ...]) -> tuple[int, ...]:
+        """These axes of (y, x, z), of more than one voxel, as the kernels number them."""
+        return tuple(at for at in map(self._order.index, axes) if self._shape[at] > 1)

@@ -11,6 +11,7 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.noise import ring_offsets
+from recon.base.slabs import part_of
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
@@ -64,30 +65,30 @@ def unexplained(
     Returns:
         None for cones, rolled or tilted views, fewer than 16 views, other slices, or a volume without matter.
     """
-    rows, same = geometry.detector_shape[0], volume.grid == Grid.matching(geometry)
+    slices, same = volume.grid.shape[0], volume.grid == Grid.matching(geometry)
     if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
         return None
-    n = _looked_at(geometry)
+    n = min(_looked_at(geometry), slices)
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
-    middle = round(float(mass @ np.arange(rows) / mass.sum())) if mass.any() else 0
-    first = min(max(middle - n // 2, 0), rows - n)
-    views = geometry.rows(first, first + n)
-    part = Volume(np.ascontiguousarray(volume.data[first : first + n]), Grid.matching(views))
+    middle = round(float(mass @ np.arange(slices) / mass.sum())) if mass.any() else 0
+    first = min(max(middle - n // 2, 0), slices - n)
+    rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
+    part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _MATTER * float(np.percentile(part.data, 99))
     matter = np.stack([binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not matter.any():
         return None
-    left = projections[:, first : first + n] - Projector(views, part.grid).forward(part.data)
+    left = projections[:, rows] - Projector(views, part.grid).forward(part.data)
     unseen = np.broadcast_to(~seen_rays(views, part.grid), left.shape)
     if weights is not None:
-        unseen = unseen | (weights[:, first : first + n] == 0)
+        unseen = unseen | (weights[:, rows] == 0)
     left[unseen] = 0
     left -= ring_offsets(left)
     left[unseen] = 0
 
     signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))
     kinds = np.stack([np.ones_like(signs), *(rng.permutation(signs) for _ in range(_FLIPS))])
-    first_kind, *flipped = _fbp_of_each(left, kinds, views)
+    first_kind, *flipped = _fbp_of_each(left, kinds, views, box)
     found, variance = _smoothed(first_kind), np.zeros(part.grid.shape, np.float32)
     for images in flipped:
         variance += _smoothed(images) ** 2 / _FLIPS
@@ -113,15 +114,16 @@ def _smoothed(images: F32) -> F32:
     return gaussian_filter(images, (0, _SMOOTH, _SMOOTH))
 
 
-def _fbp_of_each(residual: F32, signs: F32, views: Geometry) -> list[F32]:
-    """Slices of the residual times each row of signs [kind, view].
+def _fbp_of_each(residual: F32, signs: F32, views: Geometry, box: Grid) -> list[F32]:
+    """The slices of the box, of the residual times each row of signs [kind, view].
 
     If views do not move along the axis, all are slices of one volume, which takes less time.
     """
     rows, cols = views.detector_shape
     kinds = len(signs)
     if views.shifts[:, 1].any():
-        return [fbp(np.asarray(residual * sign[:, None, None], np.float32), views, filter="hann") for sign in signs]
+        signed = (np.asarray(residual * sign[:, None, None], np.float32) for sign in signs)
+        return [fbp(data, views, box, filter="hann") for data in signed]
     views = views.at_row((rows - 1) / 2)
     stacked = replace(views, detector_shape=(kinds * rows, cols), axis_row=(kinds * rows - 1) / 2)
     data = np.multiply(residual[:, None], signs.T[:, :, None, None], dtype=np.float32).reshape(-1, kinds * rows, cols)

@@ -67,8 +67,7 @@ def circle_weights(angles: ArrayLike) -> F64:
         angles: [view], radians, any order and range; equal ones share their cell.
 
     Raises:
-        ValueError: for no angles, some that are not finite, or a missing arc (short scans need other weights:
-            Parker 1982).
+        ValueError: for no angles, some that are not finite, or a missing arc.
     """
     theta = np.mod(np.asarray(angles, np.float64).ravel(), 2 * np.pi)
     if theta.size < 2 or not np.isfinite(theta).all():
@@ -76,8 +75,8 @@ def circle_weights(angles: ArrayLike) -> F64:
     order, gaps = _gaps(theta)
     if _leave_an_arc(gaps):
         raise ValueError(
-            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; FDK needs the full circle: use an "
-            "iterative method (os-sirt-tv, sirt) for a short scan"
+            f"the angles leave a gap of {np.rad2deg(gaps.max()):.4g} degrees; these weights are of the full circle: "
+            "`cone_weights` has those of a short scan"
         )
     weights = np.empty_like(theta)
     weights[order] = (gaps + np.roll(gaps, 1)) / 2
@@ -124,6 +123,70 @@ def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     axis = np.array([geometry.axis_col + geometry.shifts[:, 0].mean()])
     share, beyond = _shares(cols, axis, axis)
     return share[0], beyond
+
+
+def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
+    """Quadrature weight of each ray of a cone, in radians, on a detector made wider by some columns of zeros.
+
+    A full circle: `circle_weights` times `fan_shares`. A short scan, from 180 degrees and the fan's angle on: the two
+    measurements of a ray share its weight. One share rises smoothly as the other one falls (Parker 1982). A longer arc
+    spreads this over all of it (Silver 2000, Med. Phys. 27, 773).
+
+    Returns:
+        [view, col], and the columns of zeros to add before and after these.
+
+    Raises:
+        ValueError: no view sees some rays of the field.
+    """
+    if covers_the_circle(geometry.angles):
+        shares, beyond = fan_shares(geometry)
+        return circle_weights(geometry.angles)[:, None] * shares, beyond
+    order, beta, cells = _arc(geometry.angles)
+    lacking = missing_arc(geometry)
+    if lacking > 0:
+        raise ValueError(
+            f"the angles leave a gap: {np.rad2deg(lacking):.4g} degrees more are needed, or some rays of the field are "
+            "seen by no view. FDK takes a full circle, or a short scan of 180 degrees and the angle of the fan: use an "
+            "iterative method (fista-tv, sirt)"
+        )
+    arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]
+    most = (arc - np.pi) / 2
+    rise = np.clip(beta[:, None] / (most - gamma), 0, 2)
+    fall = np.clip((arc - beta[:, None]) / (most + gamma), 0, 2)
+    weights = np.empty_like(gamma)
+    weights[order] = (np.sin(np.pi / 4 * rise) * np.sin(np.pi / 4 * fall)) ** 2 * cells[:, None]
+    return weights, (0, 0)
+
+
+def missing_arc(geometry: Geometry) -> float:
+    """Radians that the views of a cone lack, so that each ray of the field in the plane of the source is seen.
+
+    0 for a short scan that suffices. Infinite where views leave more than one gap.
+    """
+    if covers_the_circle(geometry.angles):
+        return 0.0
+    _, beta, cells = _arc(geometry.angles)
+    if beta.size < 3 or np.diff(beta).max() > _GAP_LIMIT * np.median(np.diff(beta)):
+        return math.inf
+    return max(0.0, np.pi + 2 * float(np.abs(_fan_angles(geometry)).max()) - float(cells.sum()))
+
+
+def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
+    """The order of views from behind the widest gap on, their angles from half a step before the first, their cells."""
+    theta = np.mod(angles, 2 * np.pi)
+    order, gaps = _gaps(theta)
+    order = np.roll(order, -1 - int(np.argmax(gaps)))
+    beta = np.mod(theta[order] - theta[order[0]], 2 * np.pi)
+    steps = np.diff(beta)
+    ends = float(np.median(steps)) if steps.size else 0.0
+    steps = np.concatenate(([ends], steps, [ends]))
+    return order, beta + ends / 2, (steps[1:] + steps[:-1]) / 2
+
+
+def _fan_angles(geometry: Geometry) -> F64:
+    """Angle of each column's rays to the beam's axis [view, col], radians."""
+    u = np.arange(geometry.detector_shape[1]) - geometry.axis_col - geometry.shifts[:, :1]
+    return np.arctan(u * geometry.pixel_pitch / geometry.sdd)
 
 
 def _shares(cols: int, axis: F64, opposite: F64) -> tuple[F64, tuple[int, int]]:

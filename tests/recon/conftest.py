@@ -1,4 +1,4 @@
-"""Small random sets of Gaussians, shared by the tests of the splatting engine."""
+"""Small random sets of Gaussians, and few noisy views of a sample."""
 
 from __future__ import annotations
 
@@ -9,6 +9,10 @@ import pytest
 
 from recon.base.kernel import Kernel
 from recon.splatting.gaussians import Gaussians
+from simulators.frame.detector import Detector
+from simulators.samples.bodies.phantom import Phantom
+from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+from tests.recon.few_views import ANGLES, PITCH, SHAPE, VIEWS
 
 Make = Callable[..., Gaussians]
 
@@ -34,3 +38,17 @@ def random_gaussians(rng: np.random.Generator) -> Make:
         )
 
     return make
+
+
+@pytest.fixture(scope="module")
+def phantom() -> Phantom:
+    return Phantom.of((Cylinder(1.3, 1.6, 0.4), Ellipsoid((0.4, 0.3, 0.4), 1.0, centre=(0.5, 0.3, 0.1))))
+
+
+@pytest.fixture(scope="module")
+def noisy(phantom: Phantom) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    detector = Detector(SHAPE, PITCH, VIEWS.axis_col, (SHAPE[0] - 1) / 2)
+    clean = np.stack([phantom.line_integrals(a, detector) for a in ANGLES])
+    counts = rng.poisson(2e4 * np.exp(-clean))
+    return -np.log(np.maximum(counts, 1) / 2e4).astype(np.float32)

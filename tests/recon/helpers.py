@@ -1,10 +1,15 @@
-"""Gaussians as leaves of a graph, for gradient comparisons."""
+"""Gaussians as leaves of a graph, for gradient comparisons; and many steps of a fit."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.optimise import FitState, step
+from recon.splatting.problem import FitProblem
+from recon.splatting.settings import FitSettings
 
 
 def in_double(gaussians: Gaussians) -> Gaussians:
@@ -34,3 +39,18 @@ def gradients(gaussians: Gaussians) -> dict[str, torch.Tensor]:
         "raw_densities": gaussians.raw_densities,
     }
     return {name: tensor.grad.double().cpu() for name, tensor in named.items() if tensor.grad is not None}
+
+
+def run_steps(
+    state: FitState,
+    problem: FitProblem,
+    settings: FitSettings,
+    steps: int,
+    on_step: Callable[[FitState], bool] | None = None,
+) -> FitState:
+    """`steps` steps on a full schedule; `on_step` may end it early by returning True."""
+    for k in range(steps):
+        step(state, problem, settings, k / max(1, steps))
+        if on_step is not None and on_step(state):
+            break
+    return state

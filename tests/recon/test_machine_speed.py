@@ -19,7 +19,7 @@ TURN = np.linspace(0, 2 * np.pi, 40, endpoint=False)
 BEAMS = {
     "parallel": Geometry.parallel(TURN / 2, SHAPE, 0.1),
     "cone": Geometry.cone(TURN, SHAPE, 1.0, 30.0, 300.0),
-    "short scan of a cone": Geometry.cone(TURN * 0.6, SHAPE, 1.0, 30.0, 300.0),
+    "short scan of a cone": Geometry.cone(TURN * 0.45, SHAPE, 1.0, 30.0, 300.0),
     "leaning": Geometry.parallel(TURN / 2, SHAPE, 0.1, tilt=0.1),
 }
 

@@ -44,6 +44,19 @@ def test_iterations_cost_by_voxels_and_views(monkeypatch: pytest.MonkeyPatch) ->
         assert found == pytest.approx(1e-6 * cols**2 * (rows * (10 + 40 * (5 + views)) + 50 * views))
 
 
+def test_a_neural_field_costs_by_its_steps_and_slabs_and_ends_by_its_seconds() -> None:
+    """By a clock that counts how often it is asked: each small run takes one, a step a twelfth of that."""
+
+    def seconds(heights: list[int], **settings: Any) -> float:
+        method = recon.NAF(rays=8, samples=4, levels=1, **settings)
+        return run_seconds(method, Extent(108, 128, heights), itertools.count().__next__)
+
+    volume = 1.0  # of sixteen rows
+    assert seconds([16], steps=1200) == pytest.approx(100 + volume)
+    assert seconds([8, 8], steps=1200) == pytest.approx(200 + volume)
+    assert seconds([16], steps=1200, seconds=5.0) == pytest.approx(5 + volume)
+
+
 def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where deciding takes 4 s of a small run, whatever its size."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from operator import contains
 
@@ -10,9 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.base.method import DataUse, ReconProblem
-from recon.trials import Score, best_of, part_of
+from recon.base.geometry import Geometry
+from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.volume import Grid
+from recon.trials import Score, best_of, part_of, predicts_best
 from recon.voxels.direct import Fbp
+from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -72,3 +76,41 @@ def test_what_loses_weak_matter_is_taken_only_where_all_do(losing: tuple[int, ..
     scores = [Score(i, Fbp(), np.full(9, r), loses=i in losing) for i, r in enumerate((1.0, 1.5, 2.0))]
     taken, passed = best_of(scores)
     assert taken.at == best and {at for at, why in passed.items() if why == "loses weak matter"} == set(losing)
+
+
+def _dense_and_weak(haze: float) -> ReconProblem:
+    """A dense rod in the upper rows and a weak one in the lower rows, in views that lack `haze`."""
+    views = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (160, 64), 0.01)
+    grid = Grid.matching(views)
+    z, y, x = (np.arange(n) - (n - 1) / 2 for n in grid.shape)
+    away = (y[:, None] ** 2 + x**2)[None]
+    dense = (away < 22**2) & (np.abs(z + 35) < 35)[:, None, None]
+    weak = (away < 12**2) & (np.abs(z - 45) < 15)[:, None, None]
+    data = Projector(views, grid).forward((5 * dense + 0.8 * weak).astype(np.float32))
+    noise = np.random.default_rng(0).normal(-haze, 0.01, data.shape)
+    return ReconProblem(data + noise.astype(np.float32), views, grid, DataUse(), 0, "cpu")
+
+
+def test_trials_see_the_weakest_rows_beside_the_fullest_ones() -> None:
+    problem = _dense_and_weak(0.0)
+    part, where = part_of(problem)
+    assert part is not None and part.projections.shape[1] == part.grid.shape[0] == 40
+    (full, weak) = [slice(*map(int, said.split(" to "))) for said in where.removeprefix("rows ").split(" and ")]
+    assert full.stop < 80 and weak.start >= 110 and weak.stop < 140
+    np.testing.assert_array_equal(part.projections[:, :32], problem.projections[:, full.start : full.stop + 1])
+    np.testing.assert_array_equal(part.projections[:, 32:], problem.projections[:, weak.start : weak.stop + 1])
+
+
+def test_rows_without_beam_are_not_the_weakest() -> None:
+    problem = _dense_and_weak(0.0)
+    weights = np.ones_like(problem.projections)
+    weights[:, 108:132] = 0  # of the weak rod's rows 110 to 139
+    part, where = part_of(replace(problem, use=DataUse(weights)))
+    assert part is not None and part.use.weights is not None and part.use.weights.all(), where
+
+
+def test_a_method_that_loses_the_weak_rows_is_passed_over() -> None:
+    part, _ = part_of(_dense_and_weak(0.1))
+    assert part is not None
+    at, said = predicts_best(part, [FistaTv(), Fbp()], RunControl())
+    assert at == 1 and "loses weak matter" in said

@@ -14,7 +14,8 @@ from recon import warm_up as module
 from recon.base.choices import KERNEL
 from recon.base.geometry import Geometry
 from recon.kernels.cpu import activation, adam, footprints, joseph, losses, project, tv, voxelize
-from recon.voxels.view_weights import covers_the_circle
+from recon.voxels.direct import Fbp
+from recon.voxels.view_weights import missing_arc
 from recon.warm_up import toy_of, warm_up, warm_up_rest
 
 # In a process of its own: here, other tests have compiled most of it. All kernels that numba knows of are counted.
@@ -58,7 +59,7 @@ views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, 0.5, tilt=tilt, shi
     "cone": "views = recon.Geometry.cone(np.linspace(0, 6, 12), shape, 0.2, 20.0, 40.0)",
     "cone, a short scan, rolled, exact rays": """
 loss, rays = "l2", RayModel(exact_above=1e-4)
-views = recon.Geometry.cone(np.linspace(0, 3.6, 12), shape, 0.2, 20.0, 40.0, roll=0.02)
+views = recon.Geometry.cone(np.linspace(0, 2.8, 12), shape, 0.2, 20.0, 40.0, roll=0.02)
 """,
 }
 
@@ -97,12 +98,24 @@ def test_a_cones_fit_would_compile_after_a_warm_up_for_a_parallel_beam() -> None
     assert any("_forward.<locals>.kernel" in name for name in found) and "_bend" in found
 
 
-@pytest.mark.parametrize("turn", [2 * np.pi, 3.6])
+def test_too_short_a_scan_is_refused_by_its_own_degrees() -> None:
+    views = Geometry.cone(np.deg2rad(np.arange(0.0, 100)), (24, 48), 0.06, 5.0, 7.0)
+    lacking = np.rad2deg(missing_arc(views))
+    assert 100 < lacking < 105
+    with pytest.raises(ValueError, match=f"{lacking:.4g} degrees more are needed"):
+        warm_up(Fbp(), views)
+
+
+def test_half_a_turn_of_a_parallel_beam_that_lacks_views_is_taken() -> None:
+    warm_up(Fbp(), Geometry.parallel(np.linspace(0, 0.9 * np.pi, 20), (4, 16), 0.1))
+
+
+@pytest.mark.parametrize("turn", [2 * np.pi, 3.6, 3.3])
 def test_a_toy_is_of_the_same_kind(turn: float) -> None:
     angles = np.linspace(0, turn, 50, endpoint=False)
     cone = Geometry.cone(angles, (100, 200), 0.1, 30.0, 90.0, 80.0, shifts=np.ones((50, 2)), tilt=np.full(50, 0.01))
     data, toy = toy_of(cone)
-    assert toy.is_cone and covers_the_circle(toy.angles) == covers_the_circle(angles) == (turn > 6)
+    assert toy.is_cone and (missing_arc(toy) > 0) == (missing_arc(cone) > 0) == (turn < 3.4)
     assert (toy.tilt != 0).all() and toy.shifts.any()
     assert data.shape == (toy.n_views, *toy.detector_shape) and data.max() > 0.1
     assert toy.sample_pitch * toy.detector_shape[1] == pytest.approx(cone.sample_pitch * 200)  # as wide a cone

@@ -25,13 +25,13 @@ Flags = NDArray[np.bool_]
 _f = np.float32
 
 # Columns of the table of rays. A ray crosses plane j at line AT + STEP j, where one detector row is RISE + CLIMB j
-# slices high. It runs PATH mm from plane to plane, and REACH mm from the source to the detector (both in the plane).
-AT, STEP, RISE, CLIMB, PATH, REACH = range(6)
+# slices high. It runs PATH mm from plane to plane in x and y; from row to row of a cone its slope changes by LEAN.
+AT, STEP, RISE, CLIMB, PATH, LEAN = range(6)
 
 _BLOCK = 64  # slices of one job, at most
 _GROUP = 16  # views that share one pass over the volume
-_TILE = 32  # voxels along each edge of a tile: 74 to 296 KB with its margin
-_EDGE = _TILE + 2
+TILE = 32  # voxels along each edge of a tile: 74 to 296 KB with its margin
+EDGE = TILE + 2
 _FLAT = 1e-9  # lines a plane: such a ray stays on its line
 
 CALL = 2**28
@@ -59,7 +59,7 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
         run_x, run_y = -sin + 0 * t, cos + 0 * t
     steep = np.abs(run_y) >= np.abs(run_x)
     first_x, first_y = cx - (nx - 1) / 2 * h, cy - (ny - 1) / 2 * h
-    reach = np.hypot(run_x, run_y)
+    reach = np.hypot(run_x, run_y)  # of a cone, mm from the source to the detector
     # Planes are counted along the axis closest to the ray (a), lines along the other one (b).
     run_a, run_b = np.where(steep, run_y, run_x), np.where(steep, run_x, run_y)
     from_a = np.where(steep, first_y - origin_y, first_x - origin_x)
@@ -71,15 +71,16 @@ def ray_table(geometry: Geometry, grid: Grid) -> tuple[F64, Flags]:
     table[..., RISE] = rise * from_a / run_a if geometry.is_cone else rise
     table[..., CLIMB] = rise * h / run_a if geometry.is_cone else 0.0
     table[..., PATH] = h * reach / np.abs(run_a)
-    table[..., REACH] = reach
+    table[..., LEAN] = pitch / reach if geometry.is_cone else 0.0
     return table, steep
 
 
 @njit(cache=True, boundscheck=False, error_model="numpy")
-def _samples(first, step, low0, low1, j0, j1, across, along, at, share):
+def samples(first, step, low0, low1, j0, j1, across, along, at, share):
     """Samples of the ray first + step j, in planes j0..j1 (excluded), whose lower line is low0..low1 (excluded).
 
-    Fills at [sample], the row of the tile that has this line, and share [sample], of the next line; returns how many.
+    Fills at [sample], the row of the tile that has this line, and share [sample], of the next line. Returns the plane
+    of the first sample, and how many there are.
     Not by fast arithmetic: each sample is in one tile, and rounding does not decide otherwise from place to place.
 
     Args:
@@ -104,12 +105,12 @@ def _samples(first, step, low0, low1, j0, j1, across, along, at, share):
         low = min(max(math.floor(exact), low0), low1 - 1)
         at[k] = (a + k - j0) * across + (low - low0) * along
         share[k] = exact - low
-    return b - a
+    return a, b - a
 
 
 @njit(cache=True, boundscheck=False, error_model="numpy")
 def _columns(rays, v, low0, low1, j0, j1):
-    """Columns first..end (excluded) beyond which no ray of a parallel view has samples there (see `_samples`)."""
+    """Columns first..end (excluded) beyond which no ray of a parallel view has samples there (see `samples`)."""
     cols, step = rays.shape[1], rays[v, 0, STEP]
     per_col = (rays[v, cols - 1, AT] - rays[v, 0, AT]) / max(cols - 1, 1)
     if per_col == 0.0:
@@ -122,12 +123,12 @@ def _columns(rays, v, low0, low1, j0, j1):
 
 
 @njit(inline="always")
-def _tile(axis, y0, y1, x0, x1):
+def tile_of(axis, y0, y1, x0, x1):
     """How rays cross a tile. Planes are j0..j1 (excluded), lower lines of samples that touch it low0..low1 (excluded).
     Then rows of the tile from plane to plane and from line to line, and the row of the first sample."""
     if axis == 0:
-        return y0, y1, x0 - 1, x1, _EDGE, 1, _EDGE
-    return x0, x1, y0 - 1, y1, 1, _EDGE, 1
+        return y0, y1, x0 - 1, x1, EDGE, 1, EDGE
+    return x0, x1, y0 - 1, y1, 1, EDGE, 1
 
 
 @njit(**OPTIONS)
@@ -145,25 +146,25 @@ def _forward(
         v0 = job % groups * group
         v1 = min(views, v0 + group)
         out[v0:v1, :, z0:z1] = _f(0)
-        tile = np.zeros((_EDGE * _EDGE, block), np.float32)
-        at, share = np.empty(_TILE, np.int64), np.empty(_TILE, np.float32)
-        for y0 in range(0, ny, _TILE):
-            for x0 in range(0, nx, _TILE):
-                y1, x1 = min(y0 + _TILE, ny), min(x0 + _TILE, nx)
+        tile = np.zeros((EDGE * EDGE, block), np.float32)
+        at, share = np.empty(TILE, np.int64), np.empty(TILE, np.float32)
+        for y0 in range(0, ny, TILE):
+            for x0 in range(0, nx, TILE):
+                y1, x1 = min(y0 + TILE, ny), min(x0 + TILE, nx)
                 for y in range(y0 - 1, y1 + 1):
                     for x in range(x0 - 1, x1 + 1):
-                        row, inside = (y - y0 + 1) * _EDGE + x - x0 + 1, 0 <= y < ny and 0 <= x < nx
+                        row, inside = (y - y0 + 1) * EDGE + x - x0 + 1, 0 <= y < ny and 0 <= x < nx
                         for z in range(z0, z1, lanes.WIDTH):
                             count = min(z1 - z, lanes.WIDTH) if inside else 0
                             lanes.store(tile, row, z - z0, lanes.load_first(voxels, y * nx + x, z, count))
                 for v in range(v0, v1):
                     axis = 0 if steep[v, 0] else 1
-                    j0, j1, low0, low1, across, along, base = _tile(axis, y0, y1, x0, x1)
+                    j0, j1, low0, low1, across, along, base = tile_of(axis, y0, y1, x0, x1)
                     if low1 < (nx if axis == 0 else ny):
                         low1 -= 1  # samples whose lower line is the tile's last one are of the next tile
                     col0, col1 = _columns(rays, v, low0, low1, j0, j1)
                     for col in range(col0, col1):
-                        n = _samples(rays[v, col, 0], rays[v, col, 1], low0, low1, j0, j1, across, along, at, share)
+                        _, n = samples(rays[v, col, 0], rays[v, col, 1], low0, low1, j0, j1, across, along, at, share)
                         if n == 0:
                             continue
                         line = v * cols + col
@@ -188,20 +189,20 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, 
     ny, nx, nz = volume.shape
     views, cols, _ = projections.shape
     voxels, lines = volume.reshape(ny * nx, nz), projections.reshape(views * cols, nz)
-    across_x, blocks = (nx + _TILE - 1) // _TILE, (nz + block - 1) // block
+    across_x, blocks = (nx + TILE - 1) // TILE, (nz + block - 1) // block
     for job in prange(first, end):
         z0 = job % blocks * block
         z1 = min(nz, z0 + block)
-        y0, x0 = job // blocks // across_x * _TILE, job // blocks % across_x * _TILE
-        y1, x1 = min(y0 + _TILE, ny), min(x0 + _TILE, nx)
-        tile = np.zeros((_EDGE * _EDGE, block), np.float32)
-        at, share = np.empty(_TILE, np.int64), np.empty(_TILE, np.float32)
+        y0, x0 = job // blocks // across_x * TILE, job // blocks % across_x * TILE
+        y1, x1 = min(y0 + TILE, ny), min(x0 + TILE, nx)
+        tile = np.zeros((EDGE * EDGE, block), np.float32)
+        at, share = np.empty(TILE, np.int64), np.empty(TILE, np.float32)
         for v in range(views):
             axis = 0 if steep[v, 0] else 1
-            j0, j1, low0, low1, across, along, base = _tile(axis, y0, y1, x0, x1)
+            j0, j1, low0, low1, across, along, base = tile_of(axis, y0, y1, x0, x1)
             col0, col1 = _columns(rays, v, low0, low1, j0, j1)
             for col in range(col0, col1):
-                n = _samples(rays[v, col, 0], rays[v, col, 1], low0, low1, j0, j1, across, along, at, share)
+                _, n = samples(rays[v, col, 0], rays[v, col, 1], low0, low1, j0, j1, across, along, at, share)
                 if n == 0:
                     continue
                 path, line = _f(rays[v, col, 4]), v * cols + col
@@ -215,7 +216,7 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, 
                         lanes.store(tile, h, c, lanes.load(tile, h, c) + ray * high)
         for y in range(y0, y1):
             for x in range(x0, x1):
-                row = (y - y0 + 1) * _EDGE + x - x0 + 1
+                row = (y - y0 + 1) * EDGE + x - x0 + 1
                 for z in range(z0, z1, lanes.WIDTH):
                     count = min(z1 - z, lanes.WIDTH)
                     lanes.store_first(voxels, y * nx + x, z, lanes.load(tile, row, z - z0), count)
@@ -243,8 +244,8 @@ def adjoint(projections: F32, rays: F64, steep: Flags, out: F32) -> None:
     """The transpose of `forward`: projections [view, col, z] into out [y, x, z] (overwritten)."""
     (ny, nx, nz), views = out.shape, projections.shape[0]
     block, lines = _whole_lanes(nz, _BLOCK), np.ascontiguousarray(projections)
-    jobs = -(-ny // _TILE) * -(-nx // _TILE) * -(-nz // block)
-    for part in calls(jobs, views * _TILE**2 * min(block, nz)):
+    jobs = -(-ny // TILE) * -(-nx // TILE) * -(-nz // block)
+    for part in calls(jobs, views * TILE**2 * min(block, nz)):
         _adjoint(lines, rays, steep, block, part.start, part.stop, out)
 
 

@@ -135,6 +135,57 @@ def store(typing_context, array, row, col, lanes):
     return types.void(array, types.intp, types.intp, LANES), code
 
 
+def _turned(builder: Any, rows: list[Any]) -> list[Any]:
+    """Sixteen vectors transposed: rows and lanes change places, one bit of their numbers at a time."""
+    for bit in (1, 2, 4, 8):
+        low = [lane if not lane & bit else WIDTH + lane - bit for lane in range(WIDTH)]
+        high = [lane + bit if not lane & bit else WIDTH + lane for lane in range(WIDTH)]
+        picks = (ir.Constant(_VI, high), ir.Constant(_VI, low))
+        rows = [builder.shuffle_vector(rows[i & ~bit], rows[i | bit], picks[not i & bit]) for i in range(WIDTH)]
+    return rows
+
+
+def _steps(context: Any, builder: Any, signature: Any, args: Any) -> tuple[list[Any], list[Any]]:
+    """Addresses of array[row + i, col + shifts[i]] and of other[other_row + i, 0]."""
+    kinds, places, others = signature.args, [], []
+    for i in range(WIDTH):
+        number = ir.Constant(args[1].type, i)
+        shifts = context.make_array(kinds[3])(context, builder, args[3])
+        col = builder.add(args[2], builder.load(builder.gep(shifts.data, [number])))
+        places.append(_address(context, builder, kinds[0], args[0], builder.add(args[1], number), col))
+        row, start = builder.add(args[5], number), ir.Constant(args[1].type, 0)
+        others.append(_address(context, builder, kinds[4], args[4], row, start))
+    return places, others
+
+
+@intrinsic
+def load_turned(typing_context, array, row, col, shifts, out, out_row):
+    """out[out_row + k, i] = array[row + i, col + shifts[i] + k], i and k below sixteen; `shifts` of type intp."""
+
+    def code(context, builder, signature, args):
+        places, others = _steps(context, builder, signature, args)
+        found = _turned(builder, [builder.load(place, align=4) for place in places])
+        for vector, other in zip(found, others, strict=True):
+            builder.store(vector, other, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, shifts, out, types.intp), code
+
+
+@intrinsic
+def add_turned(typing_context, array, row, col, shifts, source, source_row):
+    """array[row + i, col + shifts[i] + k] += source[source_row + k, i]: the transpose of `load_turned`."""
+
+    def code(context, builder, signature, args):
+        places, others = _steps(context, builder, signature, args)
+        found = _turned(builder, [builder.load(other, align=4) for other in others])
+        for vector, place in zip(found, places, strict=True):
+            builder.store(builder.fadd(builder.load(place, align=4), vector, flags=_FAST), place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, shifts, source, types.intp), code
+
+
 @intrinsic
 def between(typing_context, lanes, low, high):
     """The lanes low, ..., high - 1; zero in the others."""

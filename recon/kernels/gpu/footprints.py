@@ -240,11 +240,7 @@ def _footprints_backward(
     pv0, pv1, pv2 = turned(vx, vy, vz, r0, r1, r2, r3, r4, r5, r6, r7, r8)
     pd0, pd1, pd2 = turned(dx, dy, dz, r0, r1, r2, r3, r4, r5, r6, r7, r8)
     b0, b1, b2 = s0 * (pv0 - ay * pd0), s1 * (pv1 - ay * pd1), s2 * (pv2 - ay * pd2)
-    h0, h1, h2 = (
-        (ax * pu0 + ay * pv0 + pd0) / s0,
-        (ax * pu1 + ay * pv1 + pd1) / s1,
-        (ax * pu2 + ay * pv2 + pd2) / s2,
-    )
+    h0, h1, h2 = ((ax * pu0 + ay * pv0 + pd0) / s0, (ax * pu1 + ay * pv1 + pd1) / s1, (ax * pu2 + ay * pv2 + pd2) / s2)
     hh = h0 * h0 + h1 * h1 + h2 * h2
     # A = (b x h) / (g s₁ s₂ s₃ h·h), with opposite sign since the views' axes are left-handed; B = b / Σvv in px.
     size, level = 1.0 / (g * s0 * s1) / (s2 * hh), kv * g

@@ -15,12 +15,7 @@ from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import ordered_fista
 from recon.voxels.sweeps import interleaved
-from recon.voxels.voxel_problem import (
-    VoxelProblem,
-    density_unit,
-    iterative_memory,
-    largest_eigenvalue,
-)
+from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory, largest_eigenvalue
 
 
 @dataclass(frozen=True)
@@ -62,7 +57,7 @@ class FistaTv:
             problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
         weight: NoiseBalance | float
         if self.tv_weight is None:
-            weight = choose_weight(problem, x, modelled=False)
+            weight = choose_weight(problem, x, modelled=False, of_cones=True)
         else:
             share = self.tv_weight
             weight = problem.decide(

@@ -18,6 +18,8 @@ from recon.voxels.sweeps import interleaved
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, VoxelProblem, density_unit, iterative_memory
 
+_SETTLED = 3 / 8  # of the sweeps: with 3 of 40, a cement in a cone of 50 views ended 5.6 dB lower
+
 
 @dataclass(frozen=True)
 class OsSirtTv:
@@ -61,12 +63,14 @@ class OsSirtTv:
             if self.tv_weight is None:
                 weight = weight or choose_weight(problem, x, modelled=False)
                 if isinstance(weight, NoiseBalance):
+                    weight.settled = max(weight.settled, int(_SETTLED * self.iterations))
                     weight.value = problem.decide("balance", partial(weight.after_sweep, sweeps.residual))
                 mu = weight.value if isinstance(weight, NoiseBalance) else weight
                 prox(x, float(mu * problem.decide("pace", lambda: sweeps.pace)))
             else:
                 # The unit follows the volume: the first sweeps are blurred, and fainter than later ones.
                 prox(x, self.tv_weight * problem.decide("unit", partial(density_unit, x)))
+            prox.turn()
             if not problem.go_on(k + 1, math.sqrt(error) / scale) or k + 1 == self.iterations:
                 break
             if ahead is not None:

@@ -33,6 +33,14 @@ def test_weak_matter_that_was_clipped_with_its_air_is_named_by_its_region() -> N
     assert own is not None and own.lost is None and own.air * own.noise == pytest.approx(-0.001, rel=0.05)
 
 
+def test_slices_without_beam_have_lost_nothing() -> None:
+    shown, found, seen = _fbp(0.0), _fbp(0.0, noise=0.0), np.arange(40) < 26
+    found[~seen] = 0  # no ray says what is there; FBP shows what was filled in
+    unaware, beside = compare(found, shown), compare(found, shown, seen)
+    assert unaware is not None and unaware.lost is not None
+    assert beside is not None and beside.lost is None and abs(beside.air) < 1
+
+
 @pytest.mark.parametrize("sigma", [0.5, 2.0])
 def test_a_volume_that_is_smoother_or_has_no_noise_has_lost_nothing(sigma: float) -> None:
     shown, clean = _fbp(0.0), np.maximum(gaussian_filter(_fbp(0.0, noise=0.0), sigma), 0)

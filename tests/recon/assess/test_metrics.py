@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.assess import metrics
-from recon.assess.metrics import inscribed_cuboid, kmeans_mask, nrmse, psnr, sampled, snr_cnr, ssim2d, ssim3d
+from recon.assess.metrics import (
+    inscribed_cuboid,
+    kmeans_mask,
+    nrmse,
+    psnr,
+    sampled,
+    snr_cnr,
+    ssim2d,
+    ssim3d,
+    ssim_of_whole_slices,
+)
 
 
 def blobs(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -185,3 +195,25 @@ def test_bad_input_is_refused() -> None:
         snr_cnr(ones * np.nan, np.eye(12, dtype=np.int8)[None].repeat(12, 0))
     with pytest.raises(ValueError, match="the mask"):
         snr_cnr(ones, np.zeros((1, 1, 1), np.int8))
+
+
+def test_ssim_of_whole_slices_is_the_equation_without_windows(rng: np.random.Generator) -> None:
+    truth = rng.random((3, 4, 5))
+    volume = truth + rng.normal(0, 0.3, truth.shape)
+    c1, c2 = 0.01**2 * np.ptp(truth) ** 2, 0.03**2 * np.ptp(truth) ** 2
+
+    def equation(x: np.ndarray, y: np.ndarray) -> float:
+        covariance = np.cov(x.ravel(), y.ravel(), ddof=0)
+        means, variances = (x.mean(), y.mean()), np.diag(covariance)
+        return (
+            (2 * np.prod(means) + c1)
+            * (2 * covariance[0, 1] + c2)
+            / ((np.square(means).sum() + c1) * (variances.sum() + c2))
+        )
+
+    expected = [
+        np.mean([equation(truth.take(i, axis), volume.take(i, axis)) for i in range(n)])
+        for axis, n in enumerate(truth.shape)
+    ]
+    assert ssim_of_whole_slices(truth, volume) == pytest.approx(np.mean(expected), abs=1e-12)
+    assert ssim_of_whole_slices(truth, truth) == pytest.approx(1, abs=1e-12)

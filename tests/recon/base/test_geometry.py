@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -295,3 +298,21 @@ def test_arrays_hold_all_of_a_geometry() -> None:
         for name, value in arrays_of(found).items():
             np.testing.assert_array_equal(value, arrays_of(geometry)[name])
         assert found.width == geometry.width and all(array.dtype != object for array in arrays_of(found).values())
+
+
+def test_rows_with_angles_of_their_own_are_of_straight_parallel_views() -> None:
+    """However the geometry is made."""
+    skewed = Geometry.parallel([0.0, 1.0], (4, 6)).seen_with(NO_WIDTH, 1e-3)
+    changes: tuple[dict[str, Any], ...] = (
+        {"roll": np.full(2, 0.1)}, {"tilt": np.full(2, 0.1)}, {"sod": 50.0, "sdd": 90.0}, {"skew": np.nan},
+    )  # fmt: skip
+    for change in changes:
+        with pytest.raises(ValueError, match=r"a skew of .* rad a row"):
+            replace(skewed, **change)
+
+
+def test_a_fan_is_a_cone_of_one_row_in_the_plane_of_the_source() -> None:
+    fan = Geometry.fan([0.0, 1.0], 7, 0.5, 20.0, 40.0, 2.5, shifts=[0.25, -1.0])
+    cone = Geometry.cone([0.0, 1.0], (1, 7), 0.5, 20.0, 40.0, 2.5, shifts=[(0.25, 0.0), (-1.0, 0.0)])
+    assert repr(fan) == repr(cone) and fan.axis_row == 0
+    np.testing.assert_array_equal(fan.shifts, cone.shifts)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from recon.base.geometry import Geometry
-from recon.base.noise import median_deviation, noise_level, ring_offsets
+from recon.base.noise import median_deviation, noise_beside_structure, noise_level, ring_offsets
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 
@@ -102,3 +102,47 @@ def test_a_wall_around_the_axis_is_no_ring(rng: np.random.Generator) -> None:
     found = ring_offsets(rng.normal(0, 0.2, (60, 12, 50)).astype(np.float32) + wall + ring)
     np.testing.assert_allclose(found[5, 12], 0.5, atol=0.15)
     assert np.abs(found[ring == 0]).max() < 0.2 and np.count_nonzero(found[ring == 0]) < 0.02 * ring.size
+
+
+@pytest.fixture(scope="module")
+def wires() -> F32:
+    """Thin bright wires in all directions, of a voxel's width [z, y, x]."""
+    rng = np.random.default_rng(5)
+    place = np.stack(np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in (24, 64, 64)), indexing="ij"))
+    volume = np.zeros(place.shape[1:], np.float32)
+    for _ in range(60):
+        along = rng.normal(size=3)
+        off = place - np.array([0, *rng.uniform(-20, 20, 2)])[:, None, None, None]
+        t = np.tensordot(along / np.linalg.norm(along), off, 1)
+        volume[(off**2).sum(0) - t**2 < 0.4] = 0.1
+    return np.where(np.hypot(place[1], place[2]) < 26, volume, 0).astype(np.float32)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.03])
+@pytest.mark.parametrize(
+    "views",
+    [
+        Geometry.cone(np.arange(50) * np.pi / 25, (24, 64), 2.0, 256.0, 512.0),
+        Geometry.parallel(np.deg2rad(np.arange(-88, 93, 4)), (24, 64), shifts=[(0.3, 0.0)] * 46),
+        Geometry.parallel(np.roll(np.arange(48), 5) * np.pi / 24, (24, 64), axis_col=30.2),
+    ],
+)
+def test_thin_wires_are_no_noise(wires: F32, views: Geometry, sigma: float) -> None:
+    """`noise_level` takes them for noise, up to twice too much."""
+    clean = Projector(views, Grid(wires.shape)).forward(wires)
+    lines = np.ascontiguousarray((clean + _noise(clean, sigma)).transpose(0, 2, 1))
+    assert noise_beside_structure(lines, views) == pytest.approx(sigma, rel=0.15)
+    assert noise_level(lines) > 1.3 * sigma
+    lines[:, 3, 7] = np.nan  # a row that does not count
+    assert noise_beside_structure(lines, views) == pytest.approx(sigma, rel=0.15)
+
+
+def test_uneven_views_have_the_noise_level(wires: F32) -> None:
+    """Angles at random, or few, tell nothing beside structure; without it the level stays the same to the bit."""
+    for angles in (np.random.default_rng(2).uniform(0, 2 * np.pi, 50), np.arange(9) * np.pi / 9):
+        views = Geometry.parallel(angles, (24, 64))
+        lines = np.ascontiguousarray(Projector(views, Grid(wires.shape)).forward(wires).transpose(0, 2, 1))
+        assert noise_beside_structure(lines, views) == noise_level(lines)
+    even = Geometry.parallel(np.arange(48) * np.pi / 24, (24, 64))
+    white = _noise(np.zeros((48, 64, 24), np.float32), 0.2)
+    assert noise_beside_structure(white, even) == noise_level(white)

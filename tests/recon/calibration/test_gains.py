@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 import recon
 from recon.base.geometry import Geometry
 from recon.calibration.gains import NEAR_AXIS, gains_memory, learn_gains
-from recon.prep.rings import remove_rings_in_place, ring_score
+from recon.prep.rings import remove_rings_in_place
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+from tests.recon.prep.ring_score import ring_score
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 F32 = NDArray[np.float32]

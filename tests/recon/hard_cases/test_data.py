@@ -26,6 +26,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
 from tests.recon.hard_cases import spheres
+from tests.recon.helpers import run_steps
 
 F32 = NDArray[np.float32]
 SHAPE = (12, 48)
@@ -199,7 +200,7 @@ def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> Non
     with pytest.raises(ValueError, match="one view does not determine a volume"):
         reconstruct(clean[3:4], one)
     problem = fit.problem_of(clean[3:4], one, GRID, 0.05, SHORT)
-    state = fit.run_steps(fit.init(a_few(), 0), problem, SHORT, 200)
+    state = run_steps(fit.init(a_few(), 0), problem, SHORT, 200)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     assert float(state.residual) < 0.5
 
@@ -242,7 +243,7 @@ def test_detectors_of_one_row_or_one_column(shape: tuple[int, int]) -> None:
     views = Geometry.parallel(VIEWS.angles, shape, axis_col=(shape[1] - 1) / 2)
     data = spheres.projections(views)
     problem = fit.problem_of(data, views, Grid.matching(views), 0.05, SHORT)
-    state = fit.run_steps(fit.init(a_few(), 0), problem, SHORT, 60)
+    state = run_steps(fit.init(a_few(), 0), problem, SHORT, 60)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     if shape == (1, 48):
         grid = Grid.matching(views)
@@ -254,7 +255,7 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     problem = fit.problem_of(clean, VIEWS, flat, 0.05, SHORT)
     state = fit.init(a_few(), 0)
     before = fit.misfit_of(state, problem, SHORT)
-    fit.run_steps(state, problem, SHORT, 100)
+    run_steps(state, problem, SHORT, 100)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     assert fit.misfit_of(state, problem, SHORT) < 0.8 * before
     seen = fit.volume_of(state, flat, SHORT).data
@@ -272,7 +273,7 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     # And the fit follows it: more weight, less variation.
     varied = []
     for weight in (0.0, 20.0):
-        state = fit.run_steps(fit.init(a_few(), 0), problem, replace(SHORT, tv_size=48, tv_weight=weight), 60)
+        state = run_steps(fit.init(a_few(), 0), problem, replace(SHORT, tv_size=48, tv_weight=weight), 60)
         varied.append(np.abs(np.diff(fit.volume_of(state, flat, SHORT).data, axis=2)).mean())
     assert varied[1] < 0.7 * varied[0]
 

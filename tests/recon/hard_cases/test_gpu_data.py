@@ -18,6 +18,7 @@ from recon.splatting.backend import backend_for
 from recon.splatting.settings import FitSettings
 from tests.recon.hard_cases.measure import STEP
 from tests.recon.hard_cases.on_gpu import DEVICE, quiet, some
+from tests.recon.helpers import run_steps
 
 engine = importlib.import_module("recon.kernels.gpu.engine")
 parameters = importlib.import_module("recon.kernels.gpu.parameters")
@@ -112,7 +113,7 @@ def test_detectors_of_one_row_or_column_with_a_pixel_missing_are_the_cpus(
     for device in ("cpu", "cuda"):
         backend = backend_for(device)
         problem = fit.problem_of(data, views, flat, 0.7, settings, backend)
-        state = fit.run_steps(fit.init(some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
+        state = run_steps(fit.init(some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
         states.append({name: backend.numpy(values) for name, values in state.parameters.items()})
     for name, expected in states[0].items():
         np.testing.assert_allclose(states[1][name], expected, atol=2e-5 * float(np.abs(expected).max()), err_msg=name)

@@ -7,7 +7,7 @@ import pytest
 import xraylib
 
 from recon.prep.hardening import curve_of_spectrum
-from recon.prep.matter import KNOWN, delta_beta, mass_attenuation, tube_spectrum
+from recon.prep.matter import KNOWN, absorbed_dose, delta_beta, mass_attenuation, tube_spectrum
 from simulators.light.beam import Beam, Tube
 from simulators.light.palette import Palette
 from simulators.light.spectrum import light
@@ -67,3 +67,17 @@ def test_what_is_no_material_is_said() -> None:
 def test_an_impossible_tube_is_refused(kv: float, filters: dict[str, float], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         tube_spectrum(kv, filters)
+
+
+@pytest.mark.parametrize(("energy", "absorbed"), [(10.0, 4.944), (20.0, 0.5503), (30.0, 0.1557), (60.0, 0.03190)])
+def test_a_dose_is_fluence_times_energy_times_absorption(energy: float, absorbed: float) -> None:
+    """Coefficients of water in cm²/g: Hubbell & Seltzer, NISTIR 5632 (1995)."""
+    expected = 1e6 * 100 * energy * 1.602176634e-16 * absorbed * 1000
+    assert absorbed_dose("water", energy, 1e6) == pytest.approx(expected, rel=0.03)
+
+
+def test_a_dose_outside_the_tables_is_refused() -> None:
+    with pytest.raises(ValueError, match="from 1 to 200 keV"):
+        absorbed_dose("water", 0.5, 1.0)
+    with pytest.raises(ValueError, match="neither a material"):
+        absorbed_dose("Xx", 20.0, 1.0)

@@ -15,7 +15,6 @@ from recon.prep.rings import (
     _synthesised,
     by_vo,
     remove_rings_in_place,
-    ring_score,
     stripe_score,
     without_dead_columns,
     without_large_stripes,
@@ -24,6 +23,7 @@ from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
 from tests.recon.prep.real_views import tooth_views
+from tests.recon.prep.ring_score import ring_score
 
 COLS, ANGLES = 240, np.linspace(0, np.pi, 150, endpoint=False)
 F32 = NDArray[np.float32]

@@ -12,11 +12,12 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
-from recon.prep.rings import REMOVERS, ring_score, width_for
+from recon.prep.rings import REMOVERS, width_for
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder
 from tests.recon.prep.real_views import tooth_views
+from tests.recon.prep.ring_score import ring_score
 
 theirs = pytest.importorskip("algotom.prep.removal")
 

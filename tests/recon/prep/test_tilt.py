@@ -72,5 +72,8 @@ def test_what_does_not_show_an_axis_is_refused() -> None:
     noise = np.random.default_rng(0).normal(size=(90, 64, 96))
     with pytest.raises(ValueError, match="lie on no line"):
         _found(noise, HALF.angles)
+    for cols in (1, 2, 7):
+        with pytest.raises(ValueError, match=f"{cols} columns show no axis; 8 are needed"):
+            _found(noise[:, :, :cols], HALF.angles)
     with pytest.raises(ValueError, match="3 bands of rows; 4"):
         find_tilt(noise[:, :3], np.arange(3.0), HALF.angles)

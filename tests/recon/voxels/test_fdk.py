@@ -42,6 +42,18 @@ def inside(grid: Grid, radius: float, centre: tuple[float, float, float]) -> NDA
     return (x - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 + (z[:, None, None] - centre[2]) ** 2 < radius**2
 
 
+@pytest.mark.parametrize("arc", [210, 250, 320])
+def test_a_short_scan_shows_the_ball_as_a_full_turn_does(arc: float, rng: np.random.Generator) -> None:
+    angles = rng.permutation(np.deg2rad(np.linspace(0, arc, 240) + 40))
+    short = Geometry.cone(angles, (17, 48), 1.0, 80.0, 160.0)
+    whole = Geometry.cone(circle(360), (17, 48), 1.0, 80.0, 160.0)
+    grid, centre = Grid((3, 48, 48), 0.5), (3.0, -2.0, 0.0)
+    found, expected = (fdk(ball_views(views, 5.0, centre), views, grid, "hann") for views in (short, whole))
+    ball = inside(grid, 4.0, centre)
+    assert found[ball].mean() == pytest.approx(1, abs=0.01)
+    np.testing.assert_allclose(found[1], expected[1], atol=0.05)
+
+
 @pytest.mark.parametrize("window", ["ram-lak", "shepp-logan", "hann"])
 def test_a_ball_in_the_middle_has_its_attenuation(window: str) -> None:
     geometry = Geometry.cone(circle(90), (64, 64), 0.1, 10.0, 20.0)

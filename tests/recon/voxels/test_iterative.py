@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy.sparse.linalg import lsqr, svds
 
@@ -25,7 +26,7 @@ from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.methods.sart import Sart
 from recon.voxels.methods.sirt import Sirt
 from recon.voxels.projector import Projector
-from recon.voxels.voxel_problem import density_unit, largest_eigenvalue
+from recon.voxels.voxel_problem import VoxelProblem, density_unit, largest_eigenvalue
 from tests.recon.kernels.voxels_reference import system_matrix
 from tests.recon.voxels.tv_reference import differences, total_variation, transposed_differences
 
@@ -367,3 +368,19 @@ def test_a_box_that_no_ray_meets_stays_empty(method: IterativeMethod) -> None:
     projector, _, views = parallel_case()
     aside = Projector(projector.geometry, Grid((4, 5, 6), 0.5, (90.0, 0.0, 0.0)))
     assert not solve(replace(method, iterations=2), aside, views).data.any()
+
+
+@pytest.mark.parametrize(("edge", "threads"), [(20, 1), (400, 2)])
+def test_a_small_slice_takes_few_threads_and_gives_them_back(edge: int, threads: int) -> None:
+    class Counting:
+        iterations = 1
+
+        def iterate(self, problem: VoxelProblem, x: NDArray[np.float32]) -> NDArray[np.float32]:
+            counted.append(get_num_threads())
+            return x
+
+    counted: list[int] = []
+    before = get_num_threads()
+    projector = Projector(Geometry.parallel([0.0, 1.0], (1, 5)), Grid((1, edge, edge)))
+    solve(Counting(), projector, np.ones((2, 1, 5), np.float32))
+    assert counted == [min(threads, before)] and get_num_threads() == before

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
@@ -69,6 +70,29 @@ def test_what_no_volume_explains_makes_it_heavier_from_the_third_sweep_on() -> N
         values.append(balance.value)
     heavy, lighter = (2.0 * min(1 + 1.75**2 * (s**2 - 1.05**2), 5) for s in (2.0, 1.4))
     assert values == pytest.approx([2, 2, heavy, heavy, lighter, 2, 2], rel=0.05)
+
+
+def test_a_slow_method_is_looked_at_later() -> None:
+    """OS-SIRT has not converged after three sweeps; what it still left of the views made the weight too heavy."""
+    balance = NoiseBalance(1.0, 1.0, settled=15)
+    assert [balance.after_sweep(_residual(2.0)) for _ in range(14)] == [1.0] * 14
+    assert balance.after_sweep(_residual(1.0)) == pytest.approx(1.0, rel=0.05)
+
+
+def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(rng: np.random.Generator) -> None:
+    """OS-SIRT-TV was 5.9 dB below FISTA-TV on a slice of bone."""
+    n, views = 160, 50
+    y, x = np.mgrid[: 2 * n, : 2 * n] - (n - 0.5)
+    off = np.hypot(x, y)
+    bone = (gaussian_filter(rng.normal(size=off.shape), 5) > 0.02) | (off > 0.75 * n)
+    fine = np.where((off < 0.85 * n) & bone, 1.5 / n, 0).astype(np.float32)
+    image = fine.reshape(n, 2, n, 2).mean((1, 3))
+    fan, finer = (Geometry.fan(np.arange(views) * 2 * np.pi / views, k * n, 2 / k, 4 * n, 8 * n) for k in (1, 2))
+    data = Projector(finer, Grid((1, 2 * n, 2 * n), 0.5)).forward(fine[None]).reshape(views, 1, n, 2).mean(3)
+    data = (data + rng.normal(0, 0.02, data.shape)).astype(np.float32)
+    projector = Projector(fan, Grid((1, n, n)))
+    fista, sirt = (psnr(solve(method, projector, data).data, image[None]) for method in (FistaTv(), OsSirtTv()))
+    assert sirt > fista - 1
 
 
 def test_what_no_volume_explains_is_counted_once() -> None:

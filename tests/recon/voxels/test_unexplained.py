@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,6 +39,25 @@ def test_the_truth_leaves_noise_and_rings(rng: np.random.Generator, rings: float
     offsets = np.where(rng.random((8, 64)) < 0.05, rings, 0).astype(np.float32)
     found = unexplained(Volume(TRUTH, GRID), _views(rng) + offsets, VIEWS, rng)
     assert found is not None and found.share < LIMIT / 3
+
+
+@pytest.mark.parametrize("turns", [2, 1])
+def test_a_filled_crack_is_seen_by_views_that_step_up_and_down(rng: np.random.Generator, turns: int) -> None:
+    shifts = np.zeros((60, 2))
+    shifts[:, 1] = 9 * np.cos(turns * 2 * math.pi * np.arange(60) / 60 + 0.3)
+    moved = replace(VIEWS, shifts=shifts)
+    grid = Grid.matching(moved)
+    assert grid.shape[0] != VIEWS.detector_shape[0]  # no slice a row: the case looked at
+    truth = np.repeat(TRUTH[:1], grid.shape[0], axis=0)
+    tall = replace(moved, detector_shape=(30, 64), axis_row=moved.axis_row + 11)  # all rays that the rows' see
+    box = replace(grid, shape=(60, *grid.shape[1:]))
+    whole = Projector(tall, box).forward(np.repeat(TRUTH[:1], 60, axis=0))
+    views = np.ascontiguousarray(whole[:, 11:19]) + rng.normal(0, 0.03, (60, 8, 64)).astype(np.float32)
+    filled = np.where(np.hypot(X, Y) < 26, np.float32(0.04), np.float32(0))[0]
+    closed = unexplained(Volume(np.repeat(filled[None], len(truth), axis=0), grid), views, moved, rng)
+    true = unexplained(Volume(truth, grid), views, moved, rng)
+    assert closed is not None and true is not None
+    assert closed.share > 2 * LIMIT > LIMIT > true.share
 
 
 def test_it_is_in_units_of_the_noise(rng: np.random.Generator) -> None:

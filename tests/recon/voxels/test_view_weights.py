@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
-from recon.voxels.view_weights import angular_weights, circle_weights, ray_weights
+from recon.voxels.view_weights import angular_weights, circle_weights, cone_weights, missing_arc, ray_weights
 from tests.recon.voxels.test_fbp import disc_views, half_turn
 
 
@@ -151,6 +151,40 @@ def test_uneven_steps_of_a_circle_weigh_by_their_cells_and_sum_to_a_turn(rng: np
 
 
 @pytest.mark.parametrize(("span", "n"), [(180, 90), (200, 25), (270, 100), (300, 40)])
-def test_a_short_scan_is_refused(span: float, n: int) -> None:
-    with pytest.raises(ValueError, match=r"gap of .* degrees.*short scan"):
+def test_weights_of_the_circle_are_not_those_of_a_short_scan(span: float, n: int) -> None:
+    with pytest.raises(ValueError, match=r"gap of .* degrees.*full circle"):
         circle_weights(np.deg2rad(np.linspace(0, span, n)))
+
+
+@pytest.mark.parametrize("arc", [200, 214, 260, 330])
+@pytest.mark.parametrize("sense", [1, -1])
+def test_both_measurements_of_a_ray_of_a_short_scan_weigh_one_together(arc: float, sense: int) -> None:
+    """The ray at γ in the view β is the ray at -γ in the view β + π - 2γ, if the scan goes that far."""
+    n, cols, start = 4 * arc, 41, 2.0
+    angles = sense * (start + np.deg2rad(arc) * (np.arange(n) + 0.5) / n)
+    geometry = Geometry.fan(np.random.default_rng(0).permutation(angles), cols, 1.0, 150.0, 300.0)
+    weights, zeros = cone_weights(geometry)
+    assert zeros == (0, 0) and missing_arc(geometry) == 0 and weights.min() >= 0
+    share = weights / (np.deg2rad(arc) / n)
+    order = np.argsort(geometry.angles)
+    at, gamma = geometry.angles[order], np.arctan((np.arange(cols) - 20) / 300.0)
+    sums = np.zeros((n, cols))
+    for col in range(cols):
+        for turn in (-np.pi, np.pi):
+            again = at + turn - 2 * gamma[col]
+            there = np.interp(again, at, share[order, cols - 1 - col], left=0, right=0)
+            sums[:, col] += there
+        sums[:, col] += share[order, col]
+    np.testing.assert_allclose(sums, 1, atol=0.02)
+
+
+@pytest.mark.parametrize(("arc", "lacking"), [(180, 7.6), (100, 87.6), (187, 0.6), (188.5, 0)])
+def test_what_a_short_scan_lacks_is_said_in_degrees(arc: float, lacking: float) -> None:
+    # 41 columns of 1 mm, 300 mm from the source: the fan is 7.63 degrees wide.
+    geometry = Geometry.fan(np.deg2rad(np.linspace(0, arc, 400, endpoint=False)), 41, 1.0, 150.0, 300.0)
+    assert np.rad2deg(missing_arc(geometry)) == pytest.approx(lacking, abs=0.05)
+    if lacking:
+        with pytest.raises(ValueError, match=r"[\d.]+ degrees more are needed, or some rays .* seen by no view"):
+            cone_weights(geometry)
+    gaps = Geometry.fan([0, 0.1, 0.2, 0.3, 0.4, 2.0, 2.1, 2.2, 2.3, 4.0], 41, 1.0, 150.0, 300.0)
+    assert missing_arc(gaps) == np.inf

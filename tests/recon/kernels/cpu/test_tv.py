@@ -21,7 +21,7 @@ def test_dual_steps_are_the_reference_s(shape: tuple[int, int, int], nonnegative
     x, threshold = rng.normal(size=shape).astype(np.float32), 0.3
     found, expected = np.zeros((3, *shape), np.float32), np.zeros((3, *shape))
     scratch = tv_cpu.dual_scratch(shape)
-    pace = 1.9 / (4 * sum(w * w for w in WEIGHTS)) / threshold
+    pace = 1.5 / (4 * sum(w * w for w in WEIGHTS)) / threshold
     for _ in range(6):
         tv_cpu.dual_step(x, found, threshold, WEIGHTS, nonnegative, scratch)
         y = x - threshold * transposed_differences(expected, WEIGHTS)

@@ -20,7 +20,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project, voxelize
 from tests.recon.conftest import Make
-from tests.recon.helpers import as_leaves, gradients, in_double
+from tests.recon.helpers import as_leaves, gradients, in_double, run_steps
 from tests.recon.kernels.gpu.on_gpu import AFFINE, DEVICE, EXACT, UNIT, cone, parallel
 
 gpu = importlib.import_module("recon.kernels.gpu")
@@ -33,7 +33,7 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettin
     weights = (rng.random(data.shape) > 0.1).astype(np.float32)
     problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
     state, records = fit.init(g, 11, 1.5, backend), []
-    fit.run_steps(
+    run_steps(
         state, problem, settings, 3, lambda s: records.append((s.n, float(s.loss), float(s.residual))) is not None
     )
     return state, [*records, fit.misfit_of(state, problem, settings)]

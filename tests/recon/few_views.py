@@ -1,0 +1,12 @@
+"""A cylinder with a dense ellipsoid in few noisy views; `conftest.py` has the sample and the views as fixtures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import recon
+
+SHAPE, PITCH = (20, 40), 0.1
+ANGLES = np.linspace(0, np.pi, 24, endpoint=False)
+VIEWS = recon.Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=18.3)
+GRID = recon.Grid.matching(VIEWS)

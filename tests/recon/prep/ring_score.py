@@ -1,0 +1,26 @@
+"""How strong the rings of a slice are."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+
+def ring_score(image: NDArray[np.floating], axis: tuple[float, float], width: int = 9) -> float:
+    """Rings of a slice: standard deviation of means along circles about the axis, less their median over `width` radii.
+
+    Args:
+        image: [y, x].
+        axis: (y, x) in voxels, on which the rings are centred.
+    """
+    y, x = np.indices(image.shape)
+    radius = np.rint(np.hypot(y - axis[0], x - axis[1])).astype(int)
+    reach = min(image.shape) // 2 - 2
+    inside = (radius < reach) & np.isfinite(image)
+    count = np.bincount(radius[inside], minlength=reach)
+    means = np.bincount(radius[inside], image[inside], minlength=reach) / np.maximum(count, 1)
+    off = (means - median_filter(means, 2 * (width // 2) + 1, mode="nearest"))[
+        width:
+    ]  # short circles about the axis are structure
+    return float(off.std())
