@@ -1,0 +1,214 @@
+"""Devices for a RunEngine (ophyd-async): a whole scan that flies, and the rotation stage.
+
+The scan is ours from trigger to file, in a thread: the RunEngine starts it, is told its rows as they are written, and
+waits for its end. So lost frames, a device that fails, and a missing beam are found by the scan, and fail `complete`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import AsyncIterator, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bluesky import plan_stubs, preprocessors
+from bluesky.utils import NoReplayAllowed
+from ophyd_async.core import AsyncStatus, Device, WatchableAsyncStatus, WatcherUpdate
+
+from beamline.bluesky.documents import STREAM, ScanStream
+from beamline.config.load import Config, resolved_yaml
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event, RunStarted, Sink
+from beamline.core.stop import StopRequest
+from beamline.instrument.connect import ConnectedDevices, connect
+from beamline.scan.control import Verb, state_of, tell
+from beamline.scan.run import RunResult, run_scan
+from drivers.base.protocols import RotationStage
+
+POLL = 0.2
+"""s between two looks at the rows of the file."""
+MARGIN = 10.0
+"""s beyond twice the time of a move after which it has failed."""
+
+
+class TomoScan(Device):
+    """A configured scan as flyer and detector; each kickoff is one scan, in a run folder of its own.
+
+    Args:
+        runs: folder of the run folders; the configured one unless given.
+        instrument: connected devices, which stay open; None: each scan opens and closes those of the configuration.
+    """
+
+    def __init__(
+        self, config: Config, runs: Path | None = None, name: str = "tomo", instrument: ConnectedDevices | None = None
+    ) -> None:
+        super().__init__(name)
+        self._config, self._runs, self._instrument = config, runs, instrument
+        self._stream, self._stop = ScanStream(config, name), StopRequest()
+        self._folder: Path | None = None
+        self._planned = 0
+        self._task: asyncio.Task[RunResult] | None = None
+
+    @AsyncStatus.wrap
+    async def stage(self) -> None:
+        """Nothing moves."""
+        self._refuse_second()
+
+    @AsyncStatus.wrap
+    async def unstage(self) -> None:
+        """A scan that still runs is stopped, as by `beamline stop`, and its file closed."""
+        task, self._task = self._task, None
+        if task is not None and not task.done():
+            self._stop.stop("the plan ended")
+        if task is not None:
+            await asyncio.wait([task])
+            task.exception()  # looked at, so that asyncio does not report it
+
+    async def pause(self) -> None:
+        """A pause of the plan, also by a suspender, pauses the scan as `beamline pause` does.
+
+        Raises:
+            NoReplayAllowed: always once the scan has begun: a second kickoff would be a second scan.
+            ConfigError: the scan does not answer.
+        """
+        if self._task is not None:
+            await self._tell(Verb.PAUSE)
+            raise NoReplayAllowed
+
+    async def resume(self) -> None:
+        """The scan goes on."""
+        if self._task is not None:
+            await self._tell(Verb.RESUME)
+
+    async def _tell(self, verb: Verb) -> None:
+        if self._folder is None:
+            return
+        try:
+            await asyncio.to_thread(tell, self._folder, verb)
+        except ConfigError:
+            if self._task is not None and not self._task.done() and not state_of(self._folder).ended:
+                raise
+
+    @AsyncStatus.wrap
+    async def kickoff(self) -> None:
+        """Start the scan. Raises what it raises before its file is there; nothing has moved then."""
+        self._refuse_second()
+        self._stop, self._folder = StopRequest(), None
+        self._stream = ScanStream(self._config, self.name)
+        self._task = asyncio.create_task(asyncio.to_thread(self._scan))
+        while self._folder is None and not self._task.done():
+            await asyncio.sleep(POLL)
+        if self._folder is None:
+            self._task.result()
+
+    @WatchableAsyncStatus.wrap
+    async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
+        """Wait for the end. Raises the scan's own error: frames are missing, it was stopped, a device failed."""
+        task, began = self._task, time.monotonic()
+        if task is None:
+            raise RuntimeError(f"{self.name}: kickoff comes before complete")
+        while not task.done():
+            await asyncio.wait([task], timeout=POLL)
+            yield WatcherUpdate(
+                name=self.name, current=self._stream.rows, initial=0, target=self._planned, unit="frames",
+                time_elapsed=time.monotonic() - began,
+            )  # fmt: skip
+        if self._task is task:  # else it was unstaged: the plan knows why
+            task.result()
+
+    async def describe_collect(self) -> dict[str, Any]:
+        return self._stream.data_keys()
+
+    async def get_index(self) -> int:
+        """Rows that others can read."""
+        return self._stream.rows
+
+    async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[Any]:
+        for asset in self._stream.assets(self._stream.rows if index is None else index):
+            yield asset
+
+    async def describe_configuration(self) -> dict[str, Any]:
+        return {f"{self.name}-config": {"source": "splatline", "dtype": "string", "shape": []}}
+
+    async def read_configuration(self) -> dict[str, Any]:
+        return {f"{self.name}-config": {"value": resolved_yaml(self._config), "timestamp": time.time()}}
+
+    def _refuse_second(self) -> None:
+        if self._task is not None and not self._task.done():
+            raise RuntimeError(f"{self.name}: a scan is running; unstage ends it")
+
+    def _scan(self) -> RunResult:
+        sinks: list[Sink] = [self._stream, self._begun]
+        return run_scan(self._config, self._runs, sinks, self._stop, instrument=self._instrument)
+
+    def _begun(self, event: Event) -> None:
+        if isinstance(event, RunStarted):
+            self._planned, self._folder = event.n_frames, event.folder
+
+
+class Rotation(Device):
+    """The rotation stage, in degrees, at its full speed."""
+
+    def __init__(self, stage: RotationStage, name: str = "rotation") -> None:
+        super().__init__(name)
+        self._stage, self._setpoint = stage, math.degrees(stage.position())
+
+    @AsyncStatus.wrap
+    async def set(self, value: float) -> None:
+        """Move there and wait. DeviceRefused: beyond the limits; DeviceError: it stopped short."""
+        self._setpoint = value
+        await asyncio.to_thread(self._move, math.radians(value))
+
+    async def stop(self, success: bool = True) -> None:
+        await asyncio.to_thread(self._stage.stop)
+
+    async def locate(self) -> dict[str, float]:
+        return {"setpoint": self._setpoint, "readback": await self._degrees()}
+
+    async def read(self) -> dict[str, Any]:
+        return {self.name: {"value": await self._degrees(), "timestamp": time.time()}}
+
+    async def describe(self) -> dict[str, Any]:
+        return {self.name: {"source": "splatline:stage", "dtype": "number", "shape": [], "units": "deg"}}
+
+    @property
+    def hints(self) -> Mapping[str, list[str]]:
+        return {"fields": [self.name]}
+
+    async def _degrees(self) -> float:
+        return math.degrees(await asyncio.to_thread(self._stage.position))
+
+    def _move(self, angle: float) -> None:
+        stage, limits = self._stage, self._stage.limits
+        seconds = abs(angle - stage.position()) / limits.max_speed + limits.max_speed / limits.acceleration
+        stage.start_move(angle, limits.max_speed)
+        stage.wait(2 * seconds + MARGIN)
+
+
+@contextmanager
+def tomography(config: Config, runs: Path | None = None) -> Iterator[tuple[TomoScan, Rotation]]:
+    """The instrument of a configuration, connected: its scan and its rotation stage for the plans of a RunEngine."""
+    with connect(config) as instrument:
+        yield TomoScan(config, runs, instrument=instrument), Rotation(instrument.devices.stage)
+
+
+def fly(scan: TomoScan, md: Mapping[str, Any] | None = None, flush: float = 0.5) -> Generator[Any, Any, Any]:
+    """A plan: one scan, one run. `flush`: s between two datums. Returns the uid of the run."""
+
+    @preprocessors.stage_decorator([scan])
+    @preprocessors.run_decorator(md={"plan_name": "fly", "detectors": [scan.name], **(md or {})})
+    def inner() -> Generator[Any, Any, None]:
+        yield from plan_stubs.declare_stream(scan, name=STREAM, collect=True)
+        yield from plan_stubs.kickoff(scan, wait=True)
+        completed = yield from plan_stubs.complete(scan, wait=False)
+        while not completed.done:  # a pause makes `wait`, as in collect_while_completing, forget what it waits for
+            yield from plan_stubs.sleep(flush)
+            yield from plan_stubs.collect(scan, name=STREAM)
+        yield from plan_stubs.collect(scan, name=STREAM)
+        if (error := completed.exception()) is not None:  # if the RunEngine has not raised it already
+            raise error
+
+    return (yield from inner())

@@ -1,0 +1,173 @@
+"""Documents of bluesky (event-model) that tell a scan, whose frames stay in our file: one stream datum for new rows.
+
+One index is one row of the file, darks and flats included. A trigger without a frame is no index.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+from beamline.config.load import Config
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event, Failed, FrameStored, RunDone, RunStarted, ScanDone
+from beamline.scan.preflight import dry_run
+from beamline.storage.writers import layout
+
+Emit = Callable[[str, Mapping[str, Any]], object]
+"""Takes a document: its name and its values."""
+
+STREAM = "primary"
+_COLUMNS = {  # ending of the data key: dataset, numpy type, unit
+    "": (layout.DATA, "<u2", "counts"),
+    "-angle": (layout.ANGLE, "<f8", "degree"),
+    "-kind": (layout.KIND, "<i4", ""),
+}
+
+
+def event_model() -> Any:
+    """The library. ConfigError: it is not installed."""
+    try:
+        import event_model as library
+    except ImportError as error:
+        raise ConfigError('bluesky needs: pip install "splatline[bluesky]". Nothing was started.') from error
+    return library
+
+
+class ScanStream:
+    """The data of one scan as a stream: its keys before it begins, resources and datums while its file grows.
+
+    Args:
+        name: of the data keys: NAME is the frame, NAME-angle, NAME-kind.
+    """
+
+    def __init__(self, config: Config, name: str) -> None:
+        self.shape = dry_run(config).camera.shape
+        self._name, self._behind = name, config.storage.flush_every - 1
+        self._library, self._path = event_model(), Path()
+        self._bundles: list[Any] = []
+        self._emitted = self.rows = 0
+
+    def data_keys(self) -> dict[str, Any]:
+        """Of a descriptor."""
+        return {
+            self._name + ending: {
+                "source": f"splatline:{dataset}",
+                "shape": list(self.shape) if ending == "" else [],
+                "dtype": "array" if ending == "" else "number",
+                "dtype_numpy": kind,
+                "units": unit,
+                "external": "STREAM:",
+            }
+            for ending, (dataset, kind, unit) in _COLUMNS.items()
+        }
+
+    def __call__(self, event: Event) -> None:
+        """Take an event of the scan: where its file is, and how many rows of it others can read."""
+        if event.source is not None:  # of the live reconstruction
+            return
+        if isinstance(event, RunStarted):
+            self._path, self._emitted, self.rows, self._bundles = event.path, 0, 0, []
+        elif isinstance(event, FrameStored):
+            self.rows = max(self.rows, event.n - self._behind)  # the writer flushes at least so often
+        elif isinstance(event, ScanDone):
+            self.rows = event.n_frames
+
+    def assets(self, until: int, run_start: str | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Resources and datums of the rows that were not told yet, before the row `until`. `run_start`: uid of the
+        run; None: a RunEngine fills it in."""
+        until = min(until, self.rows)
+        if until <= self._emitted:
+            return
+        if not self._bundles:
+            self._bundles = list(self._resources())
+            for bundle in self._bundles:
+                yield "stream_resource", bundle.stream_resource_doc | ({"run_start": run_start} if run_start else {})
+        for bundle in self._bundles:
+            yield "stream_datum", bundle.compose_stream_datum(indices={"start": self._emitted, "stop": until})
+        self._emitted = until
+
+    def _resources(self) -> Iterator[Any]:
+        compose = self._library.ComposeStreamResource()
+        uri = self._path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
+        for ending, (dataset, _, _) in _COLUMNS.items():
+            chunk = (1, *self.shape) if ending == "" else (1,)
+            parameters = {"dataset": dataset, "chunk_shape": chunk, "swmr": True}
+            yield compose(mimetype="application/x-hdf5", uri=uri, data_key=self._name + ending, parameters=parameters)
+
+
+class Documents:
+    """A sink of events that emits the documents of a scan: start, descriptor, resources, datums, stop.
+
+    Raises:
+        ConfigError: event-model is not installed.
+    """
+
+    def __init__(self, config: Config, emit: Emit, name: str = "camera") -> None:
+        self._config, self._emit, self._stream = config, emit, ScanStream(config, name)
+        self._run: Any = None
+        self._descriptor: Any = None
+        self._exit, self._reason = "success", ""
+
+    def __call__(self, event: Event) -> None:
+        if event.source is not None:  # of the live reconstruction
+            return
+        self._stream(event)
+        if isinstance(event, RunStarted):
+            self._begin(event)
+        if self._run is None:
+            return
+        if isinstance(event, FrameStored | ScanDone):
+            self._tell_rows()
+        if isinstance(event, ScanDone):
+            self._exit = {"complete": "success", "stopped": "abort"}.get(event.status, "fail")
+        elif isinstance(event, RunDone | Failed):
+            self._end(event.message if isinstance(event, Failed) else "", failed=isinstance(event, Failed))
+
+    def _begin(self, event: RunStarted) -> None:
+        sample, optics = self._config.sample, self._config.optics
+        self._run = event_model().compose_run(
+            metadata={
+                "plan_name": "beamline scan",
+                "sample": {"name": sample.name, "description": sample.description},
+                "run_folder": str(event.folder.absolute()),
+                "num_points": event.n_frames,
+                "pixel_size_um": optics.pixel_size_um,
+                "energy_kev": optics.energy_kev,
+                "detectors": ["camera"],
+                "motors": ["stage"],
+            }
+        )
+        self._emit("start", self._run.start_doc)
+        self._descriptor = self._run.compose_descriptor(
+            name=STREAM, data_keys=self._stream.data_keys(), object_keys={"camera": list(self._stream.data_keys())}
+        )
+        self._emit("descriptor", self._descriptor.descriptor_doc)
+
+    def _tell_rows(self) -> None:
+        for name, document in self._stream.assets(self._stream.rows, self._run.start_doc["uid"]):
+            if name == "stream_datum":
+                rows = document["indices"]
+                document |= {
+                    "descriptor": self._descriptor.descriptor_doc["uid"],
+                    "seq_nums": {"start": rows["start"] + 1, "stop": rows["stop"] + 1},
+                }
+            self._emit(name, document)
+
+    def _end(self, reason: str, failed: bool) -> None:
+        status = "fail" if failed and self._exit == "success" else self._exit
+        stop = self._run.compose_stop(exit_status=status, reason=reason)
+        self._emit("stop", stop | {"num_events": {STREAM: self._stream.rows}})
+        self._run = None
+
+
+def json_lines(stream: TextIO) -> Emit:
+    """Writes each document as one line, as bluesky's own JSONLinesWriter does, and flushes it."""
+
+    def emit(name: str, document: Mapping[str, Any]) -> None:
+        stream.write(json.dumps({"name": name, "doc": document}) + "\n")
+        stream.flush()
+
+    return emit
