@@ -14,30 +14,34 @@ import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from importlib.resources import files
+from threading import Event
 from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
-from starlette.routing import Mount, Route
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from beamline.core.errors import BeamlineError, user_message
 from beamline.page.recording import Recording
 from beamline.page.run_files import PICTURE, Reader
-from beamline.page.tiles import TileRegion, pack
+from beamline.page.tiles import number_of, region_of, tile_of
+from beamline.page.viewer import reader_of, viewer_routes
 from beamline.page.volume import ShownVolume
 from beamline.scan.control import Verb, tell
 
-COOKIE = "splatline_look"
+COOKIE = "splatline_look_"
+"""Name of the cookie, before the port: a browser sends a cookie to all ports of a host."""
 ACT_HEADER = "x-act-token"
 _PERIOD = 0.5  # s between two checks of the file for the feed
-_KEPT = 64  # tiles kept for the next client
+_STATIC = files("beamline.page") / "static"
+_KEPT = 64  # answers kept for the next client
 _HEADERS = {
     b"content-security-policy": b"default-src 'self'; img-src 'self' blob:; object-src 'none'; base-uri 'none'; "
     b"form-action 'none'; frame-ancestors 'none'",
@@ -56,6 +60,7 @@ class Access:
     hosts: Sequence[str]  # what a browser may call this server, each with the port, as in `localhost:8642`
     look: str = field(default_factory=partial(secrets.token_hex, 16))  # the token for looking
     act: str | None = None  # the token for verbs to the scan; None: nobody may act from the page
+    ended: Event = field(default_factory=Event)  # set when the server ends
 
 
 class Guard:
@@ -63,6 +68,7 @@ class Guard:
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
+        self._cookie = COOKIE + access.hosts[0].rpartition(":")[2]
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -78,11 +84,11 @@ class Guard:
         request = Request(scope)
         if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
             await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
-        elif _same(request.cookies.get(COOKIE, ""), self._access.look):
+        elif _same(request.cookies.get(self._cookie, ""), self._access.look):
             await self._app(scope, receive, send_with_headers)
         elif request.url.path == "/" and _same(request.query_params.get("token", ""), self._access.look):
             answer: Response = RedirectResponse("/", 303)
-            answer.set_cookie(COOKIE, self._access.look, httponly=True, samesite="strict")
+            answer.set_cookie(self._cookie, self._access.look, httponly=True, samesite="strict")
             await answer(scope, receive, send_with_headers)
         else:
             text = "This page needs the token in the address that was printed at its start.\n"
@@ -95,8 +101,19 @@ def _same(given: str, expected: str) -> bool:
 
 def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlette:
     """The application. `log`: takes a line for each verb that was sent, with the client's address."""
+    return guarded("index.html", page_routes(reader, access, log), access)
+
+
+def viewer(volumes: Sequence[ShownVolume], access: Access) -> Starlette:
+    """The application for one volume, or two to compare."""
+    return guarded("view.html", viewer_routes(reader_of(volumes)), access)
+
+
+def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> list[BaseRoute]:
+    """What a page of a run asks for; below `view/` its newest volume, by itself and in the viewer."""
     server = _Server(reader, access, log)
-    routes = [
+    return [
+        Mount("/view", begins_with("view.html", viewer_routes(reader.on_volumes))),
         Route("/api/facts", server.facts),
         Route("/api/feed", server.feed),
         Route("/api/columns", server.columns),
@@ -104,26 +121,22 @@ def page(reader: Reader, access: Access, log: Callable[[str], None]) -> Starlett
         Route("/api/frame/{frame:int}", server.frame),
         Route("/api/sinogram", server.sinogram),
         Route("/api/trace", server.trace),
-        Route("/api/volume", server.volume),
-        Route("/api/slice/{axis:int}/{index:int}", server.cut),
         Route("/api/model.png", server.model),
         Route("/api/verb/{verb}", server.verb, methods=["POST"]),
     ]
-    return guarded("index.html", routes, access)
 
 
-def guarded(start: str, routes: Sequence[Route], access: Access) -> Starlette:
+def guarded(start: str, routes: Sequence[BaseRoute], access: Access) -> Starlette:
     """An application of these answers that begins with a page of `static`, behind the guard."""
-    static = files("beamline.page") / "static"
-    pages = [
-        Route("/", lambda request: FileResponse(str(static / start))),
-        Mount("/static", StaticFiles(directory=str(static))),
-    ]
-    return Starlette(
-        routes=[*pages, *routes],
-        middleware=[Middleware(Guard, access=access)],
-        exception_handlers={BeamlineError: _refused},
-    )
+    static = Mount("/static", StaticFiles(directory=str(_STATIC)))
+    return begins_with(start, [static, *routes], [Middleware(Guard, access=access)])
+
+
+def begins_with(start: str, routes: Sequence[BaseRoute], middleware: Sequence[Middleware] = ()) -> Starlette:
+    """An application of these answers that begins with a page of `static`."""
+    text = "".join((_STATIC / name).read_text("utf-8") for name in ("head.html", start))
+    first = Route("/", lambda request: HTMLResponse(text))
+    return Starlette(routes=[first, *routes], middleware=middleware, exception_handlers={BeamlineError: _refused})
 
 
 def _refused(request: Request, error: Exception) -> Response:
@@ -136,24 +149,27 @@ class _Server:
 
     def __init__(self, reader: Reader, access: Access, log: Callable[[str], None]) -> None:
         self._reader, self._access, self._log = reader, access, log
-        self._picture = lru_cache(_KEPT)(self._tile_of)  # pixels of a frame never change
+        self._kept: dict[tuple[object, ...], Response] = {}  # of the reading thread
         self._state: dict[str, Any] = {}
         self._looked = 0.0
         self._looking = asyncio.Lock()
 
     def facts(self, request: Request) -> Response:
         facts = self._reader.do(Recording.facts)
-        return JSONResponse({**facts, "run": self._reader.what.name, "may_act": self._access.act is not None})
+        what = self._reader.what
+        path = str((what.folder or what.scan).resolve())
+        return JSONResponse({**facts, "run": what.name, "path": path, "may_act": self._access.act is not None})
 
     async def feed(self, request: Request) -> Response:
-        """Server-sent events: each event of the run with its number as id, and `state` whenever it changes."""
-        last = request.headers.get("last-event-id", "")
+        """Server-sent events: each event of the run with its number as id, `state` whenever it changes, and `end`."""
+        last = request.headers.get("last-event-id", request.query_params.get("last", ""))
         return StreamingResponse(self._feed(int(last) + 1 if last.isdecimal() else 0), media_type="text/event-stream")
 
     async def _feed(self, first: int) -> AsyncIterator[str]:
-        said = ""
-        while True:
-            state = await self._now()
+        said, ended = "", False
+        while not ended:
+            ended = self._access.ended.is_set()  # then what came last is still told
+            state = await self._now(at_once=ended)
             lines = self._reader.events.lines
             for number in range(first, len(lines)):
                 yield f"id: {number}\nevent: run\ndata: {lines[number]}\n\n"
@@ -162,47 +178,66 @@ class _Server:
             if now != said:
                 said = now
                 yield f"event: state\ndata: {now}\n\n"
-            await asyncio.sleep(_PERIOD)
+            if not ended:
+                await asyncio.sleep(_PERIOD)
+        yield "event: end\ndata: {}\n\n"
 
-    async def _now(self) -> dict[str, Any]:
+    async def _now(self, *, at_once: bool) -> dict[str, Any]:
         """The state, looked at once for all clients."""
         async with self._looking:
-            if time.monotonic() - self._looked > _PERIOD / 2:
+            if at_once or time.monotonic() - self._looked >= _PERIOD:  # so that all ask for the same frame
                 self._state = await run_in_threadpool(self._reader.state)
                 self._looked = time.monotonic()
         return self._state
 
     def columns(self, request: Request) -> Response:
-        return JSONResponse(self._reader.do(lambda recording: recording.columns(_number(request, "first"))))
+        first = number_of(request, "first")
+        return self._of_now(lambda file: JSONResponse(file.columns(first)), "columns", first)
 
     def flags(self, request: Request) -> Response:
-        return JSONResponse(self._reader.do(Recording.flags))
+        return self._of_now(lambda file: JSONResponse(file.flags()), "flags")
 
     def frame(self, request: Request) -> Response:
         frame, corrected = int(request.path_params["frame"]), request.query_params.get("corrected") == "1"
-        return self._picture(frame, region_of(request), corrected)
+        region = region_of(request)
 
-    def _tile_of(self, frame: int, region: TileRegion, corrected: bool) -> Response:
-        values, shown, factor = self._reader.do(lambda file: file.picture(frame, region, corrected=corrected))
-        return tile_of(values, {"frame": frame, "region": astuple(shown), "bin": factor})
+        def made(file: Recording) -> Response:
+            values, shown, factor = file.picture(frame, region, corrected=corrected)
+            return tile_of(values, {"frame": frame, "region": astuple(shown), "bin": factor})
+
+        return self._once(made, lambda file: (frame, region, corrected, file.has_references))
 
     def sinogram(self, request: Request) -> Response:
-        row, first = _number(request, "row"), _number(request, "first")
-        lines, views, factor = self._reader.do(lambda file: file.sinogram(row, first))
-        return tile_of(lines, {"views": views.tolist(), "bin": factor})
+        row, first = number_of(request, "row"), number_of(request, "first")
+
+        def made(file: Recording) -> Response:
+            lines, views, factor = file.sinogram(row, first)
+            return tile_of(lines, {"views": views.tolist(), "bin": factor})
+
+        return self._of_now(made, "sinogram", row, first)
 
     def trace(self, request: Request) -> Response:
-        region, first = region_of(request), _number(request, "first")
-        values = self._reader.do(lambda recording: recording.trace(region, first))
-        return JSONResponse({"first": first, "values": values})
+        region, first = region_of(request), number_of(request, "first")
+        return self._of_now(
+            lambda file: JSONResponse({"first": first, "values": file.trace(region, first)}), "trace", region, first
+        )
 
-    def volume(self, request: Request) -> Response:
-        return JSONResponse(self._reader.on_volume(ShownVolume.facts))
+    def _of_now(self, make: Callable[[Recording], Response], *asked: object) -> Response:
+        """An answer that holds until there are more frames."""
+        return self._once(make, lambda file: (file.progress(), *asked))
 
-    def cut(self, request: Request) -> Response:
-        axis, index = int(request.path_params["axis"]), int(request.path_params["index"])
-        values, _, factor = self._reader.on_volume(lambda volume: volume.cut(axis, index, region_of(request)))
-        return tile_of(values, {"axis": axis, "index": index, "bin": factor})
+    def _once(self, make: Callable[[Recording], Response], key: Callable[[Recording], tuple[object, ...]]) -> Response:
+        """The answer that many ask for at the same time, made once: all are made in the reading thread."""
+
+        def kept(file: Recording) -> Response:
+            found = key(file)
+            if found not in self._kept:
+                self._kept[found] = make(file)
+                if len(self._kept) > _KEPT:
+                    del self._kept[next(iter(self._kept))]
+            return self._kept[found]
+
+        return self._reader.do(kept)
 
     def model(self, request: Request) -> Response:
         """The live picture: newest view, the volume seen from there, their difference in noise."""
@@ -223,25 +258,3 @@ class _Server:
             return JSONResponse({"message": f"There is nothing here that can be told to {name}."}, 404)
         self._log(f"{name}, asked for from {client}")
         return JSONResponse({"state": str(tell(folder, Verb(name)))})
-
-
-def tile_of(values: Any, facts: dict[str, Any]) -> Response:
-    """A header in JSON, its length before it as u4, and the numbers of `tiles.Packed`."""
-    packed = pack(values)
-    head = json.dumps({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
-    padded = head.encode() + b" " * (-len(head.encode()) % 4)
-    body = len(padded).to_bytes(4, "little") + padded + packed.numbers.tobytes()
-    return Response(body, media_type="application/octet-stream")
-
-
-def _number(request: Request, name: str) -> int:
-    given = request.query_params.get(name, "0")
-    return int(given) if given.isdecimal() and len(given) < 10 else 0
-
-
-def region_of(request: Request) -> TileRegion:
-    """`region=first_row,last_row,first_col,last_col`; the whole picture where it is not that."""
-    edges = request.query_params.get("region", "").split(",")
-    if len(edges) == 4 and all(edge.isdecimal() and len(edge) < 10 for edge in edges):
-        return TileRegion(*map(int, edges))
-    return TileRegion(0, 10**9, 0, 10**9)

@@ -55,6 +55,11 @@ class Recording:
         with suppress(RuntimeError, OSError, ValueError):
             self._file.close()
 
+    @property
+    def has_references(self) -> bool:
+        """Whether a picture has been divided by flats."""
+        return self._dark_and_flat is not None
+
     def progress(self) -> ScanProgress:
         values = committed, finished, status = [
             self._file[name] for name in (layout.COMMITTED, layout.FINISHED, layout.STATUS)

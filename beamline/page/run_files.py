@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,9 +100,9 @@ class Reader:
         """The result of `read`, called in the reading thread. NotReadyError, DataError: the file gives nothing."""
         return self._thread.submit(lambda: read(self._open())).result()
 
-    def on_volume(self, read: Callable[[ShownVolume], _Result]) -> _Result:
-        """The result of `read` on the newest volume, likewise. DataError: there is no volume."""
-        return self._thread.submit(lambda: read(self._newest_volume())).result()
+    def on_volumes(self, read: Callable[[Sequence[ShownVolume]], _Result]) -> _Result:
+        """The result of `read` on the newest volume alone, likewise. DataError: there is no volume."""
+        return self._thread.submit(lambda: read([self._newest_volume()])).result()
 
     def state(self) -> dict[str, Any]:
         """Frames in the file, its status, seconds since the last frame, free bytes, name of the newest volume."""
@@ -141,4 +141,9 @@ class Reader:
             if before is not None:
                 before.close()
             self._volume, self._volume_file = ShownVolume(file.path), file
+            self._thread.submit(self._read_more)
         return self._volume
+
+    def _read_more(self) -> None:
+        if self._volume is not None and self._volume.read_more():
+            self._thread.submit(self._read_more)

@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from threading import Event
 
 import psutil
 import uvicorn
@@ -45,6 +46,18 @@ def open_port(bind: str, port: int) -> socket.socket:
     raise ConfigError(f"The page finds no port at {bind} from {port} on ({reason}). Name another by --port.")
 
 
+class _Server(uvicorn.Server):
+    """A server that says when it ends, so that feeds of open pages end by themselves."""
+
+    def __init__(self, config: uvicorn.Config, ended: Event) -> None:
+        super().__init__(config)
+        self._ended = ended
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._ended.set()
+        await super().shutdown(sockets)
+
+
 class PageServer:
     """A server that is ready to run, with known addresses."""
 
@@ -52,11 +65,12 @@ class PageServer:
         self._listening = listening
         root = f"http://{access.hosts[0]}/?token={access.look}"
         self.addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
-        self._server = uvicorn.Server(
+        self._server = _Server(
             uvicorn.Config(
                 app, log_level="warning", access_log=False, lifespan="off",
                 timeout_graceful_shutdown=1, limit_concurrency=200, server_header=False,
-            )
+            ),
+            access.ended,
         )  # fmt: skip
 
     def run(self) -> None:

@@ -1,12 +1,15 @@
-"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers."""
+"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers; answers that hold them."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from starlette.requests import Request
+from starlette.responses import Response
 
 MOST = 1024
 """Pixels that a tile has along an axis, at most."""
@@ -42,6 +45,10 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
     """Means of blocks of pixels, rows x columns; those left over at the last row and column are means of fewer."""
     if factors == (1, 1):
         return pixels.astype(np.float32)
+    (rows, cols), (down, across) = pixels.shape, factors
+    if rows % down == cols % across == 0:  # a third of the time
+        blocks = pixels.reshape(rows // down, down, cols // across, across)
+        return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))
     starts = [np.arange(0, n, factor) for n, factor in zip(pixels.shape, factors, strict=True)]
     sums = np.add.reduceat(np.add.reduceat(pixels.astype(np.float32), starts[0], 0), starts[1], 1)
     counts = [np.minimum(factor, n - first) for n, factor, first in zip(pixels.shape, factors, starts, strict=True)]
@@ -64,3 +71,26 @@ def pack(values: NDArray[np.float32]) -> PackedValues:
     scale = (high - low) / (_GREATEST - 1) or 1.0
     numbers = np.rint((np.where(finite, values, low) - np.float32(low)) / np.float32(scale))
     return PackedValues(np.where(finite, np.clip(numbers, 0, _GREATEST - 1), _GREATEST).astype("<u2"), low, scale)
+
+
+def tile_of(values: Any, facts: dict[str, Any]) -> Response:
+    """A header in JSON, its length before it as u4, and the numbers of `pack`."""
+    packed = pack(values)
+    head = json.dumps({**facts, "shape": packed.numbers.shape, "offset": packed.offset, "scale": packed.scale})
+    padded = head.encode() + b" " * (-len(head.encode()) % 4)
+    body = len(padded).to_bytes(4, "little") + padded + packed.numbers.tobytes()
+    return Response(body, media_type="application/octet-stream")
+
+
+def number_of(request: Request, name: str) -> int:
+    """A whole number of a query; 0 where it is not that."""
+    given = request.query_params.get(name, "0")
+    return int(given) if given.isdecimal() and len(given) < 10 else 0
+
+
+def region_of(request: Request) -> TileRegion:
+    """`region=first_row,last_row,first_col,last_col`; the whole picture where it is not that."""
+    edges = request.query_params.get("region", "").split(",")
+    if len(edges) == 4 and all(edge.isdecimal() and len(edge) < 10 for edge in edges):
+        return TileRegion(*map(int, edges))
+    return TileRegion(0, 10**9, 0, 10**9)

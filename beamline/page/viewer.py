@@ -1,86 +1,106 @@
-"""The viewer's server: one or two volumes as a page, slice by slice."""
+"""Answers of the viewer: one or two volumes, slice by slice."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import astuple
-from typing import TypeVar
+from dataclasses import astuple, replace
+from typing import Protocol, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from beamline.core.errors import DataError
-from beamline.page.app import Access, guarded, region_of, tile_of
-from beamline.page.tiles import TileRegion
-from beamline.page.volume import ShownVolume
+from beamline.page.tiles import region_of, tile_of
+from beamline.page.volume import ShownVolume, VolumeTile
 
 _Result = TypeVar("_Result")
 
 
-def viewer(volumes: Sequence[ShownVolume], access: Access) -> Starlette:
-    """The application for one volume, or two to compare."""
-    server = _Viewer(volumes)
-    routes = [
+class OnVolumes(Protocol):
+    """Calls a function with the volumes, in the one thread that reads them, and returns its result."""
+
+    def __call__(self, read: Callable[[Sequence[ShownVolume]], _Result]) -> _Result: ...
+
+
+def viewer_routes(do: OnVolumes) -> list[Route]:
+    """What the page of one volume, or of two to compare, asks for."""
+    server = _Viewer(do)
+    return [
         Route("/api/volumes", server.facts),
         Route("/api/slice/{which:int}/{axis:int}/{index:int}", server.cut),
         Route("/api/difference/{axis:int}/{index:int}", server.difference),
         Route("/api/histogram/{which:int}", server.histogram),
         Route("/api/profile/{which:int}/{axis:int}/{index:int}", server.profile),
     ]
-    return guarded("view.html", routes, access)
+
+
+def reader_of(volumes: Sequence[ShownVolume]) -> OnVolumes:
+    """A thread that reads these volumes, also before anybody asks."""
+    thread = ThreadPoolExecutor(1, thread_name_prefix="viewer")
+
+    def read_more() -> None:
+        """A slice of a volume that is not read whole yet; then what was asked for in the meantime goes first."""
+        if any(volume.read_more() for volume in volumes):
+            thread.submit(read_more)
+
+    thread.submit(read_more)
+    return lambda read: thread.submit(lambda: read(volumes)).result()
+
+
+def tile_of_volume(tile: VolumeTile) -> Response:
+    """A tile of a slice; `ready` below 1: it gets better while the volume is read."""
+    return tile_of(tile.values, {"region": astuple(tile.region), "bin": tile.bin, "ready": tile.ready})
 
 
 class _Viewer:
-    """Each answer is computed in one thread, as HDF5 asks for."""
-
-    def __init__(self, volumes: Sequence[ShownVolume]) -> None:
-        self._volumes, self._thread = volumes, ThreadPoolExecutor(1, thread_name_prefix="viewer")
+    def __init__(self, do: OnVolumes) -> None:
+        self._do = do
 
     def facts(self, request: Request) -> Response:
-        return JSONResponse(self._do(lambda: [volume.facts() for volume in self._volumes]))
+        return JSONResponse(self._do(lambda volumes: [volume.facts() for volume in volumes]))
 
     def cut(self, request: Request) -> Response:
-        volume, axis, index = self._volume(request), *_place(request)
-        return _picture(*self._do(lambda: volume.cut(axis, index, region_of(request))))
+        axis, index = _place(request)
+        return tile_of_volume(self._on(request, lambda volume: volume.cut(axis, index, region_of(request))))
 
     def difference(self, request: Request) -> Response:
         """The second volume less the first one; DataError unless both have one shape."""
-        if len({volume.shape for volume in self._volumes}) != 1 or len(self._volumes) != 2:
-            raise DataError("A difference is of two volumes of the same shape.")
         (axis, index), region = _place(request), region_of(request)
-        first, second = self._do(lambda: [volume.cut(axis, index, region) for volume in self._volumes])
-        return _picture(second[0] - first[0], *first[1:])
+
+        def cuts(volumes: Sequence[ShownVolume]) -> list[VolumeTile]:
+            if len({volume.shape for volume in volumes}) != 1 or len(volumes) != 2:
+                raise DataError("A difference is of two volumes of the same shape.")
+            return [volume.cut(axis, index, region) for volume in volumes]
+
+        first, second = self._do(cuts)
+        if first.values.shape != second.values.shape:  # one of them has scales
+            raise DataError("The two volumes have this slice at two resolutions; zoom in.")
+        return tile_of_volume(replace(first, values=second.values - first.values, ready=min(first.ready, second.ready)))
 
     def histogram(self, request: Request) -> Response:
-        return JSONResponse(self._do(self._volume(request).histogram))
+        return JSONResponse(self._on(request, ShownVolume.histogram))
 
     def profile(self, request: Request) -> Response:
-        volume, axis, index = self._volume(request), *_place(request)
+        axis, index = _place(request)
         try:
             line = [float(word) for word in request.query_params.get("line", "").split(",")]
             if len(line) != 4 or not all(abs(each) < 1e6 for each in line):
                 raise ValueError
         except ValueError:
             raise DataError("A profile is along a line: first row, first column, last row, last column.") from None
-        return JSONResponse(self._do(lambda: volume.profile(axis, index, line)))
+        return JSONResponse(self._on(request, lambda volume: volume.profile(axis, index, line)))
 
-    def _volume(self, request: Request) -> ShownVolume:
+    def _on(self, request: Request, read: Callable[[ShownVolume], _Result]) -> _Result:
         which = int(request.path_params["which"])
-        if which >= len(self._volumes):
-            raise DataError(f"Volume {which} is not shown here.")
-        return self._volumes[which]
 
-    def _do(self, read: Callable[[], _Result]) -> _Result:
-        return self._thread.submit(read).result()
+        def read_it(volumes: Sequence[ShownVolume]) -> _Result:
+            if which >= len(volumes):
+                raise DataError(f"Volume {which} is not shown here.")
+            return read(volumes[which])
 
-
-def _picture(values: NDArray[np.float32], shown: TileRegion, factor: int) -> Response:
-    return tile_of(values, {"region": astuple(shown), "bin": factor})
+        return self._do(read_it)
 
 
 def _place(request: Request) -> tuple[int, int]:

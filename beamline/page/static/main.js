@@ -36,7 +36,7 @@ async function showFrame(index) {
     frame.extent = facts.shape;
     const part = frame.zoom > 1 ? `&region=${frame.seen().join(",")}` : "";
     try {
-      const tile = await fetchTile(`/api/frame/${wanted}?corrected=${$("corrected").checked ? 1 : 0}${part}`);
+      const tile = await fetchTile(`api/frame/${wanted}?corrected=${$("corrected").checked ? 1 : 0}${part}`);
       current = wanted;
       const chosen = frameWindows[windowKey()] ??= usualWindow(tile), spread = chosen[1] - chosen[0];
       if (frame.window !== chosen) { frame.window = chosen; setFrameWindow([chosen[0] - spread / 2, chosen[1] + spread / 2], chosen); }
@@ -53,7 +53,10 @@ function nameFrame() {
   $("frame-slider").value = current;
   $("frame-flags").replaceChildren(...flags.filter((flag) => flag.frame === current).map((flag) => {
     const check = facts.checks.find((each) => each.name === flag.check) || { meaning: "", unit: "" };
-    return element("li", `${flag.check}${flag.alarm ? " (alarm)" : ""}: ${check.meaning}${flag.score === null ? "" : `; ${flag.score.toPrecision(3)} ${check.unit}`}`, flag.alarm ? "alarm" : "flag");
+    const item = element("li", `${flag.check}${flag.alarm ? " (alarm)" : ""}: ${check.meaning}${flag.score === null ? "" : `; ${flag.score.toPrecision(3)} ${check.unit}`}`, flag.alarm ? "alarm" : "flag");
+    const said = advice.filter((each) => each.check === flag.check && each.frame <= current).pop() || advice.find((each) => each.check === flag.check);
+    if (said) item.append(element("p", said.frame === current ? said.advice : `Frame ${said.frame}: ${said.advice}`));
+    return item;
   }));
   timeline.show(flags, planned || frames, current);
 }
@@ -63,10 +66,12 @@ $("newest").addEventListener("change", () => { if ($("newest").checked) showFram
 $("corrected").addEventListener("change", () => showFrame(current));
 
 // --- flags -------------------------------------------------------------------------------------------------------
-const timeline = new Timeline($("flags"), { go: (index) => { $("newest").checked = false; showFrame(index); } });
+const advice = [];  // flags as the monitor told them; of a series it tells some
+function go(index) { $("newest").checked = false; showFrame(index); }
+const timeline = new Timeline($("flags"), { go });
 
 async function fetchFlags() {
-  flags = await (await fetch("/api/flags")).json();
+  flags = await (await fetch("api/flags")).json();
   const marked = new Set(flags.map((flag) => flag.frame)).size;
   $("flag-count").textContent = `${marked} of ${frames} frames`;
   nameFrame();
@@ -87,7 +92,7 @@ async function fetchSinogram() {
   strip.busy = true;
   const mine = strip;
   try {
-    const first = strip.views.length ? strip.views[strip.views.length - 1] + 1 : 0, tile = await fetchTile(`/api/sinogram?row=${row}&first=${first}`);
+    const first = strip.views.length ? strip.views[strip.views.length - 1] + 1 : 0, tile = await fetchTile(`api/sinogram?row=${row}&first=${first}`);
     mine.cols = tile.shape[1]; mine.bin = tile.bin;
     for (let i = 0; i < tile.shape[0]; i++) mine.lines.push(Float32Array.from(tile.numbers.subarray(i * mine.cols, (i + 1) * mine.cols), (number) => tile.offset + tile.scale * number));
     mine.views.push(...tile.views);
@@ -124,16 +129,17 @@ function place(axis, row, col) {
 
 
 async function fetchVolume() {
-  const answer = await fetch("/api/volume");
+  const answer = await fetch("view/api/volumes");
   if (!answer.ok) return;
   const first = volume === null, before = volume;
-  volume = await answer.json();
-  $("volume-name").textContent = `${volume.name}: ${volume.method}${volume.views ? `, views 1 to ${volume.views}` : ""}, ${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}`;
+  [volume] = await answer.json();
+  $("volume-name").textContent = `${volume.name}: ${volume.method ? `${volume.method}, ` : ""}${volume.views ? `views 1 to ${volume.views}, ` : ""}${volume.shape.join(" x ")} voxels, ${new Date(1000 * volume.changed).toLocaleTimeString()}`;
   const changed = !before || before.shape.join() !== volume.shape.join();
   for (let axis = 0; axis < 3; axis++) {
     $(`at${axis}`).max = volume.shape[axis] - 1;
     if (changed) $(`at${axis}`).value = Math.floor(volume.shape[axis] / 2);
   }
+  $("viewer-link").hidden = false;
   if (first) { const [low, high] = volume.window; setVolumeWindow([low - (high - low), high + (high - low)], volume.window); slices.forEach((slice) => { slice.window = volume.window; }); }
   await Promise.all([0, 1, 2].map(showSlice));
   fetchModel();
@@ -144,14 +150,15 @@ async function showSlice(axis) {
   const index = Number($(`at${axis}`).value);
   $(`where${axis}`).textContent = position(volume, axis, index);
   try {
-    const tile = await fetchTile(`/api/slice/${axis}/${index}`);
+    const tile = await fetchTile(`view/api/slice/0/${axis}/${index}`);
     if (Number($(`at${axis}`).value) === index) slices[axis].show(tile, [volume.shape[PLANES[axis][0]], volume.shape[PLANES[axis][1]]]);
+    if (tile.ready < 1) { clearTimeout(slices[axis].again); slices[axis].again = setTimeout(() => showSlice(axis), 800); }
   } catch (error) { $("volume-value").textContent = error.message; }
 }
 for (let axis = 0; axis < 3; axis++) $(`at${axis}`).addEventListener("input", debounce(() => showSlice(axis), 40));
 
 async function fetchModel() {
-  const answer = await fetch("/api/model.png");
+  const answer = await fetch("api/model.png");
   $("model").hidden = !answer.ok;
   if (!answer.ok) return;
   const before = $("model-picture").src;
@@ -165,7 +172,7 @@ const LABELS = { light: ["frame", "mean counts"], trace: ["frame", "mean counts 
 async function fetchTrace() {
   if (!region) return;
   const line = curves.trace, chosen = region;
-  const found = await (await fetch(`/api/trace?region=${chosen.join(",")}&first=${line.y.length}`)).json();
+  const found = await (await fetch(`api/trace?region=${chosen.join(",")}&first=${line.y.length}`)).json();
   if (chosen !== region || found.first !== line.y.length) return;
   found.values.forEach((value) => { line.x.push(line.y.length); line.y.push(value); });
   drawCurve();
@@ -174,11 +181,11 @@ async function fetchTrace() {
 function drawCurve() {
   const kind = $("curve").value, data = kind === "light" ? { x: columns.mean.map((_, i) => i), y: columns.mean } : curves[kind];
   const style = getComputedStyle(document.body), colour = style.getPropertyValue("--faint"), line = style.getPropertyValue("--line");
-  const axis = (label) => ({ label, stroke: colour, grid: { stroke: line, width: 1 }, ticks: { stroke: line } });
+  const axis = (label, size) => ({ label, size, stroke: colour, grid: { stroke: line, width: 1 }, ticks: { stroke: line } });
   const unit = kind === "beam" && curves.beam.unit ? `beam, ${curves.beam.unit}` : LABELS[kind][1];
   if (!plot || plot.kind !== kind) {
     if (plot) plot.destroy();
-    plot = new uPlot({ width: $("plot").clientWidth, height: 260, scales: { x: { time: false } }, axes: [axis(LABELS[kind][0]), axis(unit)], series: [{ label: LABELS[kind][0] }, { label: unit, stroke: style.getPropertyValue("--accent"), width: 1.5, points: { show: data.x.length < 60 } }] }, [data.x, data.y], $("plot"));
+    plot = new uPlot({ width: $("plot").clientWidth, height: 260, scales: { x: { time: false } }, axes: [axis(LABELS[kind][0], 50), axis(unit, 70)], series: [{ label: LABELS[kind][0] }, { label: unit, stroke: style.getPropertyValue("--accent"), width: 1.5, points: { show: data.x.length < 60 } }] }, [data.x, data.y], $("plot"));
     plot.kind = kind;
   } else plot.setData([data.x, data.y]);
 }
@@ -191,9 +198,9 @@ function onRun(event) {
   const data = JSON.parse(event.data), live = data.source === "recon";
   switch (data.event) {
     case "run_started": planned = data.n_frames; log(data, `Scan of ${data.sample}: ${data.n_frames} frames planned`); break;
-    case "state": if (!live) { state = data.state; $("message").textContent = data.message; } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
+    case "state": if (!live) { state = data.state; $("message").textContent = data.message; $("said").textContent = ""; } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
     case "frame": rate = data; ledger.exposed = Math.max(ledger.exposed, data.n); curves.rate.x.push(data.n); curves.rate.y.push(data.frames_per_s); break;
-    case "flag": log(data, `${data.check} (${data.level}), frame ${data.frame}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning"); break;
+    case "flag": advice.push(data); log(data, `${data.check} (${data.level}), frame ${data.frame}: ${data.advice}`, data.level === "alarm" ? "failed" : "warning", data.frame); break;
     case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;
     case "progress": if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
     case "enough": log(data, `${data.n_views} of ${data.planned} views are enough: the others would add ${data.mean.toFixed(2)} dB (${data.low.toFixed(2)} to ${data.high.toFixed(2)})`); break;
@@ -211,9 +218,16 @@ function point(line, x, y) {
   else { line.x.push(x); line.y.push(y); }
 }
 
-function log(data, text, kind = "") {
+/** A line of the log; of a flag it leads to its frame. */
+function log(data, text, kind = "", at = null) {
   const item = element("li", "", kind), time = element("time", new Date(1000 * data.time).toLocaleTimeString());
   item.append(time, element("span", text));
+  if (at !== null) {
+    const button = element("button", "show");
+    button.setAttribute("aria-label", `show frame ${at}`);
+    button.addEventListener("click", () => { go(at); $("view").scrollIntoView({ block: "center" }); });
+    item.append(button);
+  }
   $("log").prepend(item);
   while ($("log").children.length > 300) $("log").lastChild.remove();
 }
@@ -228,7 +242,7 @@ async function onState(event) {
   header(now);
   if (grew) {
     $("frame-slider").max = Math.max(0, frames - 1);
-    const added = await (await fetch(`/api/columns?first=${columns.kind.length}`)).json();
+    const added = await (await fetch(`api/columns?first=${columns.kind.length}`)).json();
     if (added.first === columns.kind.length) for (const name of Object.keys(columns)) columns[name].push(...added[name]);
     if ($("newest").checked) showFrame(frames - 1); else nameFrame();
     fetchSinogram();
@@ -257,7 +271,7 @@ function header(now) {
 }
 
 async function begin() {
-  facts = await (await fetch("/api/facts")).json();
+  facts = await (await fetch("api/facts")).json();
   document.title = `${facts.sample} - splatline`;
   $("run").textContent = facts.run;
   $("sinogram-row").max = facts.shape[0] - 1; $("sinogram-row").value = Math.floor(facts.shape[0] / 2);
@@ -265,26 +279,40 @@ async function begin() {
 }
 
 // --- verbs -------------------------------------------------------------------------------------------------------
-if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", "/"); }
+if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", location.pathname); }
 const act = sessionStorage.getItem("act");
 for (const button of document.querySelectorAll("#verbs button")) button.addEventListener("click", async () => {
   const verb = button.dataset.verb;
   if (verb === "abort" && !confirm("Abort the scan? The stage stops at once, and no further frame is taken.")) return;
   $("said").textContent = `${verb}: sent`;
-  const answer = await fetch(`/api/verb/${verb}`, { method: "POST", headers: { "X-Act-Token": act } });
+  const answer = await fetch(`api/verb/${verb}`, { method: "POST", headers: { "X-Act-Token": act } });
   const data = await answer.json().catch(() => ({}));
-  $("said").textContent = answer.ok ? `${verb}: the scan is ${data.state}` : data.message || `${verb}: refused (${answer.status})`;
+  $("said").textContent = answer.ok ? "" : data.message || `${verb}: refused (${answer.status})`;
 });
 
 // --- feed --------------------------------------------------------------------------------------------------------
-const feed = new EventSource("/api/feed");
-feed.addEventListener("run", onRun);
-let handling = Promise.resolve();
-feed.addEventListener("state", (event) => { handling = handling.then(() => onState(event)).catch((error) => { $("said").textContent = error.message; }); });
+let feed = null, over = false, last = "", handling = Promise.resolve();
+function follow() {
+  feed = new EventSource(`api/feed?last=${last}`);
+  feed.addEventListener("run", (event) => { last = event.lastEventId; onRun(event); });
+  feed.addEventListener("end", () => { handling = handling.then(onEnd); });
+  feed.addEventListener("state", (event) => { handling = handling.then(() => onState(event)).catch((error) => { $("said").textContent = error.message; }); });
+}
+follow();
+/** The server says that it ends, as with the scan that started it. */
+function onEnd() {
+  over = true; feed.close();
+  for (const button of document.querySelectorAll("#verbs button")) button.disabled = true;
+  $("viewer-link").hidden = true;
+  $("said").textContent = `This page has ended and shows what it had last. ${again()}`;
+}
+function again() { const path = facts ? facts.path : "RUN"; return `To see the run again: beamline watch ${/\s/.test(path) ? `"${path}"` : path}`; }
+// A browser has six connections to a server for all its tabs: one that nobody sees keeps none.
+document.addEventListener("visibilitychange", () => { if (over) return; feed.close(); if (!document.hidden) { lastSeen = Date.now(); follow(); } });
 setInterval(() => {
-  const silent = (Date.now() - lastSeen) / 1000, lost = feed.readyState !== EventSource.OPEN;
+  const silent = (Date.now() - lastSeen) / 1000, lost = !over && !document.hidden && feed.readyState !== EventSource.OPEN;
   document.body.classList.toggle("lost", lost && silent > 3);
-  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; }
+  if (lost && silent > 3) { $("state").textContent = `no connection for ${silent.toFixed(0)} s`; $("state").className = "chip bad"; $("said").textContent = `The scan does not need its page. ${again()}`; }
 }, 1000);
 
 function element(name, text, kind = "") { const made = document.createElement(name); made.textContent = text; if (kind) made.className = kind; return made; }

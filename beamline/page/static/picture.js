@@ -30,10 +30,10 @@ export class Picture {
   /**
    * `extent`: [rows, cols] of the whole picture. Callbacks: `point(row, col, value)` under the pointer (null: outside),
    * `region([r0, r1, c0, c1])` or `line([r0, c0, r1, c1])` chosen with Shift, `moved([r0, r1, c0, c1])` the part that is seen, `draw(context, place)` on top.
-   * `stretch`: rows and columns each fill the canvas.
+   * `stretch`: rows and columns each fill the canvas. `choosing`: says that a drag chooses without Shift, as on a tablet.
    */
-  constructor(canvas, { point = () => {}, region = null, line = null, moved = () => {}, draw = () => {}, stretch = false } = {}) {
-    Object.assign(this, { canvas, point, region, line, moved, drawOver: draw, stretch });
+  constructor(canvas, { point = () => {}, region = null, line = null, moved = () => {}, draw = () => {}, stretch = false, choosing = () => false } = {}) {
+    Object.assign(this, { canvas, point, region, line, moved, drawOver: draw, stretch, choosing });
     this.extent = [1, 1]; this.window = [0, 1]; this.zoom = 1; this.centre = [0.5, 0.5];
     this.image = document.createElement("canvas"); this.tile = null; this.dragged = null; this.pending = false;
     new ResizeObserver(() => this.redraw()).observe(canvas);
@@ -136,7 +136,7 @@ export class Picture {
 
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
-    this.dragged = { x: event.clientX, y: event.clientY, from: this.place(event), choose: event.shiftKey && (this.region || this.line) };
+    this.dragged = { x: event.clientX, y: event.clientY, from: this.place(event), choose: (event.shiftKey || this.choosing()) && (this.region || this.line) };
   }
 
   drag(event) {

@@ -19,6 +19,7 @@ function addRow(title, facts, url) {
     box.append(canvas);
     row.pictures.push(new Picture(canvas, {
       point: (r, c, value) => { $("value").textContent = r === null ? "" : `${title}, ${place(row, axis, r, c)}: ${value.toPrecision(5)} ${facts.unit}`; },
+      choosing: () => $("measure").checked,
       line: (line) => { profiled = { axis, line, row }; showProfile(); },
       moved: () => follow(row, axis),
       draw: (context, { x }) => drawScale(context, canvas, x, row, axis),
@@ -74,7 +75,18 @@ async function showSlice(row, axis) {
     if (!row.window) { const high = Math.max(...usualWindow(tile).map(Math.abs)); setWindow(row, [-high, high]); }
     picture.window = row.window;
     picture.show(tile, extent, tile.region);
+    if (tile.ready < 1) again(row, axis, tile.ready);
+    else if (reading.size && reading.delete(picture) && !reading.size) { $("reading").textContent = ""; showHistogram(); }
   } catch (error) { $("value").textContent = error.message; }
+}
+
+/** Pictures of a volume that the server still reads are fetched until it has read all. */
+const reading = new Set();
+function again(row, axis, ready) {
+  const picture = row.pictures[axis];
+  $("reading").textContent = ` ${(100 * ready).toFixed(0)} % read`;
+  reading.add(picture);
+  clearTimeout(picture.again); picture.again = setTimeout(() => showSlice(row, axis), 800);
 }
 
 async function showAxis(axis) {
@@ -110,38 +122,53 @@ function drawWindow(plot) {
   }
 }
 
+/** Width of the strongest body along a profile at half of its height over the profile's ends; null where it reaches an end. */
+function widthOf({ distance, values }) {
+  const base = (values[0] + values.at(-1)) / 2, height = values.map((value) => Math.abs(value - base)), top = height.indexOf(Math.max(...height));
+  const half = height[top] / 2, side = (step) => {
+    let i = top;
+    while (height[i] > half && i + step in height) i += step;
+    if (height[i] > half) return null;
+    const before = i - step, share = (height[before] - half) / (height[before] - height[i]);
+    return distance[before] + share * (distance[i] - distance[before]);
+  };
+  const [from, to] = half > 0 ? [side(-1), side(1)] : [null, null];
+  return from === null || to === null ? null : to - from;
+}
+
 async function showProfile() {
   const { axis, line, row } = profiled;
   const found = await Promise.all(volumes.map((facts, which) => {
     const scaled = line.map((value, i) => { const side = PLANES[axis][i % 2]; return value * facts.shape[side] / row.facts.shape[side]; });
-    return json(`/api/profile/${which}/${axis}/${indexIn(facts, axis)}?line=${scaled.join(",")}`);
+    return json(`api/profile/${which}/${axis}/${indexIn(facts, axis)}?line=${scaled.join(",")}`);
   }));
   const distance = found[0].distance;  // of the same line in steps of the first volume's voxels
   const lines = found.map((each, i) => ({ name: volumes[i].name, values: distance.map((d, k) => each.values[Math.round(k * (each.values.length - 1) / Math.max(distance.length - 1, 1))]) }));
-  $("profile-name").textContent = `${distance.at(-1).toPrecision(4)} ${volumes[0].length_unit} across ${NAMES[axis]}`;
+  const unit = volumes[0].length_unit, widths = found.map(widthOf).map((width, i) => width === null ? "" : `; ${volumes.length > 1 ? `${volumes[i].name}: ` : ""}${width.toPrecision(3)} ${unit} wide at half height`);
+  $("profile-name").textContent = `${distance.at(-1).toPrecision(4)} ${unit} in a slice across ${NAMES[axis]}${widths.join("")}`;
   draw("profile", volumes[0].length_unit, volumes[0].unit, distance, lines, { x: { time: false } });
 }
 
 async function showHistogram() {
-  const found = await Promise.all(volumes.map((_, which) => json(`/api/histogram/${which}`)));
+  const found = await Promise.all(volumes.map((_, which) => json(`api/histogram/${which}`)));
   const x = [...new Set(found.flatMap((each) => each.values))].sort((a, b) => a - b);
   const lines = found.map((each, i) => { const at = new Map(each.values.map((value, k) => [value, each.voxels[k] || null])); return { name: volumes[i].name, values: x.map((value) => at.has(value) ? at.get(value) : undefined) }; });
   draw("histogram", volumes[0].unit || "value", "voxels", x, lines, { x: { time: false }, y: { distr: 3 } });
 }
 
 async function start() {
-  volumes = await json("/api/volumes");
+  volumes = await json("api/volumes");
   const [first, second] = volumes;
   $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.shape.join(" x ")} voxels${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
   document.title = volumes.map((each) => each.name).join(", ");
-  volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `/api/slice/${which}/${axis}/${index}`));
+  volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `api/slice/${which}/${axis}/${index}`));
   const setRange = windowSliders($("window"), (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); });
   const [low, high] = first.window;
   for (const row of rows) row.window = first.window;
   setRange([low - (high - low), high + (high - low)], first.window);
   if (second && first.shape.join() === second.shape.join()) {
     $("difference-window").hidden = false;
-    const row = addRow(`${second.name} less ${first.name}`, { ...first, window: null }, (axis, index) => `/api/difference/${axis}/${index}`);
+    const row = addRow(`${second.name} less ${first.name}`, { ...first, window: null }, (axis, index) => `api/difference/${axis}/${index}`);
     setDifference = windowSliders($("difference-window"), (window) => { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); });
   }
   for (let axis = 0; axis < 3; axis++) {

@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
-from beamline.page.app import page
+from beamline.page.app import page, viewer
 from beamline.page.run_files import Reader, watched
+from beamline.page.runs import RunBrowser
 from beamline.page.serve import Addresses, PageServer, open_port, start
-from beamline.page.viewer import viewer
 from beamline.page.volume import HELD, ShownVolume
 
 
@@ -22,12 +22,13 @@ class Served:
         self.addresses, self.log = addresses, log
         self.host = addresses.look.split("/")[2]
         self.token = addresses.look.partition("token=")[2]
+        self.cookie = f"splatline_look_{self.host.rpartition(':')[2]}"
 
     def ask(
         self, path: str, method: str = "GET", *, token: str | None = None, headers: Mapping[str, str] | None = None
     ) -> tuple[int, Mapping[str, str], bytes]:
         """Status, headers and body of the answer."""
-        cookie = {"Cookie": f"splatline_look={self.token if token is None else token}"}
+        cookie = {"Cookie": f"{self.cookie}={self.token if token is None else token}"}
         connection = http.client.HTTPConnection(self.host, timeout=20)
         connection.request(method, path, headers={**cookie, **(headers or {})})
         answer = connection.getresponse()
@@ -42,6 +43,14 @@ def viewed(*paths: Path, held: int = HELD) -> Iterator[Served]:
     with ExitStack() as opened:
         volumes = [opened.enter_context(closing(ShownVolume(path, held=held))) for path in paths]
         yield opened.enter_context(_running(start(lambda access: viewer(volumes, access), open_port("127.0.0.1", 0))))
+
+
+@contextmanager
+def listed(folder: Path) -> Iterator[Served]:
+    """The page of a folder of runs."""
+    with ExitStack() as opened:
+        runs = opened.enter_context(closing(RunBrowser(folder)))
+        yield opened.enter_context(_running(start(runs.app, open_port("127.0.0.1", 0))))
 
 
 @contextmanager

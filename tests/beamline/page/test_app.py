@@ -4,6 +4,7 @@ import http.client
 import json
 import struct
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.monitor.check import Level
+from beamline.page.recording import Recording
 from beamline.page.run_files import EventLog, watched
 from beamline.page.serve import open_port
 from beamline.storage.volumes.base import bare_record
@@ -60,6 +62,14 @@ def test_the_printed_address_gives_a_cookie_that_no_script_and_no_other_site_use
     assert {"httponly", "samesite=strict"} <= set(headers["set-cookie"].lower().split("; "))
 
 
+def test_a_second_page_on_this_machine_leaves_the_first_one_its_cookie(page: Served, run: Path) -> None:
+    with served(run) as other:
+        names = {
+            each.ask(f"/?token={each.token}", token="")[1]["set-cookie"].partition("=")[0] for each in (page, other)
+        }
+    assert len(names) == 2
+
+
 def test_another_name_that_leads_here_is_refused(page: Served) -> None:
     assert page.ask("/api/facts", headers={"Host": "evil.example"})[0] == 421
 
@@ -103,6 +113,17 @@ def test_a_frame_comes_as_numbers(page: Served) -> None:
     np.testing.assert_allclose(values, SCAN.counts()[6], atol=0.51 * float(str(head["scale"])))
 
 
+def test_what_many_ask_for_at_once_is_read_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[int] = []
+    picture, columns = Recording.picture, Recording.columns
+    monkeypatch.setattr(Recording, "picture", lambda *said, **more: (read.append(said[1]), picture(*said, **more))[1])
+    monkeypatch.setattr(Recording, "columns", lambda *said: (read.append(said[1]), columns(*said))[1])
+    with served(run) as page, ThreadPoolExecutor(8) as clients:
+        asked = ["/api/frame/20?corrected=0", "/api/columns?first=7"] * 8
+        answers = {body for _, _, body in clients.map(page.ask, asked)}
+    assert (len(answers), sorted(read)) == (2, [7, 20])
+
+
 @pytest.mark.parametrize("query", ["region=x", "region=1,2", "region=-1,2,3,4", "region=9999999999,1,1,1"])
 def test_an_invalid_region_means_the_whole_frame(page: Served, query: str) -> None:
     assert tile(page.ask(f"/api/frame/10?{query}")[2])[0]["region"] == [0, 4, 0, 40]
@@ -111,14 +132,14 @@ def test_an_invalid_region_means_the_whole_frame(page: Served, query: str) -> No
 def test_what_is_not_there_is_a_sentence(page: Served) -> None:
     status, _, body = page.ask("/api/frame/999")
     assert (status, "not in the file" in json.loads(body)["message"]) == (404, True)
-    status, _, body = page.ask("/api/volume")
+    status, _, body = page.ask("/view/api/volumes")
     assert (status, json.loads(body)["message"]) == (404, "There is no volume yet.")
 
 
 def test_the_feed_tells_each_event_once_also_after_a_lost_connection(page: Served) -> None:
     def first_lines(page: Served, last: str, n: int) -> list[str]:
         connection = http.client.HTTPConnection(page.host, timeout=20)
-        headers = {"Cookie": f"splatline_look={page.token}", **({"Last-Event-ID": last} if last else {})}
+        headers = {"Cookie": f"{page.cookie}={page.token}", **({"Last-Event-ID": last} if last else {})}
         connection.request("GET", "/api/feed", headers=headers)
         answer = connection.getresponse()
         lines = [answer.readline().decode().strip() for _ in range(n)]
@@ -127,6 +148,17 @@ def test_the_feed_tells_each_event_once_also_after_a_lost_connection(page: Serve
 
     assert first_lines(page, "", 2) == ["id: 0", "event: run"]
     assert first_lines(page, "0", 1) == ["event: state"]
+
+
+def test_a_server_ends_without_a_word_while_a_page_is_open(run: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with served(run) as page:
+        connection = http.client.HTTPConnection(page.host, timeout=20)
+        connection.request("GET", "/api/feed", headers={"Cookie": f"{page.cookie}={page.token}"})
+        answer = connection.getresponse()
+        answer.readline()
+    assert answer.read().endswith(b"event: end\ndata: {}\n\n")
+    connection.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_half_written_event_waits_for_its_end(tmp_path: Path) -> None:
@@ -161,9 +193,10 @@ def test_the_volume_of_a_run_is_shown_once_it_is_there(tmp_path: Path) -> None:
     write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})
     write_volume(tmp_path / "recon.h5", bare_record(tmp_path / "scan.h5", values, (0.2, 0.1, 0.1)))
     with served(tmp_path) as page:
-        facts = json.loads(page.ask("/api/volume")[2])
+        (facts,) = json.loads(page.ask("/view/api/volumes")[2])
         assert (facts["shape"], facts["length_unit"], facts["unit"]) == ([3, 4, 5], "mm", "1/mm")
         assert facts["voxel"] == pytest.approx([0.2, 0.1, 0.1])
-        np.testing.assert_allclose(tile(page.ask("/api/slice/2/4")[2])[1], values[:, :, 4], atol=1e-3)
+        np.testing.assert_allclose(tile(page.ask("/view/api/slice/0/2/4")[2])[1], values[:, :, 4], atol=1e-3)
+        assert b"view.js" in page.ask("/view/")[2]
         write_volume(tmp_path / "recon.h5", bare_record(tmp_path / "scan.h5", values[:2]), replace=True)
-        assert json.loads(page.ask("/api/volume")[2])["shape"] == [2, 4, 5]
+        assert json.loads(page.ask("/view/api/volumes")[2])[0]["shape"] == [2, 4, 5]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -17,74 +14,18 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.scan.control import state_of
 from beamline.scan.states import State
-from tests.beamline.page.served import served, viewed
+from tests.beamline.page.chromium import BEAMLINE, MARKS, WITHIN, Browser, browser, canvas_has_picture, page_of, selenium
+from tests.beamline.page.served import listed, served, viewed
+from tests.beamline.page.test_runs import made
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
-selenium = pytest.importorskip("selenium.webdriver")
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed"),
-]
-WITHIN = 60.0  # s
-
-
-class Browser:
-    """A headless Chromium on one page."""
-
-    def __init__(self) -> None:
-        options = selenium.ChromeOptions()
-        options.binary_location = shutil.which("chromium")
-        for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1400,1800"):
-            options.add_argument(word)
-        options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-        service = selenium.ChromeService(shutil.which("chromedriver"))
-        self.driver = selenium.Chrome(options=options, service=service)
-
-    def open(self, address: str) -> None:
-        """A page; complaints of earlier ones, whose servers have ended, are forgotten."""
-        self.driver.get("about:blank")
-        self.driver.get_log("browser")
-        self.driver.get(address)
-
-    def text(self, name: str) -> str:
-        return str(self.driver.find_element("id", name).text)
-
-    def script(self, code: str) -> object:
-        return self.driver.execute_script(code)
-
-    def until(self, met: Callable[[], object], what: str) -> None:
-        from selenium.webdriver.support.wait import WebDriverWait
-
-        WebDriverWait(self.driver, WITHIN).until(lambda driver: met(), f"{what}; the page says {self.text('status')!r}")
-
-    def click(self, verb: str) -> None:
-        self.driver.find_element("css selector", f"[data-verb={verb}]").click()
-
-    def complaints(self) -> list[str]:
-        """What the browser itself found wrong, but for pictures that are not there yet and the tests' own readbacks."""
-        said = [each["message"] for each in self.driver.get_log("browser")]
-        return [each for each in said if not any(word in each for word in ("model.png", "willReadFrequently"))]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    found = Browser()
-    yield found
-    found.driver.quit()
-
-
-def canvas_has_picture(browser: Browser, name: str) -> object:
-    """The canvas holds more than one grey value."""
-    return browser.script(
-        f"const c = document.getElementById('{name}'); if (!c) return false;"
-        "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;"
-        "const greys = new Set(); for (let i = 0; i < d.length; i += 4) greys.add(d[i]); return greys.size > 3;"
-    )
+__all__ = ["browser"]
+pytestmark = MARKS
 
 
 def test_a_scan_is_watched_paused_resumed_and_stopped(browser: Browser, tmp_path: Path) -> None:
     command = [
-        sys.executable, "-m", "beamline.cli.main", "scan", "configs/simulated.yaml", "--page", "--no-live", "-o",
+        *BEAMLINE, "scan", "configs/simulated.yaml", "--page", "--no-live", "-o",
         str(tmp_path), "--set", "scan.period_s=0.2", "--set", "scan.angles.views=2000",
     ]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as scan:
@@ -137,10 +78,11 @@ def test_what_a_name_holds_is_text(browser: Browser, tmp_path: Path) -> None:
 
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:
     write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
-    with served(tmp_path / "scan.h5") as page:
-        browser.open(page.addresses.look)
+    with page_of([*BEAMLINE, "watch", str(tmp_path / "scan.h5")], r"^watch +(\S+)") as (_, address):
+        browser.open(address)
         browser.until(lambda: canvas_has_picture(browser, "frame"), "a frame is drawn")
     browser.until(lambda: "no connection" in browser.text("state"), "the page says that it has lost the server")
+    assert f"beamline watch {tmp_path / 'scan.h5'}" in browser.text("said")
 
 
 def test_two_volumes_are_compared(browser: Browser, tmp_path: Path) -> None:
@@ -163,3 +105,26 @@ def test_two_volumes_are_compared(browser: Browser, tmp_path: Path) -> None:
         first.send_keys("\ue00e")  # Page Up
         browser.until(lambda: browser.text("where0") == "6", "the next slice")
         assert browser.complaints() == []
+
+
+def test_a_run_is_found_in_the_table_and_opened(browser: Browser, tmp_path: Path) -> None:
+    for day in range(1, 9):
+        made(tmp_path, day, f"sample {day}" if day < 8 else "<img src=x onerror=window.evil=1>")
+    with listed(tmp_path) as page:
+        browser.open(page.addresses.look)
+        find = partial(browser.driver.find_elements, "css selector")
+        browser.until(lambda: len(find("tbody tr")) == 8, "the runs are listed")
+        assert "<img" in find("tbody td:nth-child(2)")[0].text
+        assert browser.script("return window.evil === undefined && document.querySelector('td img') === null")
+        links = [link.get_attribute("href") for link in find("tbody a")]
+        table = browser.driver.current_window_handle
+        for link in links:  # more tabs than a browser has connections to one server
+            browser.driver.switch_to.new_window("tab")
+            browser.driver.get(link)
+            browser.until(lambda: canvas_has_picture(browser, "frame"), "a frame is drawn")
+        assert browser.text("run").startswith("20260101")
+        assert browser.complaints() == []
+        for handle in set(browser.driver.window_handles) - {table}:
+            browser.driver.switch_to.window(handle)
+            browser.driver.close()
+        browser.driver.switch_to.window(table)

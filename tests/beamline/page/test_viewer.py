@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamline.cli import view as view_command
 from beamline.core.errors import DataError
+from beamline.page import slices
 from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
+from beamline.storage.volumes.base import Pixels, bare_record
+from beamline.storage.volumes.files import write_volume
 from tests.beamline.page.served import Served, viewed
 from tests.beamline.page.test_app import tile
 
@@ -85,18 +89,115 @@ def test_nothing_is_answered_without_the_token(pair: Served) -> None:
 
 
 def test_a_large_volume_is_binned_across_y_and_x_alone(files: tuple[Path, Path, Path]) -> None:
-    read: list[tuple[int, int]] = []
-    volume = ShownVolume(files[0], lambda n, of: read.append((n, of)), held=RAMP.nbytes // 8)
-    assert (volume.coarse_bin, read[-1]) == (2, (3, 3))
-    np.testing.assert_array_equal(volume.cut(0, 5, ALL)[0], RAMP[5])
-    values, shown, bin_ = volume.cut(1, 3, ALL)
-    np.testing.assert_array_equal(values, RAMP[::2, 2:4].mean(axis=1).reshape(3, 5, 2).mean(axis=2))
-    assert (shown, bin_) == (TileRegion(0, 6, 0, 10), 2)
+    volume = ShownVolume(files[0], held=RAMP.nbytes // 8)
+    np.testing.assert_array_equal(volume.cut(0, 5, ALL).values, RAMP[5])
+    tile = volume.cut(1, 3, ALL)
+    np.testing.assert_array_equal(tile.values, RAMP[::2, 2:4].mean(axis=1).reshape(3, 5, 2).mean(axis=2))
+    assert (tile.region, tile.bin, tile.ready) == (TileRegion(0, 6, 0, 10), 2, 1.0)
     volume.close()
 
 
+def test_before_it_is_read_whole_the_nearest_slices_stand_for_others(
+    files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slices, "_AT_ONCE", 0)
+    volume = ShownVolume(files[0])
+    expected = {1: [0] * 6, 2: [0, 0, 0, 4, 4, 4], 3: [0, 0, 2, 2, 4, 4]}  # slices read: those that are shown
+    for n, shown in expected.items():
+        tile = volume.cut(2, 7, ALL)
+        assert tile.ready == pytest.approx(n / 6)
+        np.testing.assert_array_equal(tile.values, RAMP[shown, :, 7])
+        np.testing.assert_array_equal(volume.cut(0, 5, ALL).values, RAMP[5])
+        assert volume.read_more()
+    while volume.read_more():
+        pass
+    np.testing.assert_array_equal(volume.cut(2, 7, ALL).values, RAMP[:, :, 7])
+    volume.close()
+    assert not volume.read_more()
+
+
+def test_the_page_of_a_volume_reads_the_rest_by_itself(
+    files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(slices, "_AT_ONCE", 0)
+    with viewed(*files[:2]) as page:
+        for _ in range(2 * SHAPE[0]):  # an answer comes after a slice that waits
+            ready = [tile(page.ask(f"/api/slice/{which}/1/0")[2])[0]["ready"] for which in (0, 1)]
+        assert ready == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("name", ["v.ome.zarr", "v", "v.h5", "v.tif", "v.nrrd"])
+def test_every_format_is_shown(tmp_path: Path, name: str) -> None:
+    write_volume(tmp_path / name, bare_record(tmp_path, RAMP, (0.2, 0.1, 0.1)))
+    volume = ShownVolume(tmp_path / name)
+    for axis in range(3):
+        np.testing.assert_array_equal(volume.cut(axis, 3, ALL).values, RAMP.take(3, axis))
+    volume.close()
+
+
+def test_grey_values_of_a_window_are_shown_as_what_they_stand_for(tmp_path: Path) -> None:
+    write_volume(tmp_path / "v.zarr", bare_record(tmp_path, RAMP, (0.2, 0.1, 0.1)), Pixels(16, (0.0, 500.0)))
+    volume = ShownVolume(tmp_path / "v.zarr")
+    np.testing.assert_allclose(volume.cut(0, 3, ALL).values, RAMP[3], atol=0.01)
+    volume.close()
+
+
+FINE = np.random.default_rng(1).random((40, 600, 1500), np.float32)
+
+
+@pytest.fixture(scope="module")
+def scaled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scales") / "v.zarr"
+    write_volume(path, bare_record(path.parent, FINE, (0.1, 0.1, 0.1)))
+    return path
+
+
+def _mean(values: np.ndarray, factor: int) -> np.ndarray:
+    shape = [n // factor for n in values.shape]
+    blocks = values[tuple(slice(n * factor) for n in shape)]
+    return blocks.reshape([part for n in shape for part in (n, factor)]).mean(axis=tuple(range(1, 2 * values.ndim, 2)))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_tile_of_a_volume_with_scales_has_the_resolution_that_it_needs(scaled: Path, axis: int) -> None:
+    volume = ShownVolume(scaled)
+    whole, part = volume.cut(axis, 33, TileRegion(0, 9999, 0, 9999)), volume.cut(axis, 33, TileRegion(3, 30, 20, 260))
+    assert (whole.bin, part.bin, whole.ready) == (1 if axis == 2 else 2, 1, 1.0)
+    np.testing.assert_allclose(whole.values, _mean(FINE, whole.bin).take(33 // whole.bin, axis), atol=1e-6)
+    np.testing.assert_array_equal(part.values, FINE.take(33, axis)[3:30, 20:260])
+    found = volume.profile(axis, 33, (5.5, 20.5, 5.5, 99.5))
+    np.testing.assert_allclose(found["values"], FINE.take(33, axis)[5, 20:100], atol=1e-6)
+    volume.close()
+
+
+def test_no_slice_of_a_volume_with_scales_costs_more_than_a_bounded_read(
+    scaled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    volume = ShownVolume(scaled)
+    monkeypatch.setattr(slices, "_READ", 0)
+    tile = volume.cut(2, 1444, TileRegion(0, 9999, 0, 9999))
+    assert (tile.bin, tile.region) == (8, TileRegion(0, 40, 0, 600))
+    np.testing.assert_allclose(tile.values, _mean(FINE, 8)[:, :, 180], atol=1e-6)
+    monkeypatch.setattr(slices, "_READ", 5 * 2**22)  # five chunks of 16 x 256 x 256
+    assert volume.cut(2, 1444, TileRegion(0, 9999, 0, 9999)).bin > volume.cut(2, 1444, TileRegion(0, 40, 0, 100)).bin
+    volume.close()
+
+
+def test_an_array_of_a_file_with_several_is_shown_by_its_name(tmp_path: Path) -> None:
+    np.savez(tmp_path / "two.npz", a=RAMP, b=3 * RAMP)
+    path = str(tmp_path / "two.npz")
+    with pytest.raises(DataError, match=r"holds 2 volumes .*FILE::NAME"):
+        ShownVolume(tmp_path / "two.npz")
+    found, name = view_command._named(f"{path}::b")
+    volume = ShownVolume(found, dataset=name)
+    assert volume.facts()["name"] == "two.npz::b"
+    np.testing.assert_array_equal(volume.cut(0, 2, ALL).values, 3 * RAMP[2])
+    volume.close()
+    assert view_command._named(path) == (tmp_path / "two.npz", None)
+
+
 def test_a_constant_volume_and_one_without_numbers_are_shown(tmp_path: Path) -> None:
-    for value in (3.0, np.nan):
+    for value in (3.0, np.nan, -65535.0, 3e38):
         np.save(tmp_path / "v.npy", np.full(SHAPE, value, np.float32))
         volume = ShownVolume(tmp_path / "v.npy")
         low, high = volume.facts()["window"]
@@ -105,7 +206,17 @@ def test_a_constant_volume_and_one_without_numbers_are_shown(tmp_path: Path) -> 
         volume.close()
 
 
+def test_a_histogram_of_a_range_beyond_float32(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", np.float32([-3e38, 0, 3e38]).repeat(8).reshape(2, 3, 4))
+    volume = ShownVolume(tmp_path / "v.npy")
+    assert sum(volume.histogram()["voxels"]) == 24
+    volume.close()
+
+
 def test_what_is_no_volume_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", np.ones((0, 3, 3), np.float32))
+    with pytest.raises(DataError, match="holds no voxel"):
+        ShownVolume(tmp_path / "v.npy")
     (tmp_path / "v.h5").write_text("no volume")
     with pytest.raises(DataError):
         ShownVolume(tmp_path / "v.h5")

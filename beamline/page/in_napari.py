@@ -1,0 +1,82 @@
+"""Volumes, labels and Gaussians in napari, each in its place and unit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.storage import hdf5
+from beamline.storage.volume_file import axes_of
+from beamline.storage.volumes.files import opened_volume
+from beamline.storage.writers.recon_file import ReconRecord
+
+
+def show(volumes: Sequence[Path], labels: Path | None) -> None:
+    """Open a window, and return when it is closed.
+
+    Raises:
+        ConfigError: napari is not installed.
+        DataError: a file holds no volume, or the labels are not those of the first.
+    """
+    try:
+        napari: Any = import_module("napari")
+    except ImportError as error:
+        raise ConfigError(
+            f'--napari needs napari, which cannot be loaded here ({error}): pip install "napari[all]".'
+        ) from error
+    with ExitStack() as opened:
+        records = [opened.enter_context(opened_volume(path)) for path in volumes]
+        found = None if labels is None else _labels(labels, records[0])
+        viewer = napari.Viewer(title=", ".join(path.name for path in volumes))
+        for path, record in zip(volumes, records, strict=True):
+            viewer.add_image(_values(record), name=path.name, **_place(record))
+        if found is not None:
+            viewer.add_labels(found[0], name=str(labels), **found[1])
+        if model := records[0].model:
+            size = 2 * np.asarray(model["widths"]).mean(axis=1)
+            viewer.add_points(
+                np.asarray(model["centres"])[:, ::-1], size=size, name="Gaussians",
+                features={"density": np.asarray(model["densities"])}, units=_units(records[0]),
+            )  # fmt: skip
+        napari.run()
+
+
+def _values(record: ReconRecord) -> Any:
+    """What napari slices along any axis: a dataset and a mapped file as they are, other files read."""
+    data = record.volume.data
+    return data if isinstance(data, h5py.Dataset | np.ndarray) else data[:]
+
+
+def _place(record: ReconRecord) -> dict[str, Any]:
+    first = [float(centres[0]) for centres in record.volume.grid.coordinates()]
+    return {"scale": tuple(map(float, record.volume.grid.spacing)), "translate": tuple(first), "units": _units(record)}
+
+
+def _units(record: ReconRecord) -> tuple[str, str, str]:
+    unit = "pixel" if record.length_unit == "px" else record.length_unit
+    return unit, unit, unit
+
+
+def _labels(path: Path, volume: ReconRecord) -> tuple[Any, dict[str, Any]]:
+    """Labels, and their place: that of the volume, or of a part of it where their file states it (`segment`)."""
+    with opened_volume(path) as record:
+        values, place = np.asarray(record.volume.data[:]), _place(volume)
+    if values.shape != volume.volume.grid.shape and h5py.is_hdf5(path):
+        with hdf5.open_hdf5(path) as file:
+            scale, translate = axes_of(file, "entry/data/labels", volume.length_unit)
+        place |= {"scale": scale, "translate": translate}
+    elif values.shape != volume.volume.grid.shape:
+        place["scale"] = None
+    if place["scale"] is None or not np.array_equal(values, values.astype(np.int32)):
+        raise DataError(
+            f"{path} holds {values.dtype} of shape {values.shape}; expected whole numbers of "
+            f"{volume.volume.grid.shape}, as the volume, or the HDF5 file of `beamline segment` of this volume."
+        )
+    return values.astype(np.int32), place

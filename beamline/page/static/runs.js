@@ -1,0 +1,35 @@
+// The runs of a folder as a table, newest first; the name of a folder leads to the page of its run.
+const $ = (name) => document.querySelector(name);
+const PERIOD = 3000;  // ms
+let said = "";
+
+function row(cells, kind, link = null) {
+  const made = document.createElement("tr");
+  cells.forEach((text, i) => {
+    const cell = document.createElement(kind), last = i === cells.length - 1;
+    if (link && last) {
+      const to = document.createElement("a");
+      to.href = link; to.textContent = text; cell.append(to);
+    } else cell.textContent = text;
+    made.append(cell);
+  });
+  return made;
+}
+
+async function show() {
+  try {
+    const answer = await fetch("/api/runs"), text = await answer.text();
+    if (!answer.ok) throw new Error(text);
+    if (text === said) return;
+    said = text;
+    const { folder, head, rows } = JSON.parse(text);
+    document.title = `Runs in ${folder}`;
+    $("#folder").textContent = `${rows.length} ${rows.length === 1 ? "run" : "runs"} in ${folder}`;
+    $("thead").replaceChildren(row(head, "th"));
+    $("tbody").replaceChildren(...rows.map(({ number, cells }) => row(cells, "td", `/run/${number}/`)));
+    $("#said").textContent = "";
+  } catch (error) { $("#said").textContent = error.message; said = ""; }
+}
+
+await show();
+setInterval(() => { if (!document.hidden) show(); }, PERIOD);
