@@ -16,7 +16,7 @@ from beamline.projections.flags import UsableViews
 from beamline.projections.jumps import longest_part
 from beamline.projections.poses import poses_of
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
-from beamline.projections.steps.poses import PosesOfFile
+from beamline.projections.steps.poses import stated_poses
 from beamline.projections.tilt import spread, spread_views
 from beamline.storage.readers.base import ScanSource
 from recon.axis_by_views import COLS, VIEWS, axis_by_views
@@ -42,7 +42,7 @@ def rotation_axis(
         ConfigError: it lies outside the detector.
     """
     axis_col, axis = selection.axis_col, None
-    posed = selection.step(PosesOfFile).table is not None  # opposite views are then no mirror images
+    posed = stated_poses(source, selection) is not None  # opposite views are then no mirror images
     if axis_col is None and (posed or cone_of(source, selection) is not None):
         axis_col, axis = _axis_by_views(source, selection, usable, warn, progress)
     elif axis_col is None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.projections.steps.air import Surface
-from recon.base.arrays import Mask
+from recon.base.arrays import F32, F64, Mask
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -19,9 +19,6 @@ from recon.prep.background import AirSums, Background, matter
 from recon.splatting.initialise import first_volume
 from recon.voxels.fbp import fbp_memory
 from recon.voxels.projector import Projector
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _VOXELS, _VIEWS = 2**20, 180  # at most, of the volume that tells where the sample is
 _RIMS = 6.0, 1.5  # voxels, by round: there an uneven beam piles up, until the second round, in which most is taken off

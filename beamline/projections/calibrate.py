@@ -7,15 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError, DataError
+from beamline.core.errors import DataError
 from beamline.projections.correction import ScanCorrection, at_once_memory
 from beamline.projections.poses import about, pivot_of
 from beamline.projections.selection import Selection, geometry_of, rows_of
-from beamline.projections.steps.poses import PosesOfFile
 from beamline.projections.steps.step import ScanPart, StepDone
 from beamline.storage.readers.base import ScanSource
+from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.calibration.freedom import GeometryChange
@@ -23,7 +22,6 @@ from recon.calibration.learn import COLS, ROWS, LearntGeometry, learn_geometry
 
 _COPIES = 24  # float32 copies of the views looked at while their geometry is learnt
 
-I64 = NDArray[np.int64]
 Seen = Callable[[Selection, I64], Geometry]
 
 
@@ -55,7 +53,7 @@ class Calibrated:
 
     @property
     def axis(self) -> float:
-        """Columns of the detector by which the axis moves in the detector's middle row."""
+        """Displacement of the axis in the detector's middle row, in columns."""
         return self.change.axis + self.off_middle * math.tan(self.change.roll)
 
     def corrected(self, geometry: Geometry, view_ids: I64) -> Geometry:
@@ -82,10 +80,7 @@ def calibrated(
 
     Raises:
         DataError: too few views, or nothing in the beam.
-        ConfigError: a file states poses, too.
     """
-    if selection.step(PosesOfFile).table is not None:
-        raise ConfigError("--calibrate learns what --poses states: give one of them.")
     band = _band(source, selection)
     views = ScanCorrection(source, band, lambda _: None).at_once(frames)
     ids = views.view_ids
@@ -115,8 +110,11 @@ def search_memory(part: ScanPart, terms: frozenset[str]) -> int:
 
 
 def _band(source: ScanSource, selection: Selection) -> Selection:
-    """Rows around the middle of those used, with pixels binned so that a volume of them is quick."""
-    used = rows_of(source, selection)
+    """Rows around the middle of those used, with pixels binned so that a volume of them is quick.
+
+    Of the rows around a region it takes those of the whole volume, for which the region is cut out of it.
+    """
+    used = rows_of(source, replace(selection, rows=selection.axis_rows or selection.rows))
     height = used.stop - used.start
     binning = max(selection.binning, min(math.ceil(source.shape[1] / COLS), height))
     n = min(height, ROWS * binning)

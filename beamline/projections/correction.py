@@ -200,7 +200,10 @@ class ScanCorrection:
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             lost = frames[~alive]
-            self._warn(f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out.")
+            if rows is None:  # in a band it says nothing of the views
+                self._warn(
+                    f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out."
+                )
             data, frames = data[alive], frames[alive]
         damaged = tell_damaged(self._source, self._selection, frames, self._warn)
         if damaged.any() and self._selection.step(Flags).used:

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.rules.treatment import boxes_of, flagged_in_part
+from recon.base.arrays import I64
 from recon.base.binning import bin_views
 from recon.prep.resample import Resampling
 
-WARNED_SHARE = 0.5
-"""Weight of a ray in the region of a warning."""
-
-I64 = NDArray[np.int64]
+WARNED_SHARE = 0.5  # Weight of a ray in the region of a warning
 
 
 @dataclass(frozen=True, eq=False)

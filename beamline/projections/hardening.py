@@ -23,8 +23,8 @@ from recon.voxels.projector import project
 _TUBE = re.compile(r"(\d+(?:\.\d+)?)kV((?:,\w+=\d+(?:\.\d+)?)*)")
 _COLS, _VIEWS = 160, 180  # enough for a curve of three parameters
 _ROUNDS, _SETTLED = 12, 0.01
-_LEAST_SEEN = 0.01  # share by which the largest line integral grows, from which on there is hardening
-_AS_EVEN = 1e-3  # by which the mass may vary more, of itself: noise grows, too
+_LEAST_SEEN = 0.01  # growth of the largest line integral, as a share, from which on there is hardening
+_AS_EVEN = 1e-3  # that the mass may vary more: the correction amplifies noise, too
 _CURVED = 16  # float32 copies of a view while a curve corrects it
 _RAYS, _VOLUMES = 10, 3  # float32 copies of the views and of the volume while a curve is fitted
 _NODE = 40_000  # bytes of a curve for each energy

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.projections.prepared import PreparedProjections
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 
-F32 = NDArray[np.float32]
 Views = tuple[F32, Geometry]
 
 

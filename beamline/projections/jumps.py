@@ -17,6 +17,7 @@ from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
+from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
 from recon.base.volume import Grid
@@ -33,8 +34,6 @@ _ROWS = 16  # binned rows looked at
 _VIEWS = 360  # looked at, and all of parts that have no more than
 _SHORT = 40
 _COPIES = 28  # float32 copies of the views looked at while they are registered
-
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +155,7 @@ class _Views:
 
 @dataclass(frozen=True)
 class _Guess:
-    """Clusters of jumps in which the sample moved, its displacement in each group between all of them, and how well
-    that predicts views."""
+    """A trial of where the sample moved: the jumps, its displacement between them, and how well that predicts views."""
 
     jumps: list[tuple[int, int]]
     moves: list[Displacement]
@@ -340,11 +338,10 @@ def _done(
 
 
 def _parts(jumps: I64, rows: I64) -> I64:
-    """The part that each row belongs to."""
     return np.searchsorted(jumps, rows, side="right").astype(np.int64)
 
 
-def _thinned(group: NDArray[np.int64]) -> I64:
+def _thinned(group: I64) -> I64:
     """At most about `_VIEWS` of the views, all of short groups."""
     step = max(1, math.ceil(group.size / _VIEWS))
     keep = [

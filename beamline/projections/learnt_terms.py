@@ -11,12 +11,15 @@ from beamline.core.errors import DataError
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.steps.step import StepDone
 from recon.base.geometry import Geometry
+from recon.calibration import background, gains
 from recon.calibration.background import background_memory, learn_background
 from recon.calibration.gains import NEAR_AXIS, gains_memory, learn_gains
 
 Progress = Callable[[int, int], None]
 MEMORY: dict[str, Callable[[Geometry], int]] = {"background": background_memory, "gains": gains_memory}
 """Bytes that a term takes at most beside the views."""
+LEAST = {"background": (background.LEAST_VIEWS, 1), "gains": (gains.LEAST_VIEWS, gains.LEAST_COLS)}
+"""Views and columns that a term needs."""
 
 
 def without_learnt_background(views: PreparedProjections, progress: Progress) -> StepDone:
@@ -32,10 +35,7 @@ def without_learnt_background(views: PreparedProjections, progress: Progress) ->
     except ValueError as error:
         raise DataError(f"--calibrate background: {error}. Leave it out.") from error
     judged = f"views held out are left {found.without:.3g} without it and {found.left:.3g} with it"
-    values = {
-        "learnt_background_held_out_before": found.without,
-        "learnt_background_held_out_after": found.left,
-    }
+    values = {"learnt_background_held_out_before": found.without, "learnt_background_held_out_after": found.left}
     if not (found.drift or found.mean):
         said = "Background learnt with the volume: views held out confirm none; nothing taken off."
         return StepDone(said, {"learnt_background": said, **values})

@@ -37,11 +37,7 @@ from recon.prep.defects import SHADOW_REACH, shadowed
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
-_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = (
-    8,
-    16,
-    64,
-)  # for the search of a shadow: views at least and at most, and rows at a time
+_LEAST_VIEWS, _SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,17 +95,16 @@ class OpenBeam:
         }
         return cls(references, settings, photons, factor, n, done)
 
-    def correction(self, rows: slice, shadow: Mask | None, settings: CorrectionSettings | None = None) -> Correction:
+    def correction(self, rows: slice, shadow: Mask | None) -> Correction:
         """The correction of some of the rows read, binned.
 
         Args:
             shadow: bool [row, col] of all rows read, what stands in the beam of all views; None: nothing.
-            settings: None: its own.
 
         Raises:
             ValueError: references that cannot be used.
         """
-        references, settings = self.references.rows(rows), settings or self.settings
+        references, settings = self.references.rows(rows), self.settings
         found = Correction(references, settings, photons=self.photons)
         if shadow is None or not shadow[rows].any():
             return found

@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
 from beamline.projections.selection import Selection, cone_of, pixel_size, rows_of
-from beamline.projections.steps.poses import PosesOfFile
+from beamline.projections.steps.calibrate import Calibrate
+from beamline.projections.steps.poses import stated_poses
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import StepDone
 from beamline.storage.pose_table import PoseTable
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
+from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
 
 _OFF = 0.25  # of the step between two views: an angle that differs by more belongs to another view
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,26 +76,32 @@ def about(geometry: Geometry, pivot: float) -> Geometry:
 
 
 def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses | None:
-    """The poses that the selection's file states of `frames`; None where it names no file.
+    """The poses that the selection's file states of `frames`, or the scan file itself; None without any.
 
     Raises:
         ConfigError: options that do not go together.
         DataError: the file does not fit the scan: the message says how.
     """
-    table = selection.step(PosesOfFile).table
+    table = stated_poses(source, selection)
     if table is None:
         return None
     tilt = selection.step(TiltAndLens)
     if tilt.sought or tilt.tilt_deg:
-        raise ConfigError(f"--tilt turns views that {table.path} states as they were taken: write it to its roll_deg.")
+        raise ConfigError(
+            f"--tilt turns views that {table.path} states as they were taken: write it to the roll_deg of --poses."
+        )
+    if selection.step(Calibrate).geometry:
+        raise ConfigError(
+            f"--calibrate learns what {table.path} states: give one of --calibrate and --poses, or --poses ignore."
+        )
     shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
-    width = source.shape[1]
-    if (far := np.abs(shifts[:, 0]) >= width).any():
+    height, width = source.shape
+    if (far := (np.abs(shifts) >= (width, height)).any(axis=1)).any():
         row = int(np.flatnonzero(far)[0])
         raise DataError(
-            f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} px along a detector of "
-            f"{width} columns; expected pixels of the unbinned detector."
+            f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "
+            f"{shifts[row, 1]:g} rows on a detector of {width} x {height}; expected pixels of the unbinned detector."
         )
     n = source.image_key.size
     every = np.full((n, 4), np.nan)
@@ -159,7 +164,7 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
 
 def require_known(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:
     """DataError where views have no pose."""
-    unknown, table = view_ids[~poses.known(view_ids)], selection.step(PosesOfFile).table
+    unknown, table = view_ids[~poses.known(view_ids)], stated_poses(source, selection)
     if unknown.size and table is not None:
         degrees = np.degrees(source.angles[unknown[0]])
         raise DataError(

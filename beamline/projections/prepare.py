@@ -19,6 +19,7 @@ from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, choose_views, geometry_of, pixel_size, rows_of
 from beamline.projections.steps.calibrate import Calibrate
+from beamline.projections.steps.poses import stated_poses
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
@@ -31,6 +32,7 @@ from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
 from recon.voxels.projector import seen_rays
 
+_SAME_AXIS = 0.05  # columns
 _HELD_OUT_VIEWS = 16
 
 
@@ -78,6 +80,7 @@ def prepare_projections(
     usable = checked_views(source, selection, warn)
     pixel_size(source, selection)
     first = choose_views(source, usable.frames, selection)  # what is wrong is told before any frame is read
+    selection.step(Calibrate).refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
         require_known(poses, source, selection, usable.frames[first])
@@ -88,6 +91,7 @@ def prepare_projections(
         warn_of_tilt(source, selection, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
+    _warn_of_other_axis(source, selection, axis_col, warn)
     moved: dict[str, ViewPlaces] = {}
     rays: dict[str, StepDone] = {}
     phases.enter("jumps", "guesses")
@@ -143,12 +147,23 @@ def prepare_projections(
     found = replace(found, done=done)
     steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
-        progress = {"progress": phases.progress} if isinstance(step, Calibrate) and step.terms else {}
-        done[step.name] = step.apply(found, source.angles[ids], **progress)
+        done[step.name] = step.apply(found, source.angles[ids], phases.progress)
         phases.progress(n, len(steps))
     if spill is not None:
         _fill_unknown(found)
     return found
+
+
+def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:
+    """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
+    table = stated_poses(source, selection)
+    known = None if table is None else table.axis_col
+    if known is None or selection.axis_col is not None or abs(known - axis_col) <= _SAME_AXIS:
+        return
+    warn(
+        f"The poses of {table} go with the rotation axis of that volume, column {known:.2f}; column {axis_col:.2f} is "
+        f"used. Give --axis {known:.2f} to have both."
+    )
 
 
 def _fill_unknown(found: PreparedProjections) -> None:

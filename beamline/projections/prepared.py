@@ -96,6 +96,10 @@ class PreparedProjections:
         factors = self.ray_factors(others)
         return None if factors is None else factors[...]
 
+    def rays_there(self, others: int = 0) -> NDArray[np.float32] | None:
+        """As `ray_weights`, without what the monitor says of views: 0 where nothing was measured."""
+        return replace(self, view_weights=None, shares=None, shares_of=None).ray_weights(others)
+
     def ray_factors(self, others: int = 0) -> RayWeights | None:
         """Weights [view, row, col], computed only where they are asked for; None: one for all rays.
 

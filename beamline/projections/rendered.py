@@ -17,6 +17,11 @@ from recon.prep.background import surface
 from recon.voxels.projector import project
 
 PARAMETERS = "/entry/reconstruction/parameters"
+_NOT_RENDERED = {
+    "columns": "some columns alone", "view_shifts_px": "displacements", "view_roll_deg": "roll",
+    "view_tilt_deg": "tilt", "learnt_background_terms": "a learnt background", "learnt_gains_of_pixels": "learnt gains",
+    "exposure_arc_deg": "an exposure's arc",
+}  # fmt: skip
 
 
 def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[np.float32]]:
@@ -34,15 +39,18 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             axis, pitch = (float(file[f"{PARAMETERS}/{name}"][()]) for name in ("axis_col", "pixel_pitch"))
             taken_off = file.get(f"{PARAMETERS}/background_terms")
             terms = None if taken_off is None else taken_off[()]
-            cropped = f"{PARAMETERS}/columns" in file
+            beyond = [what for name, what in _NOT_RENDERED.items() if f"{PARAMETERS}/{name}" in file]
         except KeyError as error:
             raise DataError(
                 f"{path} is no volume of `beamline recon`: {error.args[0]}. Nothing was looked at."
             ) from None
     if source.cone is not None:
         raise DataError(f"{source.path} is a cone-beam scan; views are compared with volumes of parallel beams only.")
-    if cropped:
-        raise DataError(f"{path} is made of some columns of the detector. Reconstruct all columns of this scan.")
+    if beyond:
+        raise DataError(
+            f"{path} is of views with {' and '.join(beyond)}, which are not rendered here. Reconstruct this scan "
+            "without them, to compare its views."
+        )
     pixel = source.pixel_size_mm or 1.0
     binning = max(1, round(pitch / pixel))
     rows = source.shape[0] // binning

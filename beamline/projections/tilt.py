@@ -28,8 +28,7 @@ _NOTHING = 0.05  # px over the rows, not worth new pixels
 _SURE = 3.0  # standard deviations from which on a tilt is one
 _ROUNDS = 5
 _COPIES = 20  # float32 copies of all bands while their axes are found
-BandsDone = Callable[[int, int], None]
-"""(n, N): so many are done, of so many."""
+BandsDone = Callable[[int, int], None]  # (n, N): so many are done, of so many
 
 
 def with_tilt(

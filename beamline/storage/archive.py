@@ -33,8 +33,7 @@ _IMAGE = 4096  # bytes from which a row of a dataset [frame, row, col] is an ima
 _BLOCK = 2**24  # bytes that are compared at once
 
 
-Progress = Callable[[int, int], None]
-"""Gets how many of how many MB are done."""
+Progress = Callable[[int, int], None]  # Gets how many of how many MB are done
 CountImage = Callable[[NDArray[Any]], None]
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-CODECS = ("blosc2", "bitshuffle-zstd", "bitshuffle-lz4")
-"""The first is the default."""
+CODECS = ("blosc2", "bitshuffle-zstd", "bitshuffle-lz4")  # The first is the default
 
 
 def filter_of(codec: str) -> Mapping[str, Any]:

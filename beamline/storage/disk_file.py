@@ -173,10 +173,7 @@ class DiskFile(UnderHdf5):
             first, end = bisect_left(ends, at), bisect_right(begins, at + n)  # those that it overlaps or touches
             if not any(begins[i] < at + n and ends[i] > at for i in range(first, end)):
                 yield at, n, checksum
-            begins[first:end], ends[first:end] = (
-                [min([at, *begins[first:end]])],
-                [max([at + n, *ends[first:end]])],
-            )
+            begins[first:end], ends[first:end] = ([min([at, *begins[first:end]])], [max([at + n, *ends[first:end]])])
 
     def _checksum(self, at: int, n: int) -> int:
         block, checksum = memoryview(bytearray(min(n, _BLOCK))), 0

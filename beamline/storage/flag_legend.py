@@ -69,8 +69,7 @@ def mark_of(flags: Iterable[Flag]) -> Mark:
 
 
 _PLACES = {check.name: i for i, check in enumerate(CHECKS)}
-UNMARKED = mark_of(())
-"""The value of a frame that no check flagged."""
+UNMARKED = mark_of(())  # The value of a frame that no check flagged
 
 
 @dataclass(frozen=True, eq=False)

@@ -321,7 +321,7 @@ def radians(item: h5py.Dataset, default: str = "") -> NDArray[np.float64]:
 
 
 def copy_attributes(source: h5py.HLObject, target: h5py.HLObject) -> None:
-    """All attributes of an object, with their types and shapes as they are, to one that has none of them."""
+    """Copy all attributes of an object, with their types and shapes; the target has none of these names."""
     for name in source.attrs:
         given = source.attrs.get_id(name)
         made = h5py.h5a.create(target.id, name.encode(), given.get_type(), given.get_space())

@@ -70,6 +70,11 @@ def ingest(
                 f"{source.path} does not say the angles of its {views.sum()} projections: give --angles FILE "
                 "(degrees, one a line). Nothing was written."
             )
+        if source.shifts is not None:
+            raise DataError(
+                f"{source.path} states by how much its views are displaced, which the copy would not. Reconstruct it "
+                "as it is. Nothing was written."
+            )
         if source.altered:
             raise DataError(f"{altered_said(source)} Nothing was written.")
         info = layout.ScanInfo(

@@ -29,8 +29,7 @@ from beamline.storage.writers.exchange_view import add_exchange_view
 from beamline.storage.writers.rows import altered_rows, record_checksums, require_earlier
 from drivers.base.frame import FrameKind
 
-JOINED = "joined.h5"
-"""The file of all parts, in the folder of the run, where its first part is."""
+JOINED = "joined.h5"  # The file of all parts, in the folder of the run, where its first part is
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)

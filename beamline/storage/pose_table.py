@@ -11,7 +11,6 @@ from typing import Literal
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import text_in, write_whole
@@ -19,16 +18,17 @@ from beamline.storage import hdf5
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 from drivers.base.frame import FrameKind
+from recon.base.arrays import F64
 
-_KEYS = "frame", "view", "angle_deg"
+Key = Literal["frame", "view", "angle_deg"]
+IGNORE = "ignore"  # In place of a file: views count as not displaced, whatever their scan file says
+_KEYS: tuple[Key, ...] = "frame", "view", "angle_deg"
 _PIXELS = "shift_col_px", "shift_row_px"
 _TURNS = "roll_deg", "tilt_deg"
 _FOR_PEOPLE = "shift_col_mm", "shift_row_mm"
 _STEEPEST = 85.0  # degrees of tilt
 _LARGEST = 64 * 2**20  # bytes of a CSV
 _HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,20 +40,22 @@ class PoseTable:
         by: what `keys` are: rows of the scan file, views counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
         angles_deg: float64 [row] of the views, to be compared with the scan's; None where the file has none.
-        shifts: float64 [row, 2], (col, row) by which the image is displaced, in `unit`.
+        shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
         turns_deg: float64 [row, 2], roll and tilt, as of `recon.base.geometry.Geometry`.
         unit: "px" of the unbinned detector, or "mm" at the sample.
         frames: of the scan that the file was made with; None: not known.
+        axis_col: of the volume that the poses are of, in columns of the whole detector; None: not known.
     """
 
     path: Path
-    by: Literal["frame", "view", "angle_deg"]
+    by: Key
     keys: F64
     angles_deg: F64 | None
     shifts: F64
     turns_deg: F64
     unit: Literal["px", "mm"] = "px"
     frames: int | None = None
+    axis_col: float | None = None
 
     def __str__(self) -> str:
         return str(self.path)
@@ -81,11 +83,13 @@ class _NoPosesError(Exception):
 
 
 def read_poses(text: str) -> PoseTable:
-    """The table that `FILE`, or `FILE:x,-y` of an NXtomo file, names.
+    """The table that `FILE`, or `FILE:x,-y` of an NXtomo file, names; one without rows for `ignore`.
 
     Raises:
         ValueError: the file cannot be read as poses; the message says why.
     """
+    if text == IGNORE:
+        return PoseTable(Path(IGNORE), "view", np.empty(0), None, np.empty((0, 2)), np.empty((0, 2)))
     match = re.fullmatch(r"(.+):([+-]?[xyz]|0),([+-]?[xyz]|0)", text)
     path = Path(match[1] if match else text)
     try:
@@ -133,17 +137,13 @@ def _of_csv(path: Path, content: str) -> PoseTable:
             raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
     none = np.zeros(len(values))
     shifts, turns = (np.stack([columns.get(name, none) for name in part], axis=1) for part in (_PIXELS, _TURNS))
-    return PoseTable(path, by, keys, angles, shifts, turns)  # type: ignore[arg-type]
+    return PoseTable(path, by, keys, angles, shifts, turns)
 
 
 def _of_hdf5(path: Path, ways: tuple[str, str] | None) -> PoseTable:
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
-        if ways is None and hdf5.text_at(file, "entry/definition") == "NXtomoproc":
-            own = True
-        else:
-            own, table = False, _of_nexus(path, file, ways)
-    if not own:
-        return table
+        if ways is not None or hdf5.text_at(file, "entry/definition") != "NXtomoproc":
+            return _of_nexus(path, file, ways)
     with opened_reconstruction(path) as record:
         return _of_volume(path, record)
 
@@ -158,7 +158,8 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
     none, binning = np.zeros(frames.size), int(said.get("binning", 1))
     shifts = np.asarray(said.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
     turns = np.stack([np.asarray(said.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
-    return PoseTable(path, "frame", frames, angles, shifts, turns)
+    axis = None if "columns" in said or "axis_col" not in said else float(said["axis_col"])
+    return PoseTable(path, "frame", frames, angles, shifts, turns, axis_col=axis)
 
 
 POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
@@ -207,8 +208,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
     return PoseTable(path, "frame", rows.astype(np.float64), None, stacked, np.zeros((rows.size, 2)), "mm", keys.size)
 
 
-def write_poses(path: Path, volume: Path) -> int:
-    """The poses of the views of a volume file as a CSV that `read_poses` reads; how many views.
+def write_poses(path: Path, volume: Path) -> tuple[int, float]:
+    """The poses of the views of a volume file as a CSV that `read_poses` reads; how many views, and the axis' column.
 
     Raises:
         DataError: the volume holds none, `path` exists, or the disk refuses; nothing is left.
@@ -230,4 +231,4 @@ def write_poses(path: Path, volume: Path) -> int:
     for frame, *values in zip(table.keys, *columns, strict=True):
         writer.writerow([int(frame), *(repr(float(value)) for value in values)])
     write_whole(path, text.getvalue())
-    return int(table.keys.size)
+    return int(table.keys.size), float(said["axis_col"])

@@ -60,6 +60,20 @@ def read_volume(
         raise DataError(f"{path} cannot be read ({type(error).__name__}: {error}).") from error
 
 
+def axes_of(
+    file: h5py.File, dataset: str | None, unit: str = "mm"
+) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+    """Spacing and first coordinates (z, y, x) by the arrays z, y, x beside a dataset; None without them in `unit`."""
+    node = None if dataset is None else file.get(dataset)
+    axes = [] if node is None else [node.parent.get(name) for name in "zyx"]
+    if not axes or any(not isinstance(axis, h5py.Dataset) or axis.size < 2 for axis in axes):
+        return None, None
+    if any(axis.attrs.get("units") != unit for axis in axes):
+        return None, None
+    ends = [(float(axis[0]), float(axis[-1]), axis.size) for axis in axes]
+    return tuple((last - low) / (n - 1) for low, last, n in ends), tuple(low for low, _, _ in ends)
+
+
 def _is_numpy(path: Path) -> bool:
     """By its first bytes, whatever its name."""
     with path.open("rb") as file:
@@ -180,6 +194,7 @@ def _only(path: Path, axes: dict[str, int]) -> str:
     volumes = [name for name, n in axes.items() if n == 3]
     if len(volumes) != 1:
         raise DataError(
-            f"{path} holds {len(volumes)} volumes ({', '.join(volumes) or 'none'}); name one as its dataset."
+            f"{path} holds {len(volumes)} volumes ({', '.join(volumes) or 'none'}); name one as its dataset, in `view` "
+            "as FILE::NAME."
         )
     return volumes[0]

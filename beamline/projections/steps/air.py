@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -78,7 +79,9 @@ class Air:
 
         return StepMemory(alone=0 if self.surface == "none" else background_memory(part.geometry))
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
+    def apply(
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
+    ) -> StepDone:
         from beamline.projections.background import without_background
         from recon.base.masks import areas
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, ClassVar
 
+from beamline.core.errors import DataError
 from beamline.projections.steps.step import ScanPart, StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -66,6 +67,11 @@ class Calibrate:
         return frozenset(self.terms).intersection(GEOMETRY)
 
     @property
+    def may_lean(self) -> bool:
+        """Whether views may come out rolled or tilted: a row then shows several slices."""
+        return not self.geometry.isdisjoint({"roll", "tilt"})
+
+    @property
     def needs_finished(self) -> str:
         return "--calibrate is for a finished scan: it needs all views." if self.terms else ""
 
@@ -75,6 +81,19 @@ class Calibrate:
 
         terms = [MEMORY[term](part.geometry) for term in self.terms if term in MEMORY]
         return StepMemory(alone=max([search_memory(part, self.geometry), *terms]))
+
+    def refuse_few(self, used: int, usable: int, cols: int) -> None:
+        """Raises DataError for terms that need more views, used or usable, or more binned columns than there are."""
+        from beamline.projections.learnt_terms import LEAST
+        from recon.calibration.learn import LEAST_VIEWS
+
+        for term in self.terms:
+            (least, wide), views = LEAST.get(term, (LEAST_VIEWS, 1)), used if term in LEAST else usable
+            if views < least or cols < wide:
+                raise DataError(
+                    f"--calibrate {term}: {views} views of {cols} columns are too few; {least} of {wide} are needed. "
+                    "Leave it out. No view was read."
+                )
 
     def learn(
         self,
@@ -89,10 +108,7 @@ class Calibrate:
         return calibrated(source, selection, frames, seen, self.geometry, progress)
 
     def apply(
-        self,
-        views: PreparedProjections,
-        angles: NDArray[np.float64],
-        progress: Callable[[int, int], None] = lambda n, of: None,
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
         if not self.terms:
             return StepDone(parameters={})

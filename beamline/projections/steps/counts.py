@@ -31,11 +31,7 @@ class CountModel:
         choices=get_args(Noise),
     )
     gain: float | None = option(
-        "--gain",
-        None,
-        "Counts a photon, for --noise. Default: as the flats vary.",
-        parse=positive,
-        metavar="COUNTS",
+        "--gain", None, "Counts a photon, for --noise. Default: as the flats vary.", parse=positive, metavar="COUNTS"
     )
 
     def __post_init__(self) -> None:

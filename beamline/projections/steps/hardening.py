@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
@@ -68,7 +69,9 @@ class Hardening:
 
         return StepMemory(alone=0 if self.wanted is None else curve_memory(part.geometry, self))
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
+    def apply(
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
+    ) -> StepDone:
         if self.wanted is None:
             return StepDone("", {"hardening": "not corrected"})
         from beamline.projections.hardening import curve_of

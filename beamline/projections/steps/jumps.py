@@ -48,9 +48,9 @@ class Jumps:
         progress: Callable[[int, int], None],
     ) -> SamplePlaces:
         from beamline.projections.jumps import SamplePlaces, find_jumps, frames_text
-        from beamline.projections.steps.poses import PosesOfFile
+        from beamline.projections.steps.poses import stated_poses
 
-        if selection.step(PosesOfFile).table is not None:  # it states where the sample was
+        if stated_poses(source, selection) is not None:  # it states where the sample was
             return SamplePlaces(usable.frames)
         if self.wanted == "correct":
             return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)

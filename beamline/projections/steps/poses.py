@@ -15,6 +15,22 @@ if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
 
 
+def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
+    """The poses of the option's file, or else the shifts that the scan file states."""
+    import numpy as np
+
+    from beamline.storage.pose_table import PoseTable
+
+    table, shifts = selection.step(PosesOfFile).table, source.shifts
+    if table is not None:
+        return table if table.keys.size else None
+    if shifts is None:
+        return None
+    rows = np.flatnonzero(np.isfinite(shifts).all(axis=1))
+    frames = rows.astype(np.float64)
+    return PoseTable(source.path, "frame", frames, None, shifts[rows], np.zeros((rows.size, 2)), frames=len(shifts))
+
+
 def _table(text: str) -> PoseTable:
     from beamline.storage.pose_table import read_poses
 
@@ -26,7 +42,7 @@ class PosesOfFile:
     """Where views were displaced, rolled and tilted, as a file states it.
 
     Attributes:
-        table: the file's; None: views are straight and not displaced.
+        table: the file's; None: views are displaced as the scan file says (.txrm), or not at all.
     """
 
     name: ClassVar[str] = "poses"
@@ -36,7 +52,7 @@ class PosesOfFile:
         None,
         "Displacement, roll and tilt of each view; no view is resampled. A CSV with view or angle_deg, and "
         "shift_col_px, shift_row_px, roll_deg, tilt_deg. Or a volume that keeps poses. Or an NXtomo file as FILE:x,-y: "
-        "columns grow with x_translation, rows against y_translation.",
+        "columns grow with x_translation, rows against y_translation. ignore: without the shifts that a .txrm states.",
         parse=_table,
         metavar="FILE",
     )

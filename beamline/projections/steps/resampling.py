@@ -80,7 +80,7 @@ class TiltAndLens:
 
     @property
     def tilt_deg(self) -> float:
-        """Degrees by which views are turned, as far as they are known."""
+        """The turn of the views in degrees, as far as it is known."""
         return self.tilt if isinstance(self.tilt, float | int) else 0.0
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
@@ -42,7 +43,9 @@ class Rings:
 
         return StepMemory(alone=removal_memory(part.geometry.n_views, part.geometry.detector_shape, self.way))
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
+    def apply(
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
+    ) -> StepDone:
         from recon.prep.rings import remove_rings_in_place
 
         taken, said = remove_rings_in_place(views.projections.data, angles, self.way)

@@ -228,11 +228,14 @@ class RayStep(PrepStep, Protocol):
 class ScanStep(PrepStep, Protocol):
     """A step on all views of a scan."""
 
-    def apply(self, views: PreparedProjections, angles: NDArray[np.float64]) -> StepDone:
+    def apply(
+        self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
+    ) -> StepDone:
         """Change line integrals, weights and views held out in place.
 
         Args:
             angles: [view] of the stage, radians.
+            progress: takes how much is done, and of how much at most.
 
         Raises:
             DataError: the views do not show what the step needs.

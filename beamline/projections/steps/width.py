@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from beamline.storage.writers.recon_file import Value
     from recon.base.geometry import Geometry
 
+_MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail
 _LEAST_PX = 1.0  # at the edge of the field; `auto` models a motion from there on
 
 
@@ -36,8 +37,8 @@ def _spread(text: str) -> str:
             blur = float(text)
         except ValueError:
             blur = math.nan
-        if not 0 < blur < math.inf:
-            raise ValueError(f"{text!r} is neither none, nor pixel, nor a blur above 0 in pixels, e.g. 0.7")
+        if not 0 < blur <= _MOST_PX:
+            raise ValueError(f"{text!r} is neither none, nor pixel, nor a blur up to {_MOST_PX:g} pixels, e.g. 0.7")
     return text
 
 
@@ -48,9 +49,9 @@ def _arc(text: str) -> str:
             numbers = [float(part) for part in text.split(":")]
         except ValueError:
             numbers = []
-        if not (0 < len(numbers) <= 2 and all(map(math.isfinite, numbers)) and numbers[0] >= 0):
+        if not (0 < len(numbers) <= 2 and all(abs(number) <= _MOST_DEG for number in numbers) and numbers[0] >= 0):
             raise ValueError(
-                f"{text!r} is neither auto, nor none, nor ARC[:READOUT] in degrees with ARC >= 0, e.g. 0.5"
+                f"{text!r} is neither auto, nor none, nor ARC[:READOUT] of 0 to {_MOST_DEG:g} degrees, e.g. 0.5"
             )
     return text
 
@@ -106,7 +107,7 @@ class Width:
         told, motion = self._motion(source), _Motion(0.0, 0.0)
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
         if told is not None:
-            leaning = not geometry.is_straight or selection.step(Calibrate).geometry & {"roll", "tilt"}
+            leaning = not geometry.is_straight or selection.step(Calibrate).may_lean
             bent = geometry.is_cone or leaning
             if self.arc != "auto":
                 motion = told

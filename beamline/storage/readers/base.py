@@ -60,7 +60,7 @@ class ScanSource(ABC):
 
     @property
     def row_period(self) -> float | None:
-        """s by which each row is exposed later than the one above; 0: all together, None: unknown."""
+        """s from the exposure of a row to that of the next; 0: all together, None: unknown."""
         return None
 
     @property
@@ -83,6 +83,14 @@ class ScanSource(ABC):
         """float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit.
 
         NaN where unknown; None where there is no monitor.
+        """
+        return None
+
+    @property
+    def shifts(self) -> NDArray[np.float64] | None:
+        """float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it.
+
+        NaN in other frames; None where it says nothing.
         """
         return None
 

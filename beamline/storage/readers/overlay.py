@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.angle_table import assign
-from beamline.storage.readers.base import WHOLE, Attributes, Quantity, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Quantity, ScanSource, frame_indices
+from beamline.storage.readers.wrapped import WrappedSource
 from drivers.base.frame import Frame, FrameKind
 
 
-class OverlaidSource(ScanSource):
+class OverlaidSource(WrappedSource):
     """A ScanSource with references in front of it: darks, flats, then the frames of `base`.
 
     If darks (flats) are given, those of `base` become INVALID: they stay in place, unused.
@@ -40,7 +41,7 @@ class OverlaidSource(ScanSource):
 
         DataError where shapes or counts do not fit.
         """
-        self._base = base
+        super().__init__(base)
         self._replaced = {FrameKind.DARK: darks, FrameKind.FLAT: flats}
         given = [(kind, images) for kind, images in self._replaced.items() if images is not None]
         for kind, images in given:
@@ -56,9 +57,6 @@ class OverlaidSource(ScanSource):
         self._front_key = np.repeat([int(kind) for kind, _ in given], [len(images) for _, images in given])
         self._angles = None if angles is None else assign(base.image_key, angles, angles_from)
         self._quantity = quantity
-        self.path, self.format, self.shape = base.path, base.format, base.shape
-        self.pixel_size_mm, self.energy_kev = base.pixel_size_mm, base.energy_kev
-        self.cone, self.axis_col = base.cone, base.axis_col
         self._update()
 
     def _update(self) -> None:
@@ -75,10 +73,6 @@ class OverlaidSource(ScanSource):
         has_both = {FrameKind.DARK, FrameKind.FLAT} <= set(self.image_key.tolist())
         stated: Quantity = "counts" if has_both and base.quantity == "unknown" else base.quantity
         self.quantity = self._quantity or stated
-
-    @property
-    def attributes(self) -> Attributes:
-        return self._base.attributes
 
     @property
     def flags(self) -> FrameFlags | None:
@@ -99,13 +93,14 @@ class OverlaidSource(ScanSource):
         return np.where(starts > 0, starts + len(self._front), 0)
 
     @property
-    def checksummed(self) -> bool:
-        return self._base.checksummed
-
-    @property
     def currents(self) -> NDArray[np.float64] | None:
         known = self._base.currents
         return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
+
+    @property
+    def shifts(self) -> NDArray[np.float64] | None:
+        known = self._base.shifts
+        return None if known is None else np.concatenate([np.full((len(self._front), 2), np.nan), known])
 
     @property
     def altered(self) -> frozenset[int]:
@@ -114,10 +109,6 @@ class OverlaidSource(ScanSource):
     @property
     def damaged(self) -> frozenset[int]:
         return frozenset(row + len(self._front) for row in self._base.damaged)
-
-    @property
-    def finished(self) -> bool:
-        return self._base.finished
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         n = len(self._front)
@@ -131,25 +122,9 @@ class OverlaidSource(ScanSource):
             out[~front] = self._base.read(indices[~front] - n, rows)
         return out
 
-    @property
-    def row_period(self) -> float | None:
-        return self._base.row_period
-
-    @property
-    def plan(self) -> Mapping[str, Any]:
-        return self._base.plan
-
     def frames(self, first: int = 0) -> Iterator[Frame]:
         """The frames from `first` on; those of `base` keep what their file knows about them."""
         if len(self._front) or self.dtype != np.uint16:
             return super().frames(first)
         angles = self.angles
         return (replace(frame, angle=float(angles[frame.index])) for frame in self._base.frames(first))
-
-    def refresh(self) -> int:
-        n = len(self._front) + self._base.refresh()
-        self._update()
-        return n
-
-    def close(self) -> None:
-        self._base.close()

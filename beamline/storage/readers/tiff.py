@@ -19,8 +19,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 
 SUFFIXES = (".tif", ".tiff")
-VOLUME = "splatline volume"
-"""Value of `format` in the facts of a file that is a volume of ours, not a scan."""
+VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
 UNREADABLE = (
     tifffile.TiffFileError,
     OSError,

@@ -45,10 +45,7 @@ class TiffStackSource(ScanSource):
         self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
         self.angles = np.full(n, np.nan)
         self.exposures = np.full(n, np.nan)
-        self.facts = {
-            "pages": len(self._tif.pages),
-            "bigtiff": "yes" if self._tif.is_bigtiff else "no",
-        }
+        self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
 
     def _look(self) -> int:
         """Shape, type and place of the frames, and how many there are."""

@@ -25,7 +25,6 @@ _TYPES: dict[int, np.dtype[Any]] = {5: np.dtype("<u2"), 10: np.dtype("<f4")}
 _PER_STORAGE = 100  # images
 _CONE = 1  # of ImageInfo/XrayGeometry
 _ACQUIRED = 0  # of ImageInfo/AcquisitionMode; else a volume
-_LARGEST_SHIFT = 0.5  # px that a view may be shifted by, and is used as it is
 
 
 class TxrmFile:
@@ -88,11 +87,26 @@ class _Views:
         return out
 
 
+class TxrmSource(StacksSource):
+    """A scan of a .txrm, whose views may be displaced."""
+
+    _shifts: NDArray[np.float64] | None = None
+
+    def set_shifts(self, shifts: NDArray[np.float64]) -> None:
+        """Of the views, [view, 2]."""
+        if shifts.any():
+            self._shifts = np.full((self.image_key.size, 2), np.nan)
+            self._shifts[-len(shifts) :] = shifts
+
+    @property
+    def shifts(self) -> NDArray[np.float64] | None:
+        return self._shifts
+
+
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open. `own_angles` False: the caller brings the angles, so the file may lack them.
 
-    DataError where olefile is not installed, or the file holds a volume, a mosaic, views that its own software has to
-    shift, or what cannot be read.
+    DataError where olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
     """
     with hdf5.readable(path):
         file = TxrmFile(path)
@@ -116,7 +130,7 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         raise DataError(f"{path} holds {rows} x {cols} pixels of type {kind}; expected type 5 (uint16) or 10 (float).")
     if n * rows * cols * _TYPES[kind].itemsize > path.stat().st_size:
         raise DataError(f"{path} says that it has {n} images of {rows} x {cols} pixels, and is too small for them.")
-    _refuse(path, file, n)
+    _refuse(path, file)
     stacks = [FrameStack(FrameKind.PROJECTION, "ImageData", _Views(file, path, (max(n, 0), rows, cols), _TYPES[kind]))]
     reference = _TYPES.get(
         file.number("ReferenceData/DataType") or file.number("ReferenceData/ImageInfo/DataType") or 0
@@ -129,7 +143,8 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
             FrameStack(FrameKind.FLAT, "ReferenceData/Image", flat),
             *stacks,
         ]
-    source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
+    source = TxrmSource(path, file, stacks, format="txrm", facts=_facts(file))
+    source.set_shifts(_shifts(path, file, n))
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
         if angles is None:
@@ -140,20 +155,26 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
     return source
 
 
-def _refuse(path: Path, file: TxrmFile, n: int) -> None:
+def _refuse(path: Path, file: TxrmFile) -> None:
     if file.number("ImageInfo/AcquisitionMode") not in (None, _ACQUIRED):
         raise DataError(f"{path} is a volume (.txm) or a single image, not a scan: give the .txrm file.")
     if any(file.number(f"ImageInfo/{name}") for name in ("MosiacColumns", "MosiacRows")):  # as the streams are spelt
         raise DataError(
             f"{path} is a mosaic; expected views of one field each. Stitch it with the microscope's program."
         )
-    shifts = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
-    most = max((float(np.abs(each).max(initial=0)) for each in shifts if each is not None), default=0.0)
-    if not most < _LARGEST_SHIFT:
-        raise DataError(
-            f"{path} holds shifts of its views, up to {most:.3g} pixels, that are not applied here. Export the aligned "
-            "views as TIFFs from the microscope's program, and give their angles with --angles."
-        )
+
+
+def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
+    """Displacement of each image, [view, 2] pixels (col, row).
+
+    The file holds the shift that brings each one back (drift, runout, encoder; txrm2tiff and MBIRTorch move images by
+    it). In a real file the displacement of each view against the one before has the opposite sign, too.
+    """
+    found = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
+    shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in found], axis=1)
+    if not np.isfinite(shifts).all():
+        raise DataError(f"{path}: {(~np.isfinite(shifts)).sum()} of its views' shifts are no numbers: it is damaged.")
+    return shifts
 
 
 def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:

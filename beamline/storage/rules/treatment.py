@@ -13,11 +13,10 @@ from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.monitor.view import PixelBox
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
+from recon.base.arrays import Mask
 
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
 MARGIN = 0.25  # of the region's shorter side, on all sides
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

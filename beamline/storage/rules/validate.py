@@ -30,8 +30,7 @@ from recon.base.units import look_like_counts, look_like_degrees
 
 __all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
 
-Progress = Callable[[int, int], None]
-"""Is told how many of how many frames are done."""
+Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
 _FARTHEST = 1e6  # degrees
 

@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,20 +85,16 @@ class VolumeFormat(Protocol):
     @property
     def suffixes(self) -> tuple[str, ...]:
         """Endings of a file's name; "" for a folder."""
-        ...
 
     @property
     def greys(self) -> bool:
         """Whether it holds grey values of 8 and 16 bits."""
-        ...
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         """Write a new file, slice by slice. OSError where the disk refuses."""
-        ...
 
     def holds(self, path: Path) -> bool:
         """Whether this is a volume in this format, written by this program; False for what cannot be read."""
-        ...
 
     def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
         """The record of such a file; its volume's data are read where they are sliced along z.
@@ -106,7 +102,21 @@ class VolumeFormat(Protocol):
         Raises:
             DataError: cut off or damaged.
         """
-        ...
+
+
+@runtime_checkable
+class VolumeScale(Protocol):
+    """A volume in chunks, read box by box; `coarser`: the same with fewer voxels."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]: ...
+    @property
+    def chunk(self) -> tuple[int, int, int]: ...
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+    @property
+    def coarser(self) -> tuple[VolumeScale, ...]: ...
+    def box(self, first: tuple[int, int, int], end: tuple[int, int, int]) -> NDArray[Any]: ...
 
 
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
@@ -162,6 +172,8 @@ def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
 def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | None = None) -> ReconRecord:
     """The record of a volume without other facts; `spacing` (z, y, x) in mm."""
     dz, dy, dx = spacing or (1.0, 1.0, 1.0)
+    if 0 in values.shape:
+        raise DataError(f"{path} holds no voxel: its shape is {values.shape}; expected [z, y, x].")
     if not math.isclose(dy, dx, rel_tol=1e-3):
         raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be kept.")
     return ReconRecord(

@@ -96,6 +96,11 @@ def opened_volume(path: Path, dataset: str | None = None) -> Iterator[ReconRecor
         with kind.open(path) as record:
             yield record
         return
+    if (path / "zarr.json").is_file() or (path / ".zgroup").is_file() or (path / ".zarray").is_file():
+        raise DataError(
+            f"{path} is a Zarr of another program. OME-Zarr is read where `beamline export` wrote it (version 0.5, "
+            "without compression). Copy this one to a TIFF first, in napari, say."
+        )
     if path.is_dir():
         raise DataError(f"{path} is a folder, and not one of slices that this program wrote; expected {SUFFIXES}.")
     values, spacing = read_volume(path, dataset)

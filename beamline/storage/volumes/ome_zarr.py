@@ -10,7 +10,7 @@ import itertools
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,12 +56,12 @@ class OmeZarr:
         facts = _facts(path)
         assert facts is not None
         try:
-            said = json.loads((path / "0" / _META).read_text(encoding="utf-8"))
-            shape, chunk = tuple(said["shape"]), tuple(said["chunk_grid"]["configuration"]["chunk_shape"])
-            dtype = np.dtype(said["data_type"]).newbyteorder("<")
+            scales = [_opened(path / "0")]
+            while (path / str(len(scales)) / _META).is_file():
+                scales.append(_opened(path / str(len(scales))))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"{path} cannot be read as a volume ({error}): it is cut off, or was changed.") from error
-        yield record_of(facts, _Chunks(path / "0", shape, chunk, dtype))
+        yield record_of(facts, replace(scales[0], coarser=tuple(scales[1:])))
 
 
 class _Scale:
@@ -112,14 +112,23 @@ class _Scale:
                 (row / str(j)).write_bytes(whole.data)
 
 
+def _opened(folder: Path) -> _Chunks:
+    said = json.loads((folder / _META).read_text(encoding="utf-8"))
+    if (codecs := [each["name"] for each in said["codecs"]]) != ["bytes"]:
+        raise ValueError(f"its chunks are encoded by {', '.join(codecs)}, and only plain ones are read")
+    chunk = tuple(said["chunk_grid"]["configuration"]["chunk_shape"])
+    return _Chunks(folder, tuple(said["shape"]), chunk, np.dtype(said["data_type"]).newbyteorder("<"))
+
+
 @dataclass(frozen=True)
 class _Chunks:
-    """The finest scale, which is sliced along z as an array is."""
+    """A scale, which is sliced along z as an array is; of the finest one, `coarser` has the others (`base.Scale`)."""
 
     folder: Path
     shape: tuple[int, int, int]
     chunk: tuple[int, int, int]
     dtype: np.dtype[Any]
+    coarser: tuple[_Chunks, ...] = ()
 
     def __getitem__(self, part: slice) -> NDArray[Any]:
         first, end, step = part.indices(self.shape[0])
@@ -130,15 +139,30 @@ class _Chunks:
             out[mine] = self._row(int(n))[at[mine] % self.chunk[0]]
         return out
 
+    def box(self, first: tuple[int, int, int], end: tuple[int, int, int]) -> NDArray[Any]:
+        """The voxels of a box, from the pages of the files that hold them."""
+        out = np.empty([b - a for a, b in zip(first, end, strict=True)], self.dtype)
+        chunks = [range(a // n, -(-b // n)) for a, b, n in zip(first, end, self.chunk, strict=True)]
+        for at in itertools.product(*chunks):
+            here, there = [], []
+            for i, n, a, b in zip(at, self.chunk, first, end, strict=True):
+                low, high = max(a, i * n), min(b, (i + 1) * n)
+                here.append(slice(low - i * n, high - i * n))
+                there.append(slice(low - a, high - a))
+            out[tuple(there)] = self._read(*at, mapped=True)[tuple(here)]
+        return out
+
     def _row(self, n: int) -> NDArray[Any]:
         (_, high, wide), (_, rows, cols) = self.chunk, self.shape
         across, down = range(-(-cols // wide)), range(-(-rows // high))
         lines = [np.concatenate([self._read(n, i, j) for j in across], axis=2) for i in down]
         return np.concatenate(lines, axis=1)[:, :rows, :cols]
 
-    def _read(self, *at: int) -> NDArray[Any]:
+    def _read(self, *at: int, mapped: bool = False) -> NDArray[Any]:
         path = self.folder.joinpath("c", *map(str, at))
         try:
+            if mapped:
+                return np.memmap(path, self.dtype, "r", shape=self.chunk)
             return np.fromfile(path, self.dtype).reshape(self.chunk)
         except (OSError, ValueError) as error:
             raise DataError(f"{path} cannot be read ({error}): the volume is cut off, or was changed.") from error

@@ -1,4 +1,4 @@
-"""The registry of formats that volumes are written in; it imports none of them, so that help texts can go by it.
+"""The registry of volume formats. It imports no format, so that help texts can use it at no cost.
 
 Adding one takes its class (`base.VolumeFormat`) in a module of this folder, and its line in REGISTRY.
 """

@@ -17,7 +17,7 @@
       progress                  frames_committed, finished, status, missing_triggers
     /exchange                   the same frames as Data Exchange (virtual datasets, put into the group at the end)
 
-image_key holds 0, 1, 2, 3; an alignment frame is 0 there, and -1 in frame_log/kind. image_key_control (a link to it),
+image_key holds 0, 1, 2, 3; an alignment frame is 3 there, and -1 in frame_log/kind. image_key_control (a link to it),
 field_of_view and the entry's attributes `definition` and `version` are ESRF's extensions of NXtomo. Without them its
 programs (nabu) take a file for one of another kind, or leave out its darks and flats. Float frames are no NXtomo (its
 data are NX_INT): they get the same paths under the definition FLOAT_DEFINITION.
@@ -46,8 +46,7 @@ from recon.base.geometry import Geometry
 LIBVER = ("v110", "v110")  # the oldest that can do SWMR and virtual datasets: HDF5 1.10 readers open our files
 NXTOMO = "NXtomo"
 FLOAT_DEFINITION = "splatline_float_projections"
-ESRF_VERSION = 1.5
-"""Version of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest with all of ours."""
+ESRF_VERSION = 1.5  # Version of the paths that nxtomo, tomoscan and nabu look for; 1.5 is the oldest with all of ours
 
 ENTRY = "/entry"
 DETECTOR = "/entry/instrument/detector"
@@ -108,8 +107,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 
-GROWING = (*COLUMNS, VALID, SCORES, REGIONS)
-"""What has a row for each frame, beside the pixels and their preview."""
+GROWING = (*COLUMNS, VALID, SCORES, REGIONS)  # What has a row for each frame, beside the pixels and their preview
 
 RECORDED = (
     IMAGE_KEY, COUNT_TIME, ANGLE, KIND, TRIGGER, FRAMESTAMP, TIME, REPLACES,

@@ -37,10 +37,15 @@ class Record:
     replaces: int = -1
 
 
+def image_key_of(kind: FrameKind) -> int:
+    """The number of NXtomo, which has none for alignment frames: who does not know them must use none."""
+    return int(FrameKind.INVALID if kind is FrameKind.ALIGNMENT else kind)
+
+
 def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
     """CRC-32 [row] of the `layout.RECORDED` columns [row], by their paths.
 
-    The row of a repeated view becomes an invalid frame, but its checksum is still computed for a view.
+    The row of a repeated frame becomes an invalid one, but its checksum is still that of its first kind.
     """
     table = np.empty(len(columns[layout.KIND]), _RECORD)
     for path in layout.RECORDED:
@@ -68,9 +73,10 @@ def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
     checksums = columns[layout.RECORD_CHECKSUM]
     good = np.asarray(record_checksums(columns) == checksums)
     marked = ~good & ((columns[layout.KIND] == FrameKind.INVALID) | (columns[layout.IMAGE_KEY] == FrameKind.INVALID))
-    if marked.any():  # as of a repeated view, whose checksum is that of FrameKind.PROJECTION, 0
-        views = {path: np.zeros_like(columns[path]) for path in (layout.IMAGE_KEY, layout.KIND)}
-        good[marked] = (record_checksums({**columns, **views}) == checksums)[marked]
+    for kind in FrameKind if marked.any() else ():  # as of a repeated frame, whose checksum is that of its kind
+        codes = {layout.IMAGE_KEY: image_key_of(kind), layout.KIND: int(kind)}
+        before = {path: np.full_like(columns[path], code) for path, code in codes.items()}
+        good[marked] |= (record_checksums({**columns, **before}) == checksums)[marked]
     return np.flatnonzero(~good)
 
 
@@ -104,7 +110,7 @@ class Rows:
             self.flush()
             self._first = row
         said = {
-            layout.IMAGE_KEY: 0 if record.kind is FrameKind.ALIGNMENT else int(record.kind),
+            layout.IMAGE_KEY: image_key_of(record.kind),
             layout.KIND: int(record.kind),
             layout.COUNT_TIME: record.exposure,
             layout.ANGLE: math.degrees(record.angle),

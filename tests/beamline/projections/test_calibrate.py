@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +49,8 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def prepared(path: Path, *steps: PrepStep, **selected: object) -> PreparedProjections:
-    chosen = Selection(**{"axis_col": AXIS + 0.8, "steps": (Air("none"), *steps), **selected})  # type: ignore[arg-type]
+    asked: dict[str, Any] = {"axis_col": AXIS + 0.8, "steps": (Air("none"), *steps), **selected}
+    chosen = Selection(**asked)
     with SourceOptions(path).open() as source:
         return prepare_projections(source, chosen, lambda _: None)
 
@@ -74,12 +76,37 @@ def test_binned_pixels_and_chosen_views_take_their_part(scan: Path) -> None:
     assert found.held_out is not None and found.held_out[1].shifts.any()
 
 
+def test_rows_around_a_region_are_placed_as_the_whole_scan_is(scan: Path) -> None:
+    whole = prepared(scan, LEARN)
+    near = prepared(scan, LEARN, rows=(2, 10), axis_rows=(0, 24))
+    np.testing.assert_array_equal(near.geometry.shifts, whole.geometry.shifts)
+    assert near.geometry.axis_col == whole.geometry.axis_col
+
+
+@pytest.mark.parametrize(("off", "given", "told"), [(0.0, None, False), (2.0, None, True), (2.0, AXIS, False)])
+def test_poses_of_a_volume_with_another_axis_are_told(
+    scan: Path, tmp_path: Path, off: float, given: float | None, told: bool
+) -> None:
+    rows = "\n".join(f"{view},{col},{row}" for view, (col, row) in enumerate(JUMP))
+    (tmp_path / "poses.csv").write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
+    warnings: list[str] = []
+    table = read_poses(str(tmp_path / "poses.csv"))
+    with SourceOptions(scan).open() as source:
+
+        def axis_of(known: float | None) -> float:
+            steps = Air("none"), PosesOfFile(replace(table, axis_col=known))
+            return prepare_projections(source, Selection(axis_col=given, steps=steps), warnings.append).axis_col
+
+        axis_of(axis_of(None) + off)
+    assert any("go with the rotation axis of that volume" in each for each in warnings) is told
+
+
 def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Path) -> None:
     assert "it needs all views" in LEARN.needs_finished and Calibrate().needs_finished == ""
     table = tmp_path / "poses.csv"
     rows = "\n".join(f"{view},1,0" for view in range(N))
     table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
-    with pytest.raises(ConfigError, match="--calibrate learns what --poses states"):
+    with pytest.raises(ConfigError, match=r"--calibrate learns what .* states: give one of"):
         prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
     with pytest.raises(ValueError, match="'lean' is not known; choose from axis, roll, tilt, shifts"):
         Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")

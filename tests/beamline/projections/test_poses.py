@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -75,7 +76,8 @@ def every(folder: Path, by: str = "view") -> Path:
 
 def prepared(path: Path, poses: Path | str, **selected: object) -> PreparedProjections:
     steps = (Air("none"), PosesOfFile(read_poses(str(poses))))
-    selection = Selection(**{"axis_col": AXIS, "steps": steps, **selected})  # type: ignore[arg-type]
+    asked: dict[str, Any] = {"axis_col": AXIS, "steps": steps, **selected}
+    selection = Selection(**asked)
     with SourceOptions(path).open() as source:
         return prepare_projections(source, selection, lambda _: None)
 
@@ -199,7 +201,16 @@ def test_poses_that_do_not_fit_the_scan_are_refused(tmp_path: Path) -> None:
     path, views = scan(tmp_path, posed()), np.arange(N)
     for head, columns, match in (
         ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
-        ("view,shift_col_px", (views, np.full(N, 41.0)), "view 0 is displaced by 41 px along a detector of 40 columns"),
+        (
+            "view,shift_col_px",
+            (views, np.full(N, 41.0)),
+            "view 0 is displaced by 41 columns and 0 rows on a detector of 40 x",
+        ),
+        (
+            "view,shift_row_px",
+            (views, np.full(N, 25.0)),
+            "view 0 is displaced by 0 columns and 25 rows on a detector",
+        ),
         ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
         ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose of 40 of the 40 views"),
     ):

@@ -110,7 +110,18 @@ def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: st
     assert _rays(Width(), _source(), Selection().having(Calibrate(("axis", "shifts"))))[1].skew > 0
 
 
-@pytest.mark.parametrize("words", [{"spread": "wide"}, {"spread": "-1"}, {"arc": "-1"}, {"arc": "1:2:3"}, {"arc": "x"}])
+@pytest.mark.parametrize(
+    "words",
+    [
+        {"spread": "wide"},
+        {"spread": "-1"},
+        {"spread": "500"},
+        {"arc": "-1"},
+        {"arc": "1:2:3"},
+        {"arc": "x"},
+        {"arc": "720"},
+    ],
+)
 def test_other_words_are_refused(words: dict[str, str]) -> None:
     (field, text), options = *words.items(), options_of(Width)
     with pytest.raises(ValueError, match="is neither"):

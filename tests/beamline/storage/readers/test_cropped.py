@@ -13,10 +13,11 @@ from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.cropped import CroppedSource
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.wrapped import CroppedSource
 from beamline.storage.rules.treatment import treatment_of
 from recon.prep.resample import Distortion
+from tests.beamline.array_source import ArraySource
 from tests.beamline.storage.readers.test_conformance import FRAMES, SCANS
 
 
@@ -50,13 +51,13 @@ def test_columns_outside_the_detector_are_refused(path: Path, cols: tuple[int, i
         open_scan(SourceOptions(path, cols=cols))
 
 
-class _Flagged:
-    """A scan of 3 frames of 10 x 100 pixels, of which the second has a flag in columns 60 to 70."""
+class _Flagged(ArraySource):
+    """A scan of 3 frames of 10 x 100 pixels. The second one has a flag in columns 60 to 70."""
 
-    path, format, dtype, quantity = Path("scan.h5"), "nxtomo", np.dtype(np.uint16), "counts"
-    shape, pixel_size_mm, energy_kev, cone, axis_col = (10, 100), None, None, None, 52.5
-    row_period = 2e-5
-    image_key, angles, exposures = np.zeros(3, np.int32), np.zeros(3), np.ones(3)
+    axis_col, row_period = 52.5, 2e-5
+
+    def __init__(self) -> None:
+        super().__init__(np.zeros((3, 10, 100), np.uint16), [0, 0, 0], np.zeros(3))
 
     @property
     def flags(self) -> FrameFlags:

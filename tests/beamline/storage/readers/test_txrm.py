@@ -1,19 +1,25 @@
-"""Zeiss's .txrm: no real file is at hand, so the files are written here as two public readers document them."""
+"""Zeiss's .txrm: files written here as two public readers document them, and a real one."""
 
 from __future__ import annotations
 
 import builtins
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter, zoom
 
-from beamline.core.errors import DataError
+from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.poses import PosesOfFile
+from beamline.projections.steps.resampling import TiltAndLens
 from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest
+from beamline.storage.pose_table import read_poses
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import BEAM, TwoCylinders
@@ -131,8 +137,7 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
         ),
         ({"ImageInfo__AcquisitionMode": np.int32(2)}, "a volume"),
         ({"ImageInfo__MosiacRows": np.int32(2)}, "is a mosaic"),
-        ({"Alignment__X-Shifts": np.linspace(-3, 1, 120).astype("<f4")}, "up to 3 pixels, that are not applied"),
-        ({"Alignment__Y-Shifts": np.full(120, np.nan, "<f4")}, "not applied"),
+        ({"Alignment__Y-Shifts": np.full(120, np.nan, "<f4")}, "120 of its views' shifts are no numbers"),
         ({"ReferenceData__Image": b"1234"}, "damaged, or not laid out as it should be"),
     ],
 )
@@ -140,6 +145,51 @@ def test_what_cannot_be_used_is_refused_in_a_line(tmp_path: Path, changes: dict[
     with pytest.raises(DataError, match=message) as refused:
         open_scan(write_compound(tmp_path / "s.txrm", streams(**changes)))
     assert "\n" not in str(refused.value)
+
+
+def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path: Path) -> None:
+    back = np.linspace(-3, 1, 120).astype("<f4")
+    path = write_compound(tmp_path / "s.txrm", streams(**{"Alignment__X-Shifts": back}))
+    selection = Selection(axis_col=SCAN.axis_col)
+    said: list[str] = []
+    with open_scan(SourceOptions(path, cols=(2, 38))) as source:
+        displaced = prepare_projections(source, replace(selection, axis_col=SCAN.axis_col - 2), said.append)
+    with open_scan(SourceOptions(path, flats=VIEWS[:1])) as source:
+        np.testing.assert_allclose(source.shifts, [[np.nan] * 2] * 3 + [[-each, 0] for each in back])
+    with open_scan(path) as source:
+        ignored = prepare_projections(
+            source, replace(selection, steps=(PosesOfFile(read_poses("ignore")),)), pytest.fail
+        )
+        with pytest.raises(ConfigError, match="--tilt turns views"):
+            prepare_projections(source, replace(selection, steps=(TiltAndLens(1.0),)), said.append)
+    np.testing.assert_allclose(displaced.geometry.shifts, np.stack([-back, 0 * back], axis=1))
+    assert "120 poses" in said[0] and "4 px (columns)" in said[0]
+    assert not ignored.geometry.shifts.any()
+    with pytest.raises(DataError, match=r"its views are displaced, which the copy would not.*Nothing was written"):
+        ingest(path, tmp_path / "copy.h5")
+    with open_scan(write_compound(tmp_path / "z.txrm", streams(**{"Alignment__X-Shifts": 0 * back}))) as source:
+        assert source.shifts is None
+
+
+REAL = Path(__file__).parents[5] / "shared" / "data" / "fixtures" / "tomopy_chip_tomo.txrm"
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="the real .txrm is not here")
+def test_views_of_a_real_file_are_displaced_as_it_says() -> None:
+    """The sign: each view against the one before, by phase correlation; what is left is the turn of the sample."""
+    with open_scan(REAL) as source:
+        stated, views = source.shifts, np.log(source.read(slice(None)))
+        assert (source.quantity, source.cone, len(views)) == ("unknown", None, 7)
+    window = np.outer(np.hanning(256), np.hanning(256))
+    spectra = np.fft.fft2((gaussian_filter(views, (0, 2, 2)) - gaussian_filter(views, (0, 12, 12))) * window)
+    peaks = np.fft.fftshift(np.fft.ifft2(spectra[1:] * spectra[:-1].conj()).real, axes=(1, 2))[:, 118:139, 98:159]
+    found = np.array([np.unravel_index(peak.argmax(), peak.shape) for peak in zoom(peaks, (1, 10, 10), order=3)])[
+        :, ::-1
+    ]
+    assert stated is not None
+    across, down = (np.corrcoef(found[:, i], np.diff(stated[:, i]))[0, 1] for i in (0, 1))
+    assert across > 0.8
+    assert down > 0.5
 
 
 def test_a_missing_view_and_a_cut_file_are_told(tmp_path: Path) -> None:

@@ -161,10 +161,21 @@ def test_an_empty_scan_is_still_a_file(tmp_path: Path, clock: StandingClock) -> 
         assert source.pixel_size_mm is None
 
 
-def test_an_alignment_frame_is_a_projection_to_those_who_do_not_know_it(write: Write, frames: list[Frame]) -> None:
+@pytest.mark.parametrize("kind", [FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK, FrameKind.ALIGNMENT])
+def test_a_frame_that_was_taken_again_is_not_taken_for_damaged(
+    write: Write, frames: list[Frame], kind: FrameKind
+) -> None:
+    """As flats and views on the way back are after a time without beam."""
+    first = replace(frames[-1], index=14, kind=kind)
+    path = write([*frames, first, replace(first, index=15, replaces=14)])
+    with open_scan(path) as source:
+        assert (source.altered, source.image_key[14:].tolist()) == (frozenset(), [FrameKind.INVALID, kind])
+
+
+def test_an_alignment_frame_is_no_view_to_those_who_do_not_know_it(write: Write, frames: list[Frame]) -> None:
     path = write([*frames, replace(frames[-1], index=14, kind=FrameKind.ALIGNMENT)])
     with h5py.File(path) as file:
-        assert file["entry/instrument/detector/image_key"][14] == 0
+        assert file["entry/instrument/detector/image_key"][14] == 3
         assert file["entry/instrument/detector/image_key_control"][14] == -1
         assert file["exchange/data"].shape[0] == 9
         assert file["entry/instrument/detector/image_key_control"] == file["entry/frame_log/kind"]

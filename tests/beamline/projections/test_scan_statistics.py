@@ -1,0 +1,85 @@
+"""Statistics of a raw scan are those of numpy over the same frames."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import ConfigError
+from beamline.projections import scan_statistics
+from beamline.projections.scan_statistics import PERCENT, histograms, light_of, statistics_of, table
+from beamline.storage.readers.open import SourceOptions, open_scan
+from drivers.base.frame import FrameKind
+from recon.prep.matter import absorbed_dose
+from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+
+SCAN = TwoCylinders()
+
+
+def test_counts_are_described_exactly_by_kind(tmp_path: Path) -> None:
+    frames, said = frames_of(SCAN), []
+    frames[6].counts[0, :3] = 65535
+    with open_scan(write_flagged(tmp_path / "scan.h5", frames, {})) as source:
+        found = statistics_of(source, lambda n, of: said.append((n, of)))
+    assert [each.kind.name for each in found] == ["DARK", "FLAT", "PROJECTION"]
+    for each in found:
+        pixels = np.stack([frame.counts for frame in frames if frame.kind == each.kind]).astype(float)
+        assert (each.frames, each.of) == (len(pixels), len(pixels))
+        assert (each.minimum, each.maximum) == (pixels.min(), pixels.max())
+        np.testing.assert_allclose((each.mean, each.deviation), (pixels.mean(), pixels.std()), rtol=1e-9)
+        expected = np.percentile(pixels, PERCENT, method="inverted_cdf")
+        np.testing.assert_array_equal(each.percentiles, expected)
+        assert each.saturated == (pixels == 65535).mean()
+        assert each.pixels.sum() == pixels.size
+    assert said[-1] == (2 * len(frames), 2 * len(frames))
+    assert histograms(found).startswith(b"\x89PNG")
+    assert [row[0] for row in table(found)] == ["kind", "dark", "flat", "projection"]
+
+
+def test_few_frames_stand_for_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan_statistics, "FRAMES", 3)
+    with open_scan(write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {})) as source:
+        views = statistics_of(source, lambda n, of: None)[-1]
+    assert (views.kind, views.frames, views.of) == (FrameKind.PROJECTION, 3, SCAN.angles.size)
+
+
+def test_real_numbers_keep_their_range_and_those_that_are_none_are_counted(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    values = rng.normal(0.3, 1, (5, 20, 30)).astype(np.float32)
+    values[0, 0, :6] = np.nan, np.inf, -np.inf, np.nan, np.nan, np.nan
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["data"] = values
+    options = SourceOptions(tmp_path / "s.h5", data_path="data", angles=np.arange(5.0), quantity="line_integrals")
+    with open_scan(options) as source:
+        (views,) = statistics_of(source, lambda n, of: None)
+    good = values[np.isfinite(values)].astype(float)
+    np.testing.assert_allclose((views.mean, views.deviation), (good.mean(), good.std()), rtol=1e-5)
+    expected = np.percentile(good, PERCENT, method="inverted_cdf")
+    np.testing.assert_allclose(views.percentiles, expected, atol=np.ptp(good) / 2**16)
+    assert (views.not_finite, views.saturated) == (pytest.approx(6 / 3000), 0.0)
+
+
+def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
+    path = write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}, pixel_size_mm=0.002, energy_kev=20.0)
+    with open_scan(path) as source:
+        found = statistics_of(source, lambda n, of: None)
+        photons = (found[1].mean - found[0].mean) * 0.25
+        light, dose = light_of(source, found, 0.25, "water")
+        with pytest.raises(ConfigError, match="neither a material"):
+            light_of(source, found, 0.25, "Xx")
+        with pytest.raises(ConfigError, match="no darks and flats"):
+            light_of(source, found[2:], 0.25, None)
+    views = SCAN.angles.size
+    assert light == f"{photons:.4g} photons a pixel and view in the open beam, {photons * views:.4g} in {views} views"
+    expected = absorbed_dose("water", 20.0, photons * views / 0.002**2)
+    assert dose.startswith(f"{expected:.4g} Gy absorbed in water at 20 keV")
+
+
+def test_a_dose_names_what_the_scan_does_not_state(tmp_path: Path) -> None:
+    path = write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}, pixel_size_mm=0.002, energy_kev=None)
+    with open_scan(path) as source:
+        found = statistics_of(source, lambda n, of: None)
+        with pytest.raises(ConfigError, match="does not state its energy"):
+            light_of(source, found, 0.25, "water")

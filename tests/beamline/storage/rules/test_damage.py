@@ -1,0 +1,114 @@
+"""Files that a disk, a memory or another program damaged: frames are named, and nothing is taken from them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.storage.describe import describe
+from beamline.storage.ingest import ingest
+from beamline.storage.recover import recover
+from beamline.storage.rules.validate import validate
+from drivers.base.frame import Frame
+from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.beamline.storage.conftest import SHAPE
+
+Write = Callable[[list[Frame]], Path]
+DETECTOR = "entry/instrument/detector"
+
+
+def flip(path: Path, at: int, bit: int) -> None:
+    """Flip one bit of a file, as a disk or a memory does."""
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1 << bit
+    path.write_bytes(content)
+
+
+def test_a_flipped_bit_of_any_pixel_is_found_in_its_frame(
+    write: Write, frames: list[Frame], rng: np.random.Generator
+) -> None:
+    path = write(frames)
+    with h5py.File(path) as file:
+        offsets = [file[f"{DETECTOR}/data"].id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in range(14)]
+    for row in range(14):
+        at, bit = offsets[row] + int(rng.integers(2 * SHAPE[0] * SHAPE[1])), int(rng.integers(8))
+        flip(path, at, bit)
+        told: list[tuple[int, int]] = []
+        (hit,) = [hit for hit in validate(path, deep=lambda n, of: told.append((n, of))) if hit.rule == "checksums"]  # noqa: B023
+        assert hit.severity == "error"
+        assert f"1 of 14 frames differ from the checksums that were written with them: {row}." in hit.message
+        assert told == [(n, 14) for n in range(1, 15)]
+        flip(path, at, bit)
+    assert validate(path, deep=lambda n, of: None) == []
+
+
+def test_frames_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders())
+    assert [hit.rule for hit in validate(path, deep=lambda n, of: None)] == ["checksums"]  # it has none
+    with h5py.File(path, "r+") as file:
+        data = file["exchange/data"][()]
+        del file["exchange/data"]
+        packed = file.create_dataset("exchange/data", data=data, chunks=(1, *data.shape[1:]), compression="gzip")
+        offset = packed.id.get_chunk_info(30).byte_offset
+    flip(path, offset + 8, 3)
+    (hit,) = [hit for hit in validate(path, deep=lambda n, of: None) if hit.rule == "unreadable"]
+    assert hit.message.startswith("1 frame cannot be read: 34. Frame 30 of /exchange/data in ")
+
+
+def test_frames_of_big_endian_files_are_as_written_when_ingested(tmp_path: Path) -> None:
+    path = write_exchange(tmp_path / "scan.h5", TwoCylinders(), {"data": TwoCylinders().counts().astype(">u2")})
+    ingest(path, tmp_path / "ours.h5")
+
+    def differ() -> list[str]:
+        return [hit.message for hit in validate(tmp_path / "ours.h5", lambda n, of: None) if hit.rule == "checksums"]
+
+    assert differ() == []
+
+
+def test_a_damaged_scan_is_not_ingested(write: Write, frames: list[Frame], tmp_path: Path) -> None:
+    path = write(frames)
+    with h5py.File(path, "r+") as file:
+        file[f"{DETECTOR}/data"][6, 0, 0] ^= 8
+    with pytest.raises(DataError, match=r"Frame 6 of .* checksum differs"):
+        ingest(path, tmp_path / "copy.h5")
+    assert [left.name for left in tmp_path.iterdir()] == ["scan.h5"]
+
+
+ALTERATIONS = {
+    "a null dataspace": h5py.Empty("f4"),
+    "a text": "words",
+    "other dimensions": np.zeros((3, 3, 3, 3)),
+    "a link in a circle": None,
+    "nothing": np.zeros(0),
+    "a negative number": np.int64(-5),
+    "a huge number": np.int64(2**62),
+    "nested lists": "[" * 3000,
+}
+
+
+@pytest.mark.parametrize(
+    "where",
+    ["instrument/detector/image_key", "frame_log/flags", "progress/frames_committed", "progress/status", "record/plan"],
+)
+def test_altered_files_are_described_or_refused_in_words(
+    write: Write, frames: list[Frame], where: str, tmp_path: Path
+) -> None:
+    whole = write(frames)
+    for what, value in ALTERATIONS.items():
+        path = tmp_path / f"{what}.h5"
+        shutil.copy(whole, path)
+        with h5py.File(path, "r+") as file:
+            del file["entry"][where]
+            file["entry"][where] = h5py.SoftLink(f"/entry/{where}") if value is None else value
+        assert isinstance(validate(path, deep=lambda n, of: None), list)
+        for ask in (describe, recover, partial(ingest, out=tmp_path / f"copy of {what}.h5")):
+            with suppress(DataError):
+                ask(path)
