@@ -27,8 +27,7 @@ _STYLES = {
     Grade.NOT_APPLICABLE: "dim",
     Grade.CANNOT_CHECK: "dim",
 }
-_WIDTH = 120
-"""Columns on a stdout that is no terminal."""
+_WIDTH = 120  # Columns on a stdout that is no terminal
 
 
 @click.command()

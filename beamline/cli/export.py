@@ -137,10 +137,10 @@ def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
 
     with terminated_like_interrupted(), json_events(as_json) as sink:
         refuse_existing(output)
-        views = write_poses(output, volume)
-        sink(Done({"output": output, "views": views}, time=SystemClock().now()))
+        views, axis_col = write_poses(output, volume)
+        sink(Done({"output": output, "views": views, "axis_col": axis_col}, time=SystemClock().now()))
     if not as_json:
-        click.echo(f"output  {output} (CSV)\nviews   {views}")
+        click.echo(f"output  {output} (CSV)\nviews   {views}\naxis    give --axis {axis_col:.2f} with these --poses")
 
 
 def _suggestion(record: ReconRecord) -> str:

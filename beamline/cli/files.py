@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -20,32 +20,128 @@ from beamline.core.text import count, printable, size, spans
 from beamline.storage.codecs import CODECS
 from drivers.base.clock import SystemClock
 
+if TYPE_CHECKING:
+    from beamline.projections.returned import ReturnedView
+    from beamline.storage.readers.open import SourceOptions
+
 _PATH = click.Path(path_type=Path)
 
 
 @click.command()
 @click.argument("file", type=_PATH)
 @scan_options
+@click.option("--statistics", is_flag=True, help="Of a scan: range, percentiles, mean, saturated pixels, as stored.")
+@click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: the histograms, as a picture.")
+@click.option(
+    "--photons-per-count", type=POSITIVE, help="With --statistics: of photons at the sample; gives the light."
+)
+@click.option("--dose-in", metavar="MATERIAL", help="With it: the absorbed dose in a material or formula.")
+@click.option("--truth", metavar="FILE", help="Of a volume: PSNR and SSIM against this one (FILE or FILE:first:end).")
+@click.option("--masks", metavar="FILE", type=_PATH, help="Of a volume: SNR and CNR by labels, 1 dense and 2 empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
-def info(file: Path, as_json: bool, **said: Any) -> None:
-    """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format."""
+def info(
+    file: Path,
+    statistics: bool,
+    output: Path | None,
+    truth: str | None,
+    masks: Path | None,
+    as_json: bool,
+    photons_per_count: float | None,
+    dose_in: str | None,
+    **said: Any,
+) -> None:
+    """Describe the scan or volume in FILE: frames, angles, geometry, and problems of its format.
+
+    --statistics looks at up to 64 darks, flats and views each, spread over the scan, before any correction. --masks
+    takes regions that somebody has drawn, such as a TIFF of labels. "SSIM whole slices" has means and variances of
+    whole slices, without windows; "SSIM 3D" is that of reports.
+    """
     from beamline.storage.describe import describe
     from beamline.storage.flag_legend import counted
     from beamline.storage.readers.open import SourceOptions
 
+    light = photons_per_count, dose_in
+    if (output is not None or photons_per_count is not None) and not statistics:
+        raise click.UsageError("-o and --photons-per-count go with --statistics.")
+    if dose_in is not None and photons_per_count is None:
+        raise click.UsageError("--dose-in goes with --photons-per-count.")
+    if statistics and (truth or masks):
+        raise click.UsageError("--statistics is of a scan, --truth and --masks are of a volume: give one of them.")
+    if statistics:
+        _print_statistics(SourceOptions(file, **said), output, light, as_json)
+        return
+    if truth or masks:
+        _print_measured(file, truth, masks, as_json)
+        return
     with json_events(as_json) as sink:
         facts = dict(describe(SourceOptions(file, **said)))
+        returned = _returned(SourceOptions(file, **said)) if "alignment" in facts.get("kinds", {}) else []
+        if returned:
+            facts["returned"] = [vars(view) for view in returned]
         sink(Done(facts, time=SystemClock().now()))
     if as_json:
         return
     attributes, findings = facts.pop("attributes"), facts.pop("findings")
+    facts.pop("returned", None)
     if facts.get("flags") is not None:
         facts["flags"] = counted(facts["flags"])
     width = max(len(name) for name in (*facts, *attributes)) + 2
     for name, value in (facts | attributes).items():
         click.echo(f"{name:<{width}}{_text(value)}")
+    for view in returned:
+        click.echo(f"{'on the way back':<{width}}{view.said()}")
     for message in findings:
         click.echo(f"! {message}")
+
+
+def _returned(scan: SourceOptions) -> list[ReturnedView]:
+    from beamline.projections.returned import returned_views
+    from beamline.storage.readers.open import open_scan
+
+    with open_scan(scan) as source:
+        return returned_views(source)
+
+
+def _print_statistics(
+    scan: SourceOptions, output: Path | None, light: tuple[float | None, str | None], as_json: bool
+) -> None:
+    from beamline.core.files import write_whole
+    from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
+    from beamline.storage.readers.open import open_scan
+
+    clock = SystemClock()
+    with events_shown(as_json) as sink:
+        if output is not None:
+            refuse_existing(output)
+        with open_scan(scan) as source:
+            found = statistics_of(source, counting("statistics", sink, clock))
+            dose = [] if light[0] is None else light_of(source, found, light[0], light[1])
+        rows = table(found)
+        if output is not None:
+            write_whole(output, histograms(found))
+        facts = {kind: dict(zip(rows[0][1:], said, strict=True)) for kind, *said in rows[1:]}
+        sink(Done({**facts, "light": dose, "output": output}, time=clock.now()))
+    if as_json:
+        return
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        click.echo("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)))
+    for line in dose:
+        click.echo(f"light   {line}")
+    if output is not None:
+        click.echo(f"output  {output}")
+
+
+def _print_measured(file: Path, truth: str | None, masks: Path | None, as_json: bool) -> None:
+    from beamline.reconstruct.measure import measured_file
+    from beamline.report.metrics import METRICS, formatted
+
+    with json_events(as_json) as sink:
+        values = measured_file(file, truth, masks)
+        sink(Done(values, time=SystemClock().now()))
+    if not as_json:
+        for name, value in values.items():
+            click.echo(f"{METRICS[name].label:<20}{formatted(name, value)}")
 
 
 def _text(value: Any) -> str:

@@ -16,7 +16,7 @@ from beamline.core.files import RUNS
 @click.argument("runs", required=False, default=RUNS, type=click.Path(path_type=Path, file_okay=False))
 @click.option("--prefix", default="splatline:", show_default=True, help="Of the names.")
 @click.option("--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all.")
-@click.option("--control", is_flag=True, help="PVs by which the scan can be paused, resumed, stopped and aborted.")
+@click.option("--control", is_flag=True, help="Let clients pause, resume, stop and abort the scan.")
 def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
     """Serve the newest run of the folder RUNS (default ./runs) as EPICS process variables, by PVAccess.
 

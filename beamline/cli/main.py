@@ -47,6 +47,7 @@ _COMMANDS = {
     "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves.", files=False),
     "home": _Entry("home", "Search the stage's reference position. The stage turns."),
     "tune": _Entry("tune", "Take a few frames and say which exposure to take."),
+    "align": _Entry("align", "Take a pair of views and say axis, tilt and sharpness, with the corrections."),
     "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
     "runs": _Entry("runs", "List the runs in a folder: sample, frames, state, size, flags.", files=False),
     "watch": _Entry("watch", "Show a run in the browser while it goes on, and afterwards."),
@@ -73,6 +74,8 @@ _COMMANDS = {
     "export": _Entry("export", "Copy a volume to another format, with grey values if wanted."),
     "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
     "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
+    "completion": _Entry("completion", "Print the completion script of a shell.", files=False),
+    "man": _Entry("man", "Print the manual page of a command.", files=False),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }
 

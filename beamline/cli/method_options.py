@@ -229,9 +229,7 @@ _ITERATIONS = click.option(
     help="Iterations of an iterative method. Default: depends on the method.",
 )
 _TV_WEIGHT = click.option(
-    "--tv-weight",
-    type=POSITIVE,
-    help="Weight of the total variation, relative to the density of the sample.",
+    "--tv-weight", type=POSITIVE, help="Weight of the total variation, relative to the density of the sample."
 )
 _ALLOW_NEGATIVE = click.option(
     "--allow-negative",
@@ -256,11 +254,7 @@ method_options = together(
         metavar="30s|2m|1h",
         help="Time from line integrals to volume: chooses method, steps, Gaussians and binning to end in time.",
     ),
-    click.option(
-        "--quality",
-        type=click.Choice(list(PRESETS)),
-        help="Preset of steps and Gaussians.",
-    ),
+    click.option("--quality", type=click.Choice(list(PRESETS)), help="Preset of steps and Gaussians."),
     _GAUSSIANS,
     click.option(
         "--start",

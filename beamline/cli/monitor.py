@@ -69,6 +69,7 @@ def monitor(
     from beamline.projections.flagged_frames import worst_frames
     from beamline.projections.rendered import rendered
     from beamline.projections.replay import replay, verdict
+    from beamline.projections.returned import returned_views
     from beamline.report.contact_sheet import contact_sheet
     from beamline.storage.flag_legend import FrameFlags, counted
     from beamline.storage.readers.open import SourceOptions
@@ -98,6 +99,7 @@ def monitor(
                         sink(FrameFlagged(**vars(flag), time=clock.now()))
                 active = now
             said_of = verdict(source, found, limits)
+            returned = [] if stopped() else returned_views(source)
             if sheet is not None and (worst := worst_frames(source, FrameFlags.of_flags([j.flags for j in found]))):
                 write_whole(sheet, contact_sheet(worst))
         altered = [said_of.altered] if said_of.altered else []
@@ -107,7 +109,7 @@ def monitor(
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
             "flags": said_of.flags, "references": references,
-            "aside": said_of.aside,
+            "aside": said_of.aside, "returned": [vars(view) for view in returned],
             "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in said_of.kinds],
         }  # fmt: skip
         sink(Done(done, time=clock.now()))
@@ -115,7 +117,8 @@ def monitor(
         end = f"{file}: {n} frames, flagged: {counted(said_of.flags)}"
         end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""
         left_out = [f"Not looked at: {'; '.join(said_of.aside)}."] if said_of.aside else []
-        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *left_out, end]))
+        back = [f"On the way back: {view.said()}." for view in returned]
+        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *left_out, *back, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

@@ -76,8 +76,7 @@ _SHEET = ".png"
 
 
 @click.command(
-    cls=Grouped,
-    first=("method", "views", "rows", "binning", "axis", "rings", "budget", "output", "follow", "dry"),
+    cls=Grouped, first=("method", "views", "rows", "binning", "axis", "rings", "budget", "output", "follow", "dry")
 )
 @heading(DATA)
 @config_option
@@ -277,10 +276,7 @@ def recon(
         ),
         (roi and (follow or truth or tries), "--roi does not go with --follow, --truth or --axis try."),
         (tries and follow, "--axis try is for a finished scan: it needs all views."),
-        (
-            tries and (dry or log),
-            "--axis try does not go with --dry-run or --log: it writes a picture of slices only.",
-        ),
+        (tries and (dry or log), "--axis try does not go with --dry-run or --log: it writes a picture of slices only."),
         (earlier and not follow, "--earlier is for a run that goes on: give --follow, or the joined.h5 of its parts."),
     ):
         if refused:

@@ -2,41 +2,44 @@
 
 from __future__ import annotations
 
-import time
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from beamline.cli.json_output import json_events
+from beamline.cli.watch import bind_option, port_option, serve_shown
 from beamline.core.errors import ConfigError
 from beamline.core.events import Done
 from beamline.core.files import RUNS
-from beamline.core.text import printable, size
 from drivers.base.clock import SystemClock
-
-if TYPE_CHECKING:
-    from beamline.scan.runs import Run
-
-_HEAD = ("time (UTC)", "sample", "frames", "state", "size", "flags", "folder")
 
 
 @click.command()
 @click.argument("folder", required=False, type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
-def runs(folder: Path | None, as_json: bool) -> None:
+@click.option("--page", "as_page", is_flag=True, help="Show them in the browser; a link opens the page of each.")
+@port_option
+@bind_option
+@click.option("--open", "browse", is_flag=True, help="With --page: open it in this machine's browser.")
+def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str, browse: bool) -> None:
     """List the runs in FOLDER (./runs), newest first: sample, frames, state, size on the disk, flags.
 
     A run that was resumed is one line. A run that is not complete shows the frames in its files and the frames planned.
     `died`: its process ended without a word; `beamline recover` keeps its frames.
 
-    Exit code: 0 also where there is no run, 2 no folder.
+    Exit code: 0 also where there is no run, 2 no folder, or no port.
     """
-    from beamline.scan.runs import describe, runs_in
+    from beamline.scan.runs import HEAD, cells, describe, runs_in
 
     folder = folder or Path(RUNS)
     if not folder.is_dir():
         raise ConfigError(f"there is no folder {folder} here: name the one that has the runs.")
+    if as_page:
+        if as_json:
+            raise click.UsageError("--page does not go with --json.")
+        _serve(folder, port, bind, browse)
+        return
     with json_events(as_json) as sink:
         found = [describe(run) for run in runs_in(folder)]
         sink(Done({"folder": folder, "runs": found}, time=SystemClock().now()))
@@ -45,22 +48,15 @@ def runs(folder: Path | None, as_json: bool) -> None:
     if not found:
         click.echo(f"There is no run in {folder}.", err=True)
         return
-    rows = [_HEAD, *map(_row, found)]
+    rows = [HEAD, *map(cells, found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         click.echo("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-def _row(run: Run) -> tuple[str, ...]:
-    from beamline.scan.states import State
-    from beamline.storage.flag_legend import counted
+def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:
+    from beamline.page.runs import RunBrowser  # these load HDF5 and the server
+    from beamline.page.serve import open_port, start
 
-    frames = "not known" if run.frames is None else str(run.frames)
-    if run.planned is not None and run.state != State.DONE:
-        frames += f" of {run.planned}"
-    parts = f" in {run.parts} parts" if run.parts > 1 else ""
-    cells = (
-        time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(run.time)), run.sample, frames + parts, run.state,
-        size(run.bytes), counted(run.flags) if run.flags else "-", run.folder.name,
-    )  # fmt: skip
-    return tuple(printable(cell).replace("\n", " ").replace("\t", " ") for cell in cells)
+    with closing(RunBrowser(folder)) as runs:
+        serve_shown(start(runs.app, open_port(bind, port)), browse)

@@ -35,6 +35,12 @@ if TYPE_CHECKING:
 @set_option
 @click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch --control` does.")
 @click.option("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
+@click.option(
+    "--documents",
+    metavar="FILE",
+    type=click.Path(dir_okay=False),
+    help='Add the documents of bluesky to FILE, one a line. Needs: pip install "splatline[bluesky]".',
+)
 @json_option
 @click.option(
     "-o",
@@ -55,6 +61,7 @@ def scan(
     overrides: tuple[str, ...],
     page: bool,
     no_live: bool,
+    documents: str | None,
     as_json: bool,
     output: Path | None,
     run: Path | None,
@@ -77,6 +84,10 @@ def scan(
         raise click.UsageError("Missing argument 'CONFIG' (or --resume RUN).")
     if run is not None and (output is not None or (overrides and file is None)):
         raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
+    if run is not None and documents is not None:
+        raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
+    if documents is not None and "://" in documents:
+        raise click.UsageError("--documents takes a file; a program that follows its lines can publish them (0MQ).")
     with json_events(as_json) as json_sink, ExitStack() as held:
         config = None if file is None else load(file, overrides)
         try:
@@ -98,6 +109,8 @@ def scan(
             click.echo(how.remark, err=True)
         with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
             sinks: list[Sink] = [terminal, json_sink, *([beside] if page else [])]
+            if documents is not None:
+                sinks.append(_documents(config, Path(documents), held))
             result = run_scan(
                 config, series or output, sinks, stop, live=how.live, afterwards=how.afterwards,
                 ask=lambda request: terminal.ask(request, ask_operator),
@@ -106,6 +119,17 @@ def scan(
         click.echo(_results(result))
     if faults := _faults(result):
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def _documents(config: Config, path: Path, held: ExitStack) -> Sink:
+    from beamline.bluesky.documents import Documents, event_model, json_lines
+
+    event_model()  # where it is missing, no file is made
+    try:
+        stream = held.enter_context(path.open("a", encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path} cannot be written to ({error.strerror}). Nothing was started.") from error
+    return Documents(config, json_lines(stream))
 
 
 def _join(run: Path, json_sink: Sink, as_json: bool) -> None:
@@ -168,6 +192,7 @@ def _results(result: RunResult) -> str:
         lines.append(f"{'flagged':<10}{counted(result.flags)}; see {result.path.parent}")
     if result.retaken:
         lines.append(f"{'retaken':<10}{result.retaken} views with an alarm; `beamline recon` uses the new ones")
+    lines += [f"{'returned':<10}{view.said()}" for view in result.returned]
     if result.recon is not None:
         lines.append(f"{'volume':<10}{result.recon.get('output', result.path.parent / RECON)}")
         if report := result.recon.get("report"):

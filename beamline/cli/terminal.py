@@ -37,22 +37,14 @@ from drivers.base.clock import Clock
 from drivers.manual import Ask
 from recon.methods import BASELINE
 
-LONG = 2.0
-"""Real s after which a line names a phase without progress, on a stream that is not a terminal."""
-SAY_EVERY = 0.2
-"""s between events on the progress of many frames."""
-PLAIN_EVERY = 5.0
-"""Real s between progress lines on a stream that is no terminal."""
+LONG = 2.0  # Real s after which a line names a phase without progress, on a stream that is not a terminal
+SAY_EVERY = 0.2  # s between events on the progress of many frames
+PLAIN_EVERY = 5.0  # Real s between progress lines on a stream that is no terminal
 _COUNTED = {
     **dict.fromkeys(("ingest", "xafs", "monitor", "correction", "validate"), ("frames", "frames")),
     "archive": ("written and compared", "MB"),
 }  # stage: the name of its bar and what it counts; other stages are named after what they count
-_OF_TRIALS = {
-    "tradeoff": "trials",
-    "study": "trials",
-    "batch": "scans",
-    "bench": "runs",
-}  # stage: unit of its progress
+_OF_TRIALS = {"tradeoff": "trials", "study": "trials", "batch": "scans", "bench": "runs"}  # stage: unit of its progress
 
 
 class Terminal:

@@ -4,23 +4,38 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import config_argument, json_option, set_option
+from beamline.cli.options import FiniteRange, config_argument, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
-from beamline.core.events import Done
+from beamline.core.events import Done, Sink
 from beamline.core.signals import stop_signals
 from beamline.core.sinks import Announcer
 from beamline.core.stop import StopRequest
 
+if TYPE_CHECKING:
+    from beamline.config.load import Config
+    from beamline.instrument.connect import ConnectedDevices
+
+
+class Evaluated(Protocol):
+    """What frames say."""
+
+    def lines(self) -> list[str]: ...
+
+
+Found = TypeVar("Found", bound=Evaluated)
+
 
 @click.command()
 @config_argument
-@click.option("--angle", type=float, help="Angle of the view, degrees. Default: the first one of the scan.")
+@click.option("--angle", type=FiniteRange(), help="Angle of the view, degrees. Default: the first one of the scan.")
 @set_option
 @json_option
 def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
@@ -32,10 +47,23 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
 
     Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the darks or flats would stop a scan.
     """
+    from beamline.scan.tune import tune as tune_exposure
+
+    found = evaluated(file, overrides, as_json, tune_exposure, angle)
+    if found.faults:
+        if math.isnan(found.advised):
+            raise QualityError("These references would stop a scan, and no exposure mends that: look at the FAULT.")
+        raise QualityError(f"These references would stop a scan; {found.advised:.4g} s is the exposure to take.")
+
+
+def evaluated(
+    file: Path, overrides: Sequence[str], as_json: bool,
+    evaluate: Callable[[Config, ConnectedDevices, StopRequest, Sink, float | None], Found], angle: float | None,
+) -> Found:  # fmt: skip
+    """What `evaluate` finds in views from `angle`, degrees, printed as lines or JSON."""
     from beamline.config.load import load
     from beamline.instrument.connect import connect
     from beamline.instrument.operator import ask_operator
-    from beamline.scan.tune import tune as tune_exposure
 
     with json_events(as_json) as json_sink:
         config = load(file, overrides)
@@ -46,12 +74,9 @@ def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: b
             connect(config, ask=lambda request: terminal.ask(request, ask_operator)) as instrument,
             Announcer([terminal, json_sink], instrument.clock) as emit,
         ):
-            found = tune_exposure(config, instrument, stop, emit, None if angle is None else math.radians(angle))
+            found = evaluate(config, instrument, stop, emit, None if angle is None else math.radians(angle))
             now = instrument.clock.now()
         json_sink(Done(found, time=now))
     if not as_json:
         click.echo("\n".join(found.lines()))
-    if found.faults:
-        if math.isnan(found.advised):
-            raise QualityError("These references would stop a scan, and no exposure mends that: look at the FAULT.")
-        raise QualityError(f"These references would stop a scan; {found.advised:.4g} s is the exposure to take.")
+    return found

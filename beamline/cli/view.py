@@ -2,48 +2,59 @@
 
 from __future__ import annotations
 
-import sys
-import webbrowser
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import click
 
-from beamline.cli.terminal import Terminal, counting
-from beamline.cli.watch import LOOK, bind_option, port_option
-from drivers.base.clock import SystemClock
+from beamline.cli.watch import bind_option, port_option, serve_shown
 
 
 @click.command()
-@click.argument("volume", type=click.Path(path_type=Path))
-@click.argument("other", required=False, type=click.Path(path_type=Path))
+@click.argument("volume", metavar="VOLUME[::NAME]")
+@click.argument("other", metavar="[OTHER[::NAME]]", required=False)
 @port_option
 @bind_option
 @click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
-def view(volume: Path, other: Path | None, port: int, bind: str, browse: bool) -> None:
+@click.option("--napari", "in_napari", is_flag=True, help="Show it in napari, where that is installed.")
+@click.option("--labels", type=click.Path(path_type=Path), help="With --napari: labels of `segment`, or as a TIFF.")
+def view(
+    volume: str, other: str | None, port: int, bind: str, browse: bool, in_napari: bool, labels: Path | None
+) -> None:
     """Show VOLUME as a page in the browser: slices, zoom, grey window, histogram, profile along a line.
 
     OTHER is shown below it at the same places, and the difference where both have the same shape. Without OTHER the FBP
-    is, where `beamline recon` kept one beside a doubtful volume. Of a volume above
-    512 MB slices across y and x are binned. The page is served to this machine alone: from elsewhere use an ssh
-    tunnel, or --bind (not encrypted).
+    is, where `beamline recon` kept one beside a doubtful volume. Of a volume above 512 MB slices across y and x are
+    binned; those of an OME-Zarr are not (`beamline export`). The page is served to this machine alone: from elsewhere
+    use an ssh tunnel, or --bind (not encrypted). NAME is an array in a file with several, as in FILE.h5::/entry/data.
 
-    Exit code: 0 ended by Ctrl-C, 2 no port, 5 no volume.
+    --napari shows VOLUME and OTHER in napari instead, in their units, with labels and the centres of the Gaussians.
+
+    Exit code: 0 ended by Ctrl-C, 2 no port or no napari, 5 no volume.
     """
-    from beamline.page.serve import open_port, start  # these load HDF5 and the server
-    from beamline.page.viewer import viewer
+    if labels is not None and not in_napari:
+        raise click.UsageError("--labels goes with --napari.")
+    named = [_named(each) for each in (volume, other) if each is not None]
+    if in_napari:
+        from beamline.page.in_napari import show
+
+        if any(name is not None for _, name in named):
+            raise click.UsageError("--napari takes no ::NAME; copy the array to a file of its own.")
+        show([path for path, _ in named], labels)
+        return
+    from beamline.page.app import viewer  # these load HDF5 and the server
+    from beamline.page.serve import open_port, start
     from beamline.page.volume import ShownVolume
 
-    with ExitStack() as opened, suppress(KeyboardInterrupt):
-        with Terminal(sys.stderr) as terminal:
-            progress = counting("slices", terminal, SystemClock())
-            paths = [volume] if other is None else [volume, other]
-            volumes = [opened.enter_context(closing(ShownVolume(path, progress))) for path in paths]
-            if other is None and volumes[0].has_fbp:
-                volumes.append(opened.enter_context(closing(ShownVolume(volume, progress, fbp=True))))
+    with ExitStack() as opened:
+        volumes = [opened.enter_context(closing(ShownVolume(path, dataset=name))) for path, name in named]
+        if other is None and volumes[0].has_fbp:
+            volumes.append(opened.enter_context(closing(ShownVolume(named[0][0], fbp=True))))
         server = start(lambda access: viewer(volumes, access), open_port(bind, port))
-        click.echo(f"{LOOK:<8}{server.addresses.look}")
-        sys.stdout.flush()
-        if browse:
-            webbrowser.open(server.addresses.look)
-        server.run()
+        serve_shown(server, browse)
+
+
+def _named(said: str) -> tuple[Path, str | None]:
+    """FILE::NAME as the file and the array in it; a file that has such a name itself comes first."""
+    path, separator, name = said.rpartition("::")
+    return (Path(path), name) if separator and not Path(said).exists() else (Path(said), None)

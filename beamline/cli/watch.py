@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import sys
 import threading
+import time
 import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import click
 
@@ -18,9 +19,12 @@ from beamline.core.events import Event, RunStarted
 from beamline.core.files import RUNS
 from beamline.core.process import ChildProcess
 
+if TYPE_CHECKING:
+    from beamline.page.serve import PageServer
+
 LOOPBACK, PORT = "127.0.0.1", 8642
-LOOK, ACT = "watch", "control"
-"""Purpose of an address: the first word of its line."""
+LOOK, ACT = "watch", "control"  # Purpose of an address: the first word of its line
+ENDS_WITHIN = 3.0  # s
 
 port_option = click.option(
     "--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="Or the next free one."
@@ -53,19 +57,24 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     reader = Reader(watched(path or newest(Path(RUNS))))
     try:
         server = start(lambda access: page(reader, access, _log), open_port(bind, port), control=control)
-        click.echo(f"{LOOK:<8}{server.addresses.look}")
-        if server.addresses.act is not None:
-            click.echo(f"{ACT:<8}{server.addresses.act}")
-        sys.stdout.flush()
         click.echo("Ctrl-C ends the page, not the scan.", err=True)
-        if browse:
-            webbrowser.open(server.addresses.act or server.addresses.look)
         if tethered:
-            threading.Thread(target=_end_with_stdin, daemon=True).start()
-        with suppress(KeyboardInterrupt):
-            server.run()
+            threading.Thread(target=_end_with_stdin, args=(server,), daemon=True).start()
+        serve_shown(server, browse)
     finally:
         reader.close()
+
+
+def serve_shown(server: PageServer, browse: bool) -> None:
+    """Print the addresses of a server, and serve until Ctrl-C. `browse`: open the page in the browser."""
+    click.echo(f"{LOOK:<8}{server.addresses.look}")
+    if server.addresses.act is not None:
+        click.echo(f"{ACT:<8}{server.addresses.act}")
+    sys.stdout.flush()
+    if browse:
+        webbrowser.open(server.addresses.act or server.addresses.look)
+    with suppress(KeyboardInterrupt):
+        server.run()
 
 
 class PageBeside:
@@ -91,7 +100,9 @@ class PageBeside:
         command = [sys.executable, "-m", "beamline.cli.main", *page]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
-            self._held.enter_context(ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True))
+            child = ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True)
+            self._held.callback(child.wait, seconds=ENDS_WITHIN)
+            self._held.callback(child.let_go)  # first: open pages are told that they end
         except OSError as error:
             self._say(f"There is no page ({error}). The scan is not affected.")
 
@@ -101,9 +112,11 @@ class PageBeside:
             self._say(f"Page, to {what}: {address.strip()}")
 
 
-def _end_with_stdin() -> None:
-    """End this process when the process that started it has died."""
+def _end_with_stdin(server: PageServer) -> None:
+    """End this process when the process that started it lets it go or has died. Open pages are told within 3 s."""
     sys.stdin.read()
+    server.stop()
+    time.sleep(ENDS_WITHIN)
     os._exit(0)
 
 

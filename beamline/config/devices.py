@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
@@ -11,11 +12,15 @@ from beamline.config.section import Section, declared, read_from, section_of
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.beam_monitors.page import url_problem
 from drivers.beam_monitors.reading import pattern_problem
 from drivers.beam_monitors.serial import PATTERN, QUERY
 from drivers.cameras import CAMERAS
+from drivers.epics.channel import url_problem as pv_problem
+from drivers.epics.devices import ShutterPvs
+from drivers.sample import MoverPlaces, StageSampleMover
 from drivers.stages.registry import STAGES
 
 Roi = Annotated[
@@ -33,6 +38,8 @@ class _Orca(Section):
     """The keys that the real and the simulated ORCA-Quest share."""
 
     kind: str
+    model: Literal["C15550-20UP", "C15550-22UP"] = "C15550-20UP"
+    """ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast; plans and simulations go by it."""
     roi: Roi | None = None
     """null: the full sensor, 2304 x 4096."""
     binning: Literal[1, 2, 4] = 1
@@ -43,7 +50,7 @@ class _Orca(Section):
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
         """What the camera will say of its timing. ValueError for what it would refuse."""
-        return orca_quest.timing(wanted)
+        return orca_quest.timing(wanted, model=self.model)
 
 
 class SimulatedOrca(_Orca):
@@ -83,7 +90,7 @@ class DcamOrca(_Orca):
     """USB serial number, for the doctor, where there are several cameras."""
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
-        return orca_quest.timing(wanted, self.link)
+        return orca_quest.timing(wanted, self.link, self.model)
 
 
 class PluggedCamera(Section):
@@ -111,8 +118,7 @@ def _plugged(kind: str) -> type[PluggedCamera]:
     return section_of(f"{kind.title()}CameraConfig", PluggedCamera, keys)
 
 
-PLUGGED: tuple[type[PluggedCamera], ...] = tuple(map(_plugged, CAMERAS))
-"""Sections of the cameras of other packages."""
+PLUGGED: tuple[type[PluggedCamera], ...] = tuple(map(_plugged, CAMERAS))  # Sections of the cameras of other packages
 
 if TYPE_CHECKING:
     CameraConfig = SimulatedOrca | DcamOrca | PluggedCamera
@@ -150,6 +156,78 @@ def _without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 Pattern = Annotated[str, _without(pattern_problem)]
+PvUrl = Annotated[str, _without(pv_problem)]
+PvValue = float | str
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
+
+
+class EpicsShutter(Section):
+    """A shutter behind EPICS process variables, each as pva://NAME or ca://NAME."""
+
+    kind: Literal["epics"]
+    open_pv: PvUrl
+    open_value: PvValue = 1.0
+    """Written to open_pv to open it: a number, a text or a label."""
+    close_pv: PvUrl | None = None
+    """null: open_pv, which then takes both values."""
+    close_value: PvValue = 0.0
+    status_pv: PvUrl
+    """Where the blade itself is read; open_pv where there is nothing better."""
+    status_open: PvValue = 1.0
+    """Its value or label while the shutter is open; anything else is closed."""
+    timeout_s: Seconds = 2.0
+    """For an answer of the IOC."""
+    travel_s: Seconds = 10.0
+    """The longest that the status may take to follow."""
+
+    @property
+    def pvs(self) -> ShutterPvs:
+        """In the driver's terms."""
+        closing = self.close_pv or self.open_pv
+        values = self.open_value, self.close_value, self.status_open
+        return ShutterPvs(self.open_pv, closing, self.status_pv, *values, self.timeout_s, self.travel_s)
+
+
+class StageMover(Section):
+    """A motor that takes the sample out of the beam for flats: any stage, between two named places.
+
+    A linear axis has its own unit (mm, say) wherever a key says deg.
+    """
+
+    kind: Literal["stage"]
+    in_deg: float
+    """Where the sample is in the beam."""
+    out_deg: float
+    """Where flats are taken."""
+    speed_deg_s: Annotated[float, Field(gt=0)] | None = None
+    """null: the stage's max_speed_deg_s."""
+    stage: Annotated[StageConfig, Field(discriminator="kind")]
+
+    @model_validator(mode="after")
+    def _places_can_be_reached(self) -> Self:
+        figures = self.stage.settings.figures
+        low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
+        for name, place in (("in_deg", self.in_deg), ("out_deg", self.out_deg)):
+            if not low - 1e-9 <= place <= high + 1e-9:
+                raise ValueError(f"{name} {place:g} is beyond the limits of its stage, {low:g} ... {high:g}")
+        if self.in_deg == self.out_deg:
+            raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}; flats would show the sample")
+        if self.speed_deg_s is not None and self.speed_deg_s > fastest * (1 + 1e-9):
+            raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
+        return self
+
+    def connect(self, clock: Clock, url: str | None = None) -> StageSampleMover:
+        """The mover, connected at its port or at `url`. Nothing moves.
+
+        Raises:
+            DeviceError: its stage does not answer, or does not fit.
+        """
+        speed = self.stage.settings.figures.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
+        places = MoverPlaces(math.radians(self.in_deg), math.radians(self.out_deg), speed)
+        try:
+            return StageSampleMover(self.stage.connect(clock, url), places, clock)
+        except DeviceError as cause:
+            raise cause.told_by("sample mover", cause.problem) from cause
 
 
 class _BeamMonitor(Section):
@@ -219,14 +297,27 @@ class RingCurrentConfig(_BeamMonitor):
     unit: str = "mA"
 
 
-BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig
+class EpicsBeamConfig(_BeamMonitor):
+    """The ring current, or an intensity, from an EPICS process variable."""
+
+    kind: Literal["epics"]
+    pv: PvUrl
+    """pva://NAME or ca://NAME."""
+    unit: str = "mA"
+
+
+BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig | EpicsBeamConfig
+
+
+def _simulated(mover: Simple | StageMover) -> bool:
+    return mover.stage.simulated if isinstance(mover, StageMover) else mover.kind == "simulated"
 
 
 class DeviceSection(Section):
     stage: Annotated[StageConfig, Field(discriminator="kind")]
     camera: Annotated[CameraConfig, Field(discriminator="kind")]
-    shutter: Annotated[Simple | StageOutputShutter, Field(discriminator="kind")]
-    sample_mover: Simple
+    shutter: Annotated[Simple | StageOutputShutter | EpicsShutter, Field(discriminator="kind")]
+    sample_mover: Annotated[Simple | StageMover, Field(discriminator="kind")]
     beam_monitor: Annotated[BeamMonitorConfig, Field(discriminator="kind")] = NoBeamMonitor()
 
     @model_validator(mode="after")
@@ -255,6 +346,16 @@ class DeviceSection(Section):
             raise ValueError(f"shutter.output {taken} is the output that the stage's trigger pulses come from")
         return self
 
+    @model_validator(mode="after")
+    def _port_is_free(self) -> Self:
+        mover = self.sample_mover
+        if isinstance(mover, StageMover) and not mover.stage.simulated and mover.stage.port == self.stage.port:
+            raise ValueError(
+                f"sample_mover.stage.port {mover.stage.port} is that of devices.stage, and a port is opened once; the "
+                "sample mover needs a controller, or a record, of its own"
+            )
+        return self
+
     def simulated_or_not(self) -> dict[str, bool]:
         """Each device that can be simulated, and whether it is."""
         stage, shutter = self.stage.simulated, self.shutter.kind
@@ -262,7 +363,7 @@ class DeviceSection(Section):
             "stage": stage,
             "camera": self.camera.kind == "simulated_orca",
             "shutter": shutter == "simulated" or (shutter == "stage_output" and stage),
-            "sample_mover": self.sample_mover.kind == "simulated",
+            "sample_mover": _simulated(self.sample_mover),
         }
         if isinstance(self.beam_monitor, ElectrometerConfig):
             simulated["beam_monitor"] = self.beam_monitor.simulated

@@ -121,6 +121,8 @@ def plan_of(config: Config) -> ScanPlan:
         exposure=scan.exposure_s,
         period=scan.period_s,
         settle=scan.settle_s,
+        warm_up=scan.warm_up_s,
+        return_views=scan.return_views,
         darks=_field(scan.darks, scan.exposure_s),
         flats=_field(scan.flats, scan.exposure_s),
         scheme=scan.angles.scheme,

@@ -112,6 +112,10 @@ class ScanSection(Section):
     """Time between views: sets the speed of a fly scan, the least time per view of a step scan."""
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 0.1
     """Wait after each move of a step scan."""
+    warm_up_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Light on the scintillator before frames with light, each time the shutter opens; it glows brighter when warm."""
+    return_views: Annotated[int, Field(ge=0, le=100)] = 0
+    """Views that are taken a second time on the way back, evenly spread: they tell whether the sample has moved."""
     without_watchdog: Literal["warn", "pause"] = "warn"
     """The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."""
     darks: Fields = Fields()

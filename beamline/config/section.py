@@ -49,7 +49,6 @@ def _key(field: FlatField) -> Key:
 
 
 def _name(field: FlatField) -> str:
-    """The key of a field."""
     return _key(field).name_of(field.name)
 
 

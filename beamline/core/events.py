@@ -57,8 +57,7 @@ class Event:
         return json.dumps({"event": self.event, "time": round(self.time, 6), **_plain(self.data)}, allow_nan=False)
 
 
-Sink = Callable[[Event], None]
-"""Takes events."""
+Sink = Callable[[Event], None]  # Takes events
 
 
 def event_of(values: Mapping[str, Any]) -> Event:
@@ -291,6 +290,7 @@ class ScanDone(Event, event="scan_done"):
     bytes: int
     recon: Mapping[str, Any] | None
     status: str
+    returned: Sequence[Any] = ()
 
 
 class ReconStarted(Event, event="recon_started"):

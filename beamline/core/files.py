@@ -16,14 +16,10 @@ from pathlib import Path
 
 from beamline.core.errors import DataError
 
-PART = "part-{}"
-"""The folder of a later part of a scan that was resumed, in that of the run."""
-OURS = 0o755
-"""Mode of a run's folder: only the owner may replace files there, whatever the umask."""
-RUNS = "runs"
-"""The default folder for the folders of runs."""
-EVENTS = "events.jsonl"
-"""The log of events of a run, or of a later part of it, in its folder."""
+PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
+OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
+RUNS = "runs"  # The default folder for the folders of runs
+EVENTS = "events.jsonl"  # The log of events of a run, or of a later part of it, in its folder
 
 
 def parts_of(run: Path) -> list[Path]:
@@ -48,10 +44,8 @@ _NO_SUCH_CALL = (errno.EINVAL, errno.EBADF, errno.ENOTSUP)  # errors of systems 
 
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
 """Errors of PyYAML beside its YAMLError: for a 13th month, a number of 5000 digits, `!!bool x`."""
-TEXT = 2**26
-"""Most bytes of a text file that a user names: angles of a million views take 20 MB."""
-SETTINGS = 2**20
-"""Most bytes of a text file of settings: YAML of 1 MB takes seconds to read."""
+TEXT = 2**26  # Most bytes of a text file that a user names: angles of a million views take 20 MB
+SETTINGS = 2**20  # Most bytes of a text file of settings: YAML of 1 MB takes seconds to read
 
 
 def require_regular(path: Path, largest: float = math.inf) -> None:

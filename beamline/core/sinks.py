@@ -11,8 +11,7 @@ from typing import Self, TextIO
 from beamline.core.events import Event, Sink, Warned
 from drivers.base.clock import Clock
 
-Warn = Callable[[str], None]
-"""Takes a sentence about something that is wrong though work goes on."""
+Warn = Callable[[str], None]  # Takes a sentence about something that is wrong though work goes on
 
 
 class JsonLines:

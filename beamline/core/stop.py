@@ -122,6 +122,11 @@ class StopRequest:
         self.stopping = self.aborting = self._enough = False
         self.reason, self._now, self._requested_at = "", now, 0.0
 
+    def refuse_abort(self) -> None:
+        """Raise ScanAborted if an abort was requested."""
+        if self.aborting:
+            raise ScanAborted(f"Aborted: {self.reason}.")
+
     def stop(self, reason: str = "the operator asked for it") -> None:
         """End cleanly: pending frames and missing references are still acquired, the stage returns."""
         self.reason = self.reason or reason

@@ -22,14 +22,10 @@ from beamline.scan.preflight import DryRun, disk_of
 from beamline.scan.recorder import room as waiting_room
 from drivers.base.clock import Clock
 
-SECONDS, MOST = 3.0, 4 << 30
-"""Longest time (s on the clock) and most bytes of a measurement."""
-PIECE = 16 << 20
-"""Bytes that are written and synchronised together."""
-LEAST = 4 * PIECE
-"""Fewer bytes give no reliable rate."""
-COMFORT = 1.25
-"""A disk faster than the need by this factor is good; a slower one may be disturbed by other programs."""
+SECONDS, MOST = 3.0, 4 << 30  # Longest time (s on the clock) and most bytes of a measurement
+PIECE = 16 << 20  # Bytes that are written and synchronised together
+LEAST = 4 * PIECE  # Fewer bytes give no reliable rate
+COMFORT = 1.25  # A disk faster than the need by this factor is good; a slower one may be disturbed by other programs
 SPEED, ROOM = "disk speed", "disk space"
 
 

@@ -13,8 +13,7 @@ from urllib.parse import urlsplit
 from beamline.doctor.check import Diagnosis, Grade
 from drivers.serial.ports import SerialPort
 
-CONNECT_TIMEOUT = 2.0
-"""s for a TCP connection."""
+CONNECT_TIMEOUT = 2.0  # s for a TCP connection
 
 
 def ports(found: Sequence[SerialPort]) -> Diagnosis:

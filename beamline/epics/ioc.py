@@ -88,7 +88,7 @@ class RunServer:
         try:
             run = newest(self._runs)
         except ConfigError:
-            return self._values  # there is none yet
+            return self._values  # no run so far
         values = self._values
         what = watched(run)
         if self._reader is None or self._reader.what != what:

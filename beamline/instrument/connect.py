@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
-from beamline.config.devices import DcamOrca, NoBeamMonitor, SimulatedOrca, StageOutputShutter
+from beamline.config.devices import DcamOrca, EpicsShutter, NoBeamMonitor, SimulatedOrca, StageMover, StageOutputShutter
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError
 from beamline.instrument.devices import make_beam_monitor, make_camera, wait_until_cold
@@ -29,8 +29,10 @@ from drivers.base.protocols import (
     StageLimits,
     TriggerSource,
 )
+from drivers.epics.devices import PvShutter
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualSampleMover, ManualShutter
+from drivers.sample import StageSampleMover
 from drivers.shutter import OutputShutter
 from drivers.stages.travel import Travel
 
@@ -48,6 +50,7 @@ class ConnectedDevices:
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None if none is configured.
         frame_memory: of the camera's frames; None for a simulated camera.
+        watch_sample: takes what is called again and again while a motor moves the sample; its exception stops it.
     """
 
     devices: Devices
@@ -56,6 +59,7 @@ class ConnectedDevices:
     close: Callable[[], None]
     beam_monitor: BeamMonitor | None = None
     frame_memory: FrameMemory | None = None
+    watch_sample: Callable[[Callable[[], None]], None] = lambda check: None
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
@@ -87,6 +91,10 @@ def connect(
         if config.simulation is None:
             clock, simulated, memory = clock or SystemClock(), None, FrameMemory()
             devices = _instrument(config, clock, ask or ask_operator, check_stop, opened, memory)
+            if isinstance(chosen := config.devices.sample_mover, StageMover):
+                mover = chosen.connect(clock)
+                opened.callback(mover.close)
+                devices = replace(devices, sample=mover)
         else:
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
@@ -94,7 +102,8 @@ def connect(
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory)
+        watch = devices.sample.watch if isinstance(devices.sample, StageSampleMover) else lambda check: None
+        return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory, watch)
 
 
 @contextmanager
@@ -154,12 +163,17 @@ def _instrument(
     else:
         camera = chosen.connect(clock)
         opened.callback(camera.close)
-    return Devices(stage, camera, shutter_of(config, stage, clock, ask), ManualSampleMover(ask))
+    shutter = shutter_of(config, stage, clock, ask)
+    if isinstance(shutter, PvShutter):
+        opened.callback(shutter.disconnect)
+    return Devices(stage, camera, shutter, ManualSampleMover(ask))
 
 
 def shutter_of(config: Config, stage: RotationStage, clock: Clock, ask: Ask) -> Shutter:
     """The configured shutter of a real instrument."""
     wanted = config.devices.shutter
+    if isinstance(wanted, EpicsShutter):
+        return PvShutter(wanted.pvs, clock)
     if not isinstance(wanted, StageOutputShutter):
         return ManualShutter(ask)
     output = stage.digital_output(wanted.output)

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.config.devices import DcamOrca, ElectrometerConfig, RingCurrentConfig
+from beamline.config.devices import DcamOrca, ElectrometerConfig, EpicsBeamConfig, RingCurrentConfig
 from beamline.instrument.simulated import simulated_electrometer
 from drivers.base.clock import Clock
 from drivers.base.protocols import BeamMonitor
 from drivers.beam_monitors.page import PageSource
 from drivers.beam_monitors.reading import TextBeamMonitor, TextSource
 from drivers.beam_monitors.serial import SerialSource
+from drivers.epics.devices import PvSource
 from drivers.frame_memory import FrameMemory
 
 if TYPE_CHECKING:
     from drivers.dcam.camera import DcamCamera
     from drivers.dcam.options import DcamOptions
 
-TELL_EVERY = 30.0
-"""s between messages on a sensor that is cooling down."""
+TELL_EVERY = 30.0  # s between messages on a sensor that is cooling down
 
 
 def make_camera(config: DcamOrca, clock: Clock, memory: FrameMemory | None = None) -> DcamCamera:
@@ -78,14 +78,17 @@ def options_of(camera: DcamOrca) -> DcamOptions:
     )
 
 
-def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig, clock: Clock) -> BeamMonitor:
+def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig | EpicsBeamConfig, clock: Clock) -> BeamMonitor:
     """The beam monitor that is configured; the simulated electrometer shows a steady current.
 
     Raises:
         DeviceError: the electrometer's port does not open.
     """
     source: TextSource
-    if isinstance(config, RingCurrentConfig):
+    pattern = "(.*)" if isinstance(config, EpicsBeamConfig) else config.pattern
+    if isinstance(config, EpicsBeamConfig):
+        source = PvSource(config.pv, config.timeout_s)
+    elif isinstance(config, RingCurrentConfig):
         source = PageSource(config.url, clock, timeout=config.timeout_s)
     else:
         end = {"crlf": b"\r\n", "cr": b"\r", "lf": b"\n"}[config.line_end]
@@ -100,4 +103,4 @@ def make_beam_monitor(config: ElectrometerConfig | RingCurrentConfig, clock: Clo
             line_end=end,
             transcript=None if config.transcript is None else Path(config.transcript),
         )
-    return TextBeamMonitor(source, clock, pattern=config.pattern, unit=config.unit, scale=config.scale)
+    return TextBeamMonitor(source, clock, pattern=pattern, unit=config.unit, scale=config.scale)

@@ -5,25 +5,26 @@ Simulators are imported where they are needed, so that an instrument loads none.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.devices import StageOutputShutter
+from beamline.config.devices import SimulatedOrca, StageMover, StageOutputShutter
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
-from drivers.base.protocols import Devices, Shutter
+from drivers.base.protocols import Devices, SampleMover, Shutter
 from drivers.shutter import OutputShutter
 
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
     from simulators.devices.camera import SimulatedOrcaQuest
-    from simulators.devices.shutter import BeamGate
+    from simulators.devices.shutter import BeamGate, SampleGate
     from simulators.effects.anomaly import Label
     from simulators.scenes.scene import Scene
 
@@ -55,7 +56,7 @@ def simulated_devices(
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
     from simulators.devices.camera import SimulatedOrcaQuest
-    from simulators.devices.shutter import SimulatedSampleMover, SimulatedShutter, WiredShutter
+    from simulators.devices.shutter import MovedSample, SimulatedSampleMover, SimulatedShutter, WiredShutter
     from simulators.devices.trigger_line import TriggerLine
     from simulators.wires.registry import WIRES
     from simulators.wires.serial_url import register
@@ -76,9 +77,18 @@ def simulated_devices(
         number, output = wanted.output, stage.digital_output(wanted.output)
         shutter = OutputShutter(output, clock, open_high=wanted.open_high, settle=wanted.settle_s)
         blade = WiredShutter(lambda: controller.output_is_high(number), wanted.open_high)
-    sample = SimulatedSampleMover()
+    sample: SampleMover
+    inside: SampleGate
+    sample = inside = SimulatedSampleMover()
+    if isinstance(mover := config.devices.sample_mover, StageMover):
+        axis = TriggerLine(clock)
+        moved = WIRES[mover.stage.kind].matching(mover.stage.settings).controller(clock, axis)
+        sample = motor = mover.connect(clock, register(f"{mover.stage.kind}-{uuid4().hex}", moved))
+        opened.callback(motor.close)
+        inside = MovedSample(axis, math.radians(mover.in_deg))
     pitch = config.optics.pixel_size_um * 1e-3
-    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, sample, pixel_pitch=pitch)
+    model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
+    camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, pixel_pitch=pitch, model=model)
     opened.callback(camera.close)
     known = SimulatedScene(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
     return Devices(stage, camera, shutter, sample), known

@@ -34,8 +34,6 @@ SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 
 @dataclass(frozen=True)
 class BeamState:
-    """State of the check."""
-
     drifting: int = 0  # views in a row beyond the limit; after `said`, views in a row within it
     said: bool = False  # the drift was flagged
     covered: bool = False  # the missing air was reported

@@ -36,8 +36,6 @@ DARKEST = 0.05  # share of the flat's mean: pixels with less light are not used
 
 @dataclass(frozen=True, eq=False)
 class BlurState:
-    """State of the check."""
-
     # kind, counted: of the latest group of frames
     kind: FrameKind = FrameKind.INVALID
     counted: int = 0

@@ -162,8 +162,6 @@ class Check(Protocol):
 
     def start(self) -> Any:
         """The state before the first frame."""
-        ...
 
     def look(self, state: Any, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[Any]:
         """Look at the next frame. Costs O(pixels of the preview) at most."""
-        ...

@@ -1,4 +1,4 @@
-"""The registry of the monitor's checks, and the bits by which a file says which of them flagged a frame.
+"""The registry of the monitor's checks, and their bits in a file: those of a frame say which checks flagged it.
 
 Adding a check takes its file in this folder and its line in REGISTRY. Its keys in the configuration, its bits and the
 legend in a scan file, and its name in `beamline info` follow.
@@ -14,7 +14,7 @@ from beamline.monitor.check import Check, Flag, Level
 from drivers.plugins import plugins
 
 ALARM_SHIFT = 16  # bit b: the check with this bit flagged the frame; bit 16 + b: and it was an alarm
-BITS = (*range(16), *range(32, 48))  # that a check may have, in the order in which they are given away
+BITS = (*range(16), *range(32, 48))  # that a check may have, the next free one first
 ALARMS = sum(1 << bit + ALARM_SHIFT for bit in BITS)  # a frame with any of these bits has an alarm
 
 

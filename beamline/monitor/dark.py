@@ -16,7 +16,7 @@ from beamline.monitor.references import FEW, READOUT
 from drivers.base.frame import Frame, FrameKind
 
 TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
-SHUT = 3.0  # noises of a pixel of the dark by which flats are brighter where the shutter was shut for the dark
+SHUT = 3.0  # flats outshine a dark by so many noises of its pixels, or the shutter was open
 
 
 @dataclass(frozen=True, eq=False)

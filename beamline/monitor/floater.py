@@ -48,8 +48,6 @@ FASTEST = 1e3  # cells a view: what moves faster is in one view only
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    """State of the check."""
-
     raw: tuple[CellView, ...] = ()  # the last two views
     indices: tuple[int, ...] = ()  # rows in the file of the SPAN views before the last
     # depths: their line integrals, without zingers and smoothed along the columns; oldest first

@@ -44,8 +44,6 @@ RULES = Rules(span=10, least=4, share=0.6, total=0.0, rows=0.0, cols=2.5, slack=
 
 @dataclass(frozen=True, eq=False)
 class GhostState:
-    """State of the check."""
-
     profiles: tuple[CellValues, ...] = ()  # float32 [part of the rows, broad column] of the last views, oldest first
     angle: float = math.nan
     filters: Filters | None = None  # for the angle's `step` in radians

@@ -49,8 +49,10 @@ class ScanPlan:
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
         retake_share: largest share of the views that are repeated after an alarm of the monitor; 0: none.
         stored: views that need not be taken: earlier files of the same scan have them.
+        warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
         end_references: kinds of references that are still to be taken after the views, where all else is stored. None:
             all that are planned, before and after the views.
+        return_views: views that are taken a second time on the way back, evenly spread; alignment frames.
     """
 
     angles: NDArray[np.float64]
@@ -64,6 +66,8 @@ class ScanPlan:
     retake_share: float = 0.0
     stored: frozenset[int] = frozenset()
     end_references: frozenset[FrameKind] | None = None
+    warm_up: float = 0.0
+    return_views: int = 0
 
     @property
     def retakes(self) -> int:
@@ -115,7 +119,7 @@ class Timeline:
 
     Attributes:
         blocks: in the order of acquisition.
-        duration: s, with taxi, settling, moves and reference frames; without views that are taken again.
+        duration: s, with taxi, settling, moves, warm-up and reference frames; without views that are taken again.
         frame_bytes: of one frame's uint16 pixels.
         total_bytes: of the whole file, pixels and previews; without views that are taken again.
         step_counts: whole counts between neighbouring fly triggers (0 for a step scan).
@@ -125,6 +129,7 @@ class Timeline:
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
         retake_seconds: for the most views that may be taken again.
+        warm_up: as of the plan.
     """
 
     blocks: tuple[Block, ...]
@@ -138,6 +143,7 @@ class Timeline:
     violations: tuple[str, ...]
     remarks: tuple[str, ...]
     retake_seconds: float = 0.0
+    warm_up: float = 0.0
 
     @property
     def n_frames(self) -> int:

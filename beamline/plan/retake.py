@@ -1,9 +1,9 @@
-"""Retake: views that are repeated after the last one, with a standing stage at their angles."""
+"""Retake: views that are taken again after the last one, with a standing stage at their angles."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,20 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
         turned[passed] = np.sign(views.angles[passed][-1] - views.angles[first]) * views.speed * views.exposure / 2
         first += train.n
     return turned
+
+
+def return_triggers(views: Block, n: int) -> NDArray[np.int64]:
+    """So many of the views, evenly spread in angle, in the order in which a stage meets them on its way back."""
+    ahead = np.argsort(views.angles, kind="stable")
+    chosen = ahead[np.unique(np.linspace(0, views.n - 1, min(n, views.n)).round().astype(int))]
+    back = abs(views.angles[chosen[0]] - views.angles[-1]) > abs(views.angles[chosen[-1]] - views.angles[-1])
+    return np.asarray(chosen[::-1] if back else chosen, np.int64)
+
+
+def return_block(views: Block, n: int, *, stored: bool) -> Block:
+    """The block that takes so many views a second time on the way back; the stage stands during each exposure."""
+    block = retake_block(views, return_triggers(views, n))
+    return replace(block, kind=FrameKind.ALIGNMENT, stored=frozenset(range(block.n)) if stored else frozenset[int]())
 
 
 def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:

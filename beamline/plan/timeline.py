@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -14,7 +14,7 @@ from beamline.core.text import degrees, size
 from beamline.monitor.digest import preview_shape
 from beamline.plan.limits import PlanFacts, remarks, violations
 from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
-from beamline.plan.retake import Retake, retake_block, spread
+from beamline.plan.retake import Retake, retake_block, return_block, spread
 from beamline.plan.triggers import Flight, Scale, plan_flight
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
@@ -34,11 +34,11 @@ def work_out(
 ) -> Timeline:
     """Blocks, times, bytes, and every broken limit; nothing is asked of a device, so a dry run is the same call.
 
-    Darks then flats before the views, flats then darks after them. A fly scan turns at step / period, rounded to whole
-    counts a second (the views' block has the resulting period). It starts far enough before the first pulse to
-    reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return
-    at full speed between them. The duration is that of a stage that stands at its zero and goes back there at the end,
-    without shutter and sample moves.
+    Darks then flats before the views; views on the way back, flats, then darks after them. A fly scan turns at step /
+    period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first
+    pulse to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a
+    return at full speed between them. The duration is that of a stage that stands at its zero and goes back there at
+    the end, without shutter and sample moves.
 
     Args:
         to_counts: the stage's conversion of radians to whole counts.
@@ -78,9 +78,12 @@ def work_out(
         free_bytes=free_bytes,
     )
     step_counts = flight.interval if flight else 0
+    last = next((block for block in blocks if block.kind is FrameKind.ALIGNMENT and block.left), views)
+    seconds = sum(block_seconds(block, stage, camera, plan.settle, _start(block, views)) for block in blocks)
+    seconds += _return(last, stage)
     return Timeline(
         blocks=blocks,
-        duration=sum(block_seconds(block, stage, camera, plan.settle) for block in blocks) + _return(views, stage),
+        duration=seconds + plan.warm_up * _openings(blocks),
         frame_bytes=frame_bytes,
         total_bytes=facts.total_bytes,
         step_counts=step_counts,
@@ -90,7 +93,14 @@ def work_out(
         violations=(*broken, *violations(facts)),
         remarks=tuple(remarks(facts)),
         retake_seconds=retake_seconds,
+        warm_up=plan.warm_up,
     )
+
+
+def _openings(blocks: Iterable[Block]) -> int:
+    """How often the shutter opens, which is closed at first."""
+    lit = [False, *(block.kind is not FrameKind.DARK for block in blocks if block.left)]
+    return sum(after and not before for before, after in pairwise(lit))
 
 
 def taxi_angle(speed: float, acceleration: float, step: float) -> float:
@@ -145,14 +155,14 @@ def _pieces(block: Block, first: int, train: TriggerTrain) -> Iterator[FlyPass]:
             yield FlyPass(before + 1, pulses, float(angles[0]) - out, float(angles[-1]) + out)
 
 
-def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float) -> float:
-    """Duration of a block with its moves; the views' block begins with the stage at its zero."""
+def block_seconds(block: Block, stage: StageLimits, camera: CameraTiming, settle: float, start: float = 0.0) -> float:
+    """Duration of a block with its moves; `start`: where the stage stands at first."""
     if not block.left:
         return 0.0
     tail = block.exposure + camera.readout
     if block.mode is Mode.STATIC or (block.mode is Mode.FLY and not block.trains):
         return (block.n - 1) * block.period + tail
-    seconds, at = 0.0, 0.0
+    seconds, at = 0.0, start
     if block.mode is Mode.FLY:
         for flown in passes(block):
             seconds += move_seconds(flown.start - at, stage.max_speed, stage.acceleration)
@@ -179,6 +189,10 @@ def _blocks(
     views = _views(plan, flight, row, scale, stage)
     yield views
     row += views.n
+    if plan.return_views:
+        back = return_block(views, plan.return_views, stored=missing is not None)
+        yield replace(back, first_trigger=row)
+        row += back.n
     for kind, field in reversed(before):
         if field.count and field.at in (Place.END, Place.BOTH):
             yield _static(kind, field, row, plan, camera, stored=missing is not None and kind not in missing)
@@ -230,11 +244,19 @@ def _retake_seconds(plan: ScanPlan, views: Block, stage: StageLimits, camera: Ca
     return block_seconds(block, stage, camera, plan.settle) + _return(views, stage)
 
 
-def _return(views: Block, stage: StageLimits) -> float:
-    if not views.left:
+def _return(last: Block, stage: StageLimits) -> float:
+    return move_seconds(_end(last), stage.max_speed, stage.acceleration)
+
+
+def _end(block: Block) -> float:
+    """Where the stage stands after a block of views; at its zero where it takes none."""
+    if not block.left:
         return 0.0
-    last = passes(views)[-1].end if views.trains else float(views.angles[-1])
-    return move_seconds(last, stage.max_speed, stage.acceleration)
+    return passes(block)[-1].end if block.trains else float(block.angles[-1])
+
+
+def _start(block: Block, views: Block) -> float:
+    return _end(views) if block.kind is FrameKind.ALIGNMENT else 0.0
 
 
 def describe(
@@ -247,7 +269,7 @@ def describe(
     for block, row in zip(timeline.blocks, timeline.first_rows, strict=True):
         if not block.left:
             continue
-        seconds = block_seconds(block, stage, camera, plan.settle)
+        seconds = block_seconds(block, stage, camera, plan.settle, _start(block, timeline.views))
         lines.append(
             f"{row:>6}-{row + block.left - 1:<6}  {block.kind.name.lower():<10}  {block.left:>6}  {block.mode:<6}  "
             f"{block.exposure:>7.4g} s  {block.period:>7.4g} s  {seconds:>7.1f} s  {_angles(block.angles)}"

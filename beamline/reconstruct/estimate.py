@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from beamline.core.errors import DataError
 from beamline.core.text import count, size
 from beamline.projections.selection import cone_of
+from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
 from beamline.storage.writers.partial_volume import slabs_of_partial
@@ -66,8 +67,11 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
             cone, and for a partial volume with another number of slices.
-        ConfigError: the selection does not fit the scan, or an option needs more memory than there is.
+        ConfigError: the selection does not fit the scan, or an option needs more memory than there is. Also
+            for a method without error bars, where they are wanted.
     """
+    if options.uncertainty:
+        refuse_impossible(options)
     with options.source.open() as source:
         if cone_of(source, options.selection) is not None:
             raise DataError(f"{source.path}: --dry-run is for a parallel beam; this is a cone.")

@@ -35,7 +35,7 @@ from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions
-from recon.base.method import CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
+from recon.base.method import BoundedMethod, CheckpointedMethod, DataUse, Method, Progress, RunControl, candidates_of
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.methods import with_trait
@@ -104,7 +104,7 @@ def reconstruct_file(
         _Job(options, prepared, sink, clock, StopLatch(lambda: False), warn, region).compile_kernels()
         phases.enter("reconstruction")
         deadline = Deadline()
-        if isinstance(options.method, FitMethod) and options.method.seconds is not None:
+        if isinstance(options.method, BoundedMethod) and options.method.seconds is not None:
             method, deadline = fit_within(
                 options.method, prepared, options.target, (started, worked), clock, warn
             )  # fmt: skip

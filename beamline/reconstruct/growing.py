@@ -343,7 +343,7 @@ class ScanFollower:
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:
-                    done[step.name] = step.apply(found, self.source.angles[projections.view_ids])
+                    done[step.name] = step.apply(found, self.source.angles[projections.view_ids], lambda n, of: None)
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue

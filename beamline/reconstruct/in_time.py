@@ -15,9 +15,9 @@ from beamline.reconstruct.measure import residual_share
 from beamline.reconstruct.result import OutputPaths
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
+from recon.base.method import BoundedMethod
 from recon.base.volume import Grid
 from recon.methods import with_settings
-from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import first_sweep_seconds
 from recon.splatting.initialise import sweeps_of_start
 
@@ -48,13 +48,13 @@ class Deadline:
 
 
 def fit_within(
-    method: FitMethod,
+    method: BoundedMethod,
     prepared: PreparedProjections,
     target: OutputPaths,
     started: tuple[float, float],
     clock: Clock,
     warn: Warn,
-) -> tuple[FitMethod, Deadline]:
+) -> tuple[BoundedMethod, Deadline]:
     """The fit with the seconds that its call leaves it, before measuring, report and writing; and when the call ends.
 
     If they are too few, `warn` is told the expected duration before the fit.
@@ -73,7 +73,7 @@ def fit_within(
     measuring = _FORWARD * sweep * residual_share(geometry, grid, prepared.held_out)
     left, least = method.seconds - spent - measuring - after, _LEAST * sweep
     if left < least:
-        start = sweeps_of_start(geometry, method.start) * sweep
+        start = sweeps_of_start(geometry, getattr(method, "start", "fbp")) * sweep
         warn(
             f"{duration_text(method.seconds)} do not suffice for this scan: reading and correcting it took "
             f"{duration_text(spent)}, measuring the volume, the report and writing take about "

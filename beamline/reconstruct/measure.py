@@ -15,6 +15,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepared import PreparedProjections
 from beamline.storage import hdf5
 from beamline.storage.volume_file import read_volume
+from beamline.storage.volumes.files import opened_volume
 from recon.assess import metrics
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
@@ -82,7 +83,7 @@ def fit_truth(truth: NDArray[np.float32], grid: Grid, binning: int) -> Volume:
 
 
 def regions(volume: Volume, seed: int) -> NDArray[np.int8] | None:
-    """Dense and empty regions of a good volume (k-means), by which others of the same sample are judged; or None.
+    """Dense and empty regions of a good volume (k-means), to judge others of the same sample; None without contrast.
 
     They are those of `metrics.sampled` of the volume.
     """
@@ -132,6 +133,36 @@ def measure(
         weights = prepared.ray_factors(unseen.n_views)
         later = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
         values["residual_held_out"] = _residual(volume, data, unseen, np.arange(unseen.n_views), later, progress)
+    return {name: float(value) for name, value in values.items()}
+
+
+def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str, float]:
+    """Figures of merit of a volume file: against a truth, and by regions that somebody has drawn.
+
+    Args:
+        truth: as of `read_truth`.
+        masks: labels [z, y, x] of the volume's shape: 1 dense, 2 empty, 0 not used.
+
+    Raises:
+        DataError, ConfigError: files that hold no volumes, or of another shape.
+    """
+    with opened_volume(path) as record:
+        volume = np.asarray(record.volume.data[:], np.float32)
+    values: dict[str, float] = {}
+    try:
+        if truth is not None:
+            true = read_truth(truth)
+            values["psnr"], values["nrmse"] = metrics.psnr(true, volume), metrics.nrmse(true, volume)
+            values["ssim3d"] = metrics.ssim3d(true, volume)
+            values["ssim_slices"] = metrics.ssim_of_whole_slices(true, volume)
+        if masks is not None:
+            labels, _ = read_volume(masks)
+            if not np.isin(labels, (0, 1, 2)).all():
+                raise ValueError(f"{masks} holds other labels than 0 (not used), 1 (dense) and 2 (empty)")
+            regions = np.array([-1, 1, 0], np.int8)[labels.astype(np.intp)]
+            values["snr"], values["cnr"] = metrics.snr_cnr(volume, regions)
+    except ValueError as error:
+        raise DataError(f"{path} cannot be measured so: {error}.") from error
     return {name: float(value) for name, value in values.items()}
 
 

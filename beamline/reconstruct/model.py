@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,8 @@ def read_model(path: Path) -> Model:
             found["centres"], found["widths"], found["densities"], found["rotations"], float(found["density_unit"]),
             Kernel(str(found["kernel"])),
         )  # fmt: skip
-        return Model(gaussians, geometry, record)
+        # Error bars and FBP are of the file's voxels, and the file is closed behind this.
+        return Model(gaussians, geometry, replace(record, deviation=None, fbp=None))
 
 
 def box_grid(grid: Grid, voxel: float | None, box: tuple[tuple[float, float], ...] | None) -> Grid:
@@ -112,10 +113,13 @@ def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Vo
 def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Callable[[int, int], None]) -> None:
     """Line integrals of the model at `angles` [view] in radians: a Data Exchange file that every command reads.
 
+    The views are straight, in their place: the poses of the views that were fitted are those of their own angles.
+
     Raises:
         DataError: `path` exists, or the disk refuses; nothing is left.
     """
-    geometry = model.geometry.select([0]).at(angles)
+    one = model.geometry.select([0])
+    geometry = replace(one, shifts=np.zeros((1, 2)), roll=np.zeros(1), tilt=np.zeros(1)).at(angles)
     with whole_file(path) as partial, hdf5.created(partial) as file:
         if model.record.length_unit == "mm":
             file.attrs["pixel_size_mm"] = geometry.pixel_pitch

@@ -15,6 +15,7 @@ from beamline.core.phases import Phases
 from beamline.core.text import spans
 from beamline.projections.flagged_frames import reasons, reference_images, worst_frames
 from beamline.projections.prepared import PreparedProjections
+from beamline.projections.returned import returned_views
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.report import figures
@@ -29,7 +30,7 @@ from beamline.storage.writers.recon_file import Value
 from drivers.base.frame import FrameKind
 from recon.assess.time_model import NextDecibel, duration_text, next_decibel, next_decibel_of_fit
 from recon.base.method import Progress
-from recon.base.volume import Volume
+from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
@@ -125,7 +126,10 @@ class ReconOutcome:
 
 @dataclass(frozen=True)
 class ReportContext:
-    """The context of a reconstruction: the scan, the selection, the command, and the warnings so far."""
+    """The context of a reconstruction: the scan, the selection, the command, and the warnings so far.
+
+    `stray` is the map of mass where views show nothing [y, x], None without any.
+    """
 
     facts: ScanFacts
     selection: Selection
@@ -139,6 +143,7 @@ class ReportContext:
     live_picture: str = ""  # file name of the last picture of a volume that grew with its scan
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True  # whether there is time for so much before the report
+    stray: NDArray[np.float32] | None = None
 
 
 _NO_REFERENCE = "Neither is the truth: what only one of them shows is to be looked for in the views."
@@ -175,7 +180,11 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     again = rows_replaced(source)
     if again.size:
         table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
+    returned = returned_views(source)
+    if returned:
+        table["views on the way back"] = "; ".join(view.said() for view in returned)
     remarks = [] if flags is None else reasons(flags)
+    remarks += [f"On the way back {view.said()} since the first view." for view in returned if view.moved]
     flagged = [] if flags is None else worst_frames(source, flags)
     frames = f"{n}/{n + missing}"
     images = reference_images(source)
@@ -235,6 +244,11 @@ def compose(
             f"Matter that leaves structure: voxels at which the back-projected residual of {len(left.significance)} "
             f"slices exceeds four standard deviations of its noise; above {LIMIT:g} a fit hides something."
         )
+    if "stray" in own:
+        footnotes.append(
+            "Mass where views show nothing: share of the volume's mass in voxels whose rays meet no matter in two "
+            "views at least. Sparse views leave blobs and streaks there."
+        )
     if truth is not None:
         footnotes.append(
             "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
@@ -247,12 +261,26 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
-        pictures=[*_pictures(made, prepared, truth, volumes, left), *_frame_pictures(context.facts)],
+        pictures=[
+            *_pictures(made, prepared, truth, volumes, left),
+            *_stray_mass(context.stray, made.volume.grid, prepared.length_unit),
+            *_frame_pictures(context.facts),
+        ],
         command=context.command,
         recipe=context.recipe,
         footnotes=footnotes,
         live_picture=context.live_picture,
     )
+
+
+def _stray_mass(stray: NDArray[np.float32] | None, grid: Grid, unit: str) -> list[Picture]:
+    if stray is None:
+        return []
+    caption = (
+        "The highest density above each other, of voxels that the views show to be empty. All of it is an artefact: "
+        "less is better."
+    )
+    return [Picture("Stray mass", caption, figures.stray_mass(stray, grid, unit))]
 
 
 def _frame_pictures(facts: ScanFacts) -> list[Picture]:

@@ -9,7 +9,9 @@ import numpy as np
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
+from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.flags import Flags
+from beamline.projections.steps.poses import stated_poses
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -47,7 +49,7 @@ class RegionOfRows:
     Attributes:
         region: in the whole volume.
         slices: the same slices (z, y, x) of the volume of these rows.
-        z_offset: mm by which z = 0 of these rows lies above that of all rows.
+        z_offset: mm from z = 0 of all rows up to z = 0 of these rows.
     """
 
     region: Region
@@ -71,11 +73,20 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
     """The rows of the selection that show the region, and so many slices beside it; the axis is that of all rows.
 
     Raises:
-        ConfigError: a cone, or a region beyond the rows, or beyond the widest volume; `locate` refuses what only the
-            rotation axis tells.
+        ConfigError: a cone, or a region beyond the rows or the widest volume; options that may lean views or move them
+            along the axis. `locate` refuses what only the views tell.
     """
     if cone_of(source, selection) is not None:
         raise ConfigError(f"--roi is for a parallel beam; {source.path} is a cone. Give --rows instead.")
+    calibrate, poses = selection.step(Calibrate), stated_poses(source, selection)
+    given = [f"--calibrate {term}" for term in calibrate.terms if term in ("roll", "tilt", "shifts")]
+    if poses is not None and (poses.shifts[:, 1].any() or poses.turns_deg.any()):
+        given.append("--poses along the axis, or with roll or tilt")
+    if given:
+        raise ConfigError(
+            f"--roi takes rows for slices, and by {' and '.join(given)} a row may show others. Give --rows instead of "
+            "--roi, or leave that out. Nothing was read."
+        )
     rows, side, (first, end) = rows_of(source, selection), selection.binning, region.z
     slices = (rows.stop - rows.start) // side
     if end > slices:

@@ -9,8 +9,10 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import ReconOutcome, label_of
 from recon.assess.lost_mass import Comparison
+from recon.base.geometry import Geometry
 from recon.methods import by_name
-from recon.voxels import odd_views, unexplained
+from recon.splatting import needles
+from recon.voxels import odd_views, stray_mass, unexplained
 
 _NAMED = 5  # odd views, at most
 
@@ -35,6 +37,29 @@ def hiding_warning(made: ReconOutcome, left: unexplained.Unexplained) -> str:
         f"{left.share:.1%} of the matter leaves structure in the residual of the views (at most "
         f"{unexplained.LIMIT:.1%} is usual): the {label_of(made.method)} volume may hide cracks, pores or edges. Look "
         "at 'What the volume leaves in the views' in the report, and compare with --method fbp and fista-tv."
+    )
+
+
+def stray_mass_warning(made: ReconOutcome, found: stray_mass.StrayMass) -> str:
+    """The warning that a volume has mass where views show nothing; empty if it has little, and for direct methods."""
+    if found.share <= stray_mass.LIMIT or by_name(made.method).traits.direct:
+        return ""
+    return (
+        f"{found.share:.1%} of the mass of the {label_of(made.method)} volume is stray, where the views show nothing "
+        f"(at most {stray_mass.LIMIT:.0%} is usual). Look at 'Stray mass' in the report before you believe faint parts."
+    )
+
+
+def needles_warning(made: ReconOutcome, geometry: Geometry) -> str:
+    """The warning that a model is made of needles; empty if it is not, or if there is no model."""
+    if made.gaussians is None or not made.gaussians.n:
+        return ""
+    found = needles.needles(made.gaussians, geometry)
+    if found.share <= needles.LIMIT:
+        return ""
+    return (
+        f"{found.share:.0%} of the mass of the model is in Gaussians thinner than a pixel and ten times as long (at "
+        f"most {needles.LIMIT:.0%} is usual). They follow the noise of few views: compare with --method fista-tv."
     )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Sink, StateEntered, VolumeDone, Warned
@@ -22,7 +23,13 @@ from beamline.projections.steps.registry import recorded
 from beamline.reconstruct.measure import measure, regions, residual_share
 from beamline.reconstruct.model import arrays_of_model
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
-from beamline.reconstruct.remarks import hiding_warning, lost_mass_warning, odd_views_warning
+from beamline.reconstruct.remarks import (
+    hiding_warning,
+    lost_mass_warning,
+    needles_warning,
+    odd_views_warning,
+    stray_mass_warning,
+)
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.scratch import scratch_array
@@ -36,6 +43,7 @@ from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE, by_name
 from recon.prep.align import AxisEstimate
 from recon.voxels.direct import direct, has_direct_method
+from recon.voxels.stray_mass import stray_mass, stray_mass_share
 from recon.voxels.unexplained import unexplained
 
 _ROOM = 3.0  # times a volume: free disk from which on a second one is kept
@@ -157,6 +165,15 @@ def write_result(
         metrics[made.method]["unexplained"] = left.share
         warn(hiding := hiding_warning(made, left))
         doubtful = bool(hiding)
+    if waited_for or not context.leaves(stray_mass_share(prepared.geometry, made.volume.grid) * all_rays):
+        left_out.append("the look for mass where views show nothing")
+    else:
+        stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
+        if stray is not None:
+            metrics[made.method]["stray"] = stray.share
+            warn(stray_mass_warning(made, stray))
+            context = replace(context, stray=stray.map if stray.share > 0 else None)
+    warn(needles_warning(made, prepared.geometry))
     if not (direct_method or waited_for or context.leaves(_ODD_VIEWS * all_rays)):
         left_out.append("the look for views that do not fit the volume")
     else:
@@ -176,15 +193,21 @@ def write_result(
         metrics = {BASELINE: judged(volumes[BASELINE], clock.now() - before), **metrics}
     if BASELINE in volumes:  # it is the first
         for name, volume in volumes.items():
-            beside_fbp = compare(volume.data, volumes[BASELINE].data)
+            beside_fbp = compare(volume.data, volumes[BASELINE].data, _slices_seen(prepared, volume.grid))
             if beside_fbp is None:
                 break  # it shows no air
             metrics[name]["air"] = beside_fbp.air
             warn(lost := lost_mass_warning(made, beside_fbp))
             doubtful = doubtful or bool(lost)
-    keeps_fbp = doubtful and compared and BASELINE in volumes and partial_volume is None
-    if keeps_fbp := keeps_fbp and target.takes_a_second(made.volume.grid):
+    wants_fbp = doubtful and compared and BASELINE in volumes
+    keeps_fbp = wants_fbp and partial_volume is None and target.takes_a_second(made.volume.grid)
+    if keeps_fbp:
         warn(f"FBP of the same views is kept beside the volume: `beamline view {target.output.name}` shows both.")
+    elif wants_fbp:
+        warn(
+            "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
+            "disk. Make it with --method fbp to compare."
+        )
     if left_out:
         why = "the reconstruction was stopped" if waited_for else "the seconds asked for were nearly over"
         remark = f"Left out, as {why}: {', '.join(left_out)}."
@@ -253,6 +276,14 @@ def write_result(
         )
     )
     return own
+
+
+def _slices_seen(prepared: PreparedProjections, grid: Grid) -> NDArray[np.bool_] | None:
+    """[z] whether the slice's row of the detector got beam; None: all did, or rows show no slices."""
+    measured, geometry = prepared.measured, prepared.geometry
+    if measured is None or not geometry.rows_show_slices or grid.shape[0] != len(measured):
+        return None
+    return np.asarray(measured.any(axis=1))
 
 
 def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:

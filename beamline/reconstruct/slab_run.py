@@ -36,8 +36,7 @@ _WEIGHED = 16  # rows whose weights are made at a time
 _LOOK = 0.5  # s between two checks of slabs under way
 
 T = TypeVar("T")
-RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]
-"""Reconstructs views on a grid."""
+RunMethod = Callable[[Method, PreparedProjections, Grid, RunControl], Reconstruction]  # Reconstructs views on a grid
 
 
 @dataclass(frozen=True)

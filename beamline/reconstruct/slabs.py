@@ -18,6 +18,8 @@ from beamline.core.text import size
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import choose_views, cone_of, rows_of
+from beamline.projections.steps.calibrate import Calibrate
+from beamline.projections.steps.poses import stated_poses
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import ScanPart, StepMemory
 from beamline.reconstruct.cluster import local_workers
@@ -36,10 +38,10 @@ from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
 from recon.voxels.direct import Fbp
 from recon.voxels.odd_views import odd_views_memory
+from recon.voxels.stray_mass import stray_mass_memory
 from recon.voxels.unexplained import unexplained_memory
 
-SHARE = 0.7
-"""Share of the free memory that a reconstruction takes by default."""
+SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
 
 _BATCH = 0.25  # share of it for views during correction
 _COPIES = 4  # float32 copies of a view while it is corrected
@@ -109,7 +111,7 @@ class Needs:
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        return rays + self._work(self._for_part(seen), part, self._grid(seen))
+        return rays + self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
 
     def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
         """The method, or its error bars beside its volume."""
@@ -123,7 +125,8 @@ class Needs:
     def figures(self) -> int:
         """The figures of merit of a volume on disk, beyond the program's own memory; FBP needs less."""
         odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
-        found = min(self.volume // 4, _REGIONS) + max(odd, unexplained_memory(self.geometry))
+        looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
+        found = min(self.volume // 4, _REGIONS) + max(odd, *looks)
         return found if found > _ASIDE else 0
 
     @property
@@ -141,9 +144,6 @@ class Needs:
 
     def _grid(self, rows: int) -> Grid:
         return Grid((rows, *Grid.matching(self.geometry).shape[1:]), self.geometry.sample_pitch)
-
-    def _for_part(self, rows: int) -> Method:
-        return for_part(self.method, rows, self.rows, self.rows)
 
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
@@ -220,7 +220,10 @@ def memory_of(options: ReconOptions) -> int:
 
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: Needs, memory: int) -> None:
     """Raises ConfigError for options that need everything in memory."""
+    poses = stated_poses(source, options.selection)
     whole = {
+        "--calibrate with roll or tilt": options.selection.step(Calibrate).may_lean,
+        "--poses with roll or tilt": poses is not None and bool(poses.turns_deg.any()),
         "--budget": options.budget is not None,
         "--checkpoint and --resume": options.checkpoints.wanted,
         "--early-stop": options.stops_early,

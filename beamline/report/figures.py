@@ -67,9 +67,7 @@ def projection(data: NDArray[np.float32], geometry: Geometry, view: int, unit: s
     axes.axvline(0.0, color="tab:orange", lw=1, ls="--", label="rotation axis")
     axes.legend(loc="upper right", fontsize=8, framealpha=0.8)
     axes.set(
-        xlabel=f"u ({unit})",
-        ylabel=downwards("z", unit),
-        title=f"View at {np.degrees(geometry.angles[view]):.2f}°",
+        xlabel=f"u ({unit})", ylabel=downwards("z", unit), title=f"View at {np.degrees(geometry.angles[view]):.2f}°"
     )
     figure.colorbar(image, ax=axes, label="line integral", shrink=0.9, pad=0.02)
     return png(figure)
@@ -211,6 +209,17 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
     shown = axes.imshow(image, cmap="RdBu_r", extent=extent, norm=Normalize(-8, 8), interpolation="nearest")
     axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
     figure.colorbar(shown, ax=axes, label="standard deviations of the noise", pad=0.02)
+    return png(figure)
+
+
+def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str) -> bytes:
+    """The map [y, x] of density in empty voxels."""
+    figure, axes = _figure((6.4, 5.4))
+    (y, x), (_, cy, cx) = image.shape, grid.centre
+    extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size)[::-1])
+    shown = axes.imshow(image, cmap="magma", extent=extent, interpolation="nearest")
+    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title="Highest density where views show nothing")
+    figure.colorbar(shown, ax=axes, label=f"attenuation (1/{unit})", pad=0.02)
     return png(figure)
 
 

@@ -14,8 +14,7 @@ from beamline.core.files import write_whole
 from beamline.core.version import version
 from beamline.report.metrics import METRICS, formatted
 
-FactTable = Mapping[str, str]
-"""Values for people, by name; a table of two columns on the page."""
+FactTable = Mapping[str, str]  # Values for people, by name; a table of two columns on the page
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,12 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
+from recon.base.arrays import F32
 from recon.base.noise import noise_level
 from recon.base.volume import Volume
 
-F32 = NDArray[np.float32]
 _DPI, _GAP, _LINE = 100, 14, 15  # pixels: between panels, a line of text
 _SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
 _SIGMAS = 5.0  # range of the differences

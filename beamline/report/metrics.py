@@ -19,12 +19,14 @@ class Metric:
 METRICS = {
     "psnr": Metric("PSNR", "dB", 2, "higher is better"),
     "ssim3d": Metric("SSIM 3D", "", 4, "higher is better"),
+    "ssim_slices": Metric("SSIM whole slices", "", 4, "higher is better"),
     "nrmse": Metric("NRMSE", "", 4, "lower is better"),
     "snr": Metric("SNR", "dB", 2, "smoother has more"),
     "cnr": Metric("CNR", "dB", 2, "smoother has more"),
     "residual": Metric("Data residual, views used", "", 4, "lower is better"),
     "residual_held_out": Metric("Data residual, views held out", "", 4, "lower is better"),
     "unexplained": Metric("Matter that leaves structure", "", 4, "lower is better"),
+    "stray": Metric("Mass where views show nothing", "", 4, "lower is better"),
     "air": Metric("Level of air, in noise of FBP", "", 2, "nearer to 0 is better"),
     "seconds": Metric("Time", "s", 1, "lower is better"),
 }

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from beamline.report.figures import WIDTH, bright_centre, dpi_for, grey_window, png
+from recon.base.arrays import F32
 
-F32 = NDArray[np.float32]
 _COLUMNS = 4
 
 

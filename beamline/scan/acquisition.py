@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, InstrumentError, ReferencesError, ScanStopped
-from beamline.core.events import BlockDone, BlockStarted, Sink, Warned
+from beamline.core.events import BlockDone, BlockStarted, Sink, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import spans
 from beamline.plan.plan import Block, Timeline
-from beamline.plan.retake import middle_of_exposure, retake_block
-from beamline.scan.exposures import Exposures, Taken
+from beamline.plan.retake import middle_of_exposure, retake_block, return_triggers
+from beamline.scan.exposures import SLICE, Exposures, Taken
 from beamline.scan.ledger import LedgerError
+from beamline.scan.references import REFERENCES
 from beamline.scan.states import State
 from beamline.scan.supervision import Supervision
 from drivers.base.clock import Clock
@@ -27,7 +28,7 @@ DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 
 @dataclass(frozen=True)
 class TakenBlock:
-    """A block with its frames and missing triggers; `again`: it repeats views."""
+    """A block with its frames and missing triggers; `again`: it takes views again, whose loss is no failure."""
 
     block: Block
     taken: Taken
@@ -56,7 +57,7 @@ class Acquisition:
         sink: Sink = lambda event: None,
         supervision: Supervision | None = None,
     ) -> None:
-        self._devices, self._timeline, self._stop, self._sink = devices, timeline, stop, sink
+        self._devices, self._timeline, self._stop, self._sink, self._clock = devices, timeline, stop, sink, clock
         self._supervision, self._refused = supervision or Supervision(), ""
         self._exposures = Exposures(
             devices, camera_settings, settle, clock, stop, sink, self._supervision, self._wait_while_paused
@@ -126,6 +127,9 @@ class Acquisition:
             if block.kind is FrameKind.PROJECTION and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
+            if block.kind is FrameKind.ALIGNMENT:
+                yield from self._on_the_way_back(block)
+                continue
             done = TakenBlock(block, Taken())
             yield from self._block(done)
             if block.kind is FrameKind.PROJECTION and not self._stop.stopping:
@@ -164,13 +168,23 @@ class Acquisition:
         if rows := [retakes[i].row for i in done.taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were taken again."))
 
+    def _on_the_way_back(self, block: Block) -> Iterator[Frame]:
+        """Views that are taken a second time, at the angles of the first ones. Nothing replaces anything."""
+        views = self._timeline.views
+        beyond = middle_of_exposure(views)[return_triggers(views, block.n)]
+        done = TakenBlock(block, Taken(), again=True)
+        for frame in self._block(done):
+            yield replace(frame, angle=frame.angle - float(beyond[frame.trigger]))
+        if done.taken.missing:
+            self._sink(Warned(f"Of {block.n} views on the way back {len(done.taken.missing)} gave no frame."))
+
     def _still_needed(self, block: Block) -> bool:
         """A stopped scan still needs this block: projections were taken, but no darks or flats of this block's kind.
 
         A stop during the block itself ends it, because each block is considered once.
         """
         kinds = {done.block.kind for done in self._done if done.taken.frames}
-        return block.kind is not FrameKind.PROJECTION and FrameKind.PROJECTION in kinds and block.kind not in kinds
+        return block.kind in REFERENCES and FrameKind.PROJECTION in kinds and block.kind not in kinds
 
     def _set_shutter_and_sample(self, kind: FrameKind) -> None:
         """Bring shutter and sample where this kind of frame needs them; a shutter that does not move ends the scan."""
@@ -179,13 +193,25 @@ class Acquisition:
             shutter.close()
         else:
             sample.out() if kind is FrameKind.FLAT else sample.back()
+            cold = not shutter.is_open()
             shutter.open()
+            if cold:
+                self._warm_up()
         if shutter.is_open() is (kind is FrameKind.DARK):
             wanted, found = ("closed", "open") if kind is FrameKind.DARK else ("open", "closed")
             raise InstrumentError(
                 f"{shutter.name}: it is {found}, {kind.name.lower()}s need it {wanted}. Check its interlock. "
                 "What was taken before is in the file."
             )
+
+    def _warm_up(self) -> None:
+        """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
+        if not (seconds := self._timeline.warm_up):
+            return
+        self._sink(StateEntered(self._supervision.states.state, f"The scintillator warms up for {seconds:g} s"))
+        deadline = self._clock.now() + seconds
+        while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
+            self._clock.sleep(min(SLICE, left))
 
     def _wait_while_paused(self) -> None:
         """Wait with a closed shutter while a pause is requested; a stop ends it.
@@ -279,7 +305,7 @@ class Acquisition:
 
 def _state_of(block: Block) -> State:
     """The state in which a block begins, and goes on after a pause."""
-    if block.kind is FrameKind.PROJECTION:
+    if block.kind not in REFERENCES:
         return State.TAXI if block.trains else State.ACQUIRING
     return State.DARKS if block.kind is FrameKind.DARK else State.FLATS
 

@@ -16,8 +16,7 @@ from beamline.scan.supervision import PAUSE_POLL, BeamGuard, BeamLimits
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, BeamReading
 
-LAST_WAIT = 3.0
-"""Longest wait in s for a reading in progress at the end of a scan."""
+LAST_WAIT = 3.0  # Longest wait in s for a reading in progress at the end of a scan
 
 
 class BeamLog:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import BeamlineError, InstrumentError
 from beamline.core.events import Sink, Warned
-from beamline.core.stop import ScanAborted, StopRequest
+from beamline.core.stop import StopRequest
 from beamline.plan.plan import Block
 from beamline.plan.timeline import move_seconds, passes
 from beamline.scan.braking import Braking, booked, by_nothing, placing
@@ -358,7 +358,7 @@ class Exposures:
         deadline = self._clock.now() + timeout
         failed = False
         while True:
-            self._check_abort()
+            self._stop.refuse_abort()
             remaining = deadline - self._clock.now()
             try:
                 return self._camera.next_frame(max(0.0, min(SLICE, remaining)))
@@ -375,7 +375,7 @@ class Exposures:
         """Wait for a move that should take `seconds`; False if a stop cut it short."""
         deadline = self._clock.now() + 2 * seconds + 5.0
         while self._stage.moving():
-            self._check_abort()
+            self._stop.refuse_abort()
             if until_stop and self._stop.stopping:
                 self.stand()
                 return False
@@ -391,7 +391,7 @@ class Exposures:
         deadline = self._clock.now() + 2 * limits.max_speed / limits.acceleration + 5.0
         self._stage.stop()
         while self._stage.moving():
-            self._check_abort()
+            self._stop.refuse_abort()
             if self._clock.now() > deadline:
                 raise InstrumentError(f"{self._stage.name}: it still moves after a stop. Use its emergency stop.")
             self._clock.sleep(POLL)
@@ -400,7 +400,3 @@ class Exposures:
     def _interrupted(self) -> bool:
         """Whether a stop or a pause is requested."""
         return self._stop.stopping or bool(self._supervision.pause.reason)
-
-    def _check_abort(self) -> None:
-        if self._stop.aborting:
-            raise ScanAborted(f"Aborted: {self._stop.reason}.")

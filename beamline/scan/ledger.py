@@ -218,7 +218,7 @@ def start_known(train: Train) -> bool:
 
 
 def _off(ledger: Ledger, trigger: int, time: float) -> float:
-    """Periods by which a frame came after the time when its trigger was expected; negative: before."""
+    """Periods from the time when its trigger was expected to a frame; negative: it came before."""
     if ledger.last >= 0:
         return (time - ledger.phase) / ledger.period - (trigger - ledger.last)
     return 0.0 if ledger.train.first is None else (time - ledger.train.first) / ledger.train.period - trigger

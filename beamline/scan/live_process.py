@@ -34,8 +34,7 @@ from recon.methods import streams
 if TYPE_CHECKING:
     from beamline.scan.resume import ResumableRun
 
-LiveCommand = Callable[[Path, Path], Sequence[str]]
-"""(scan file, output file) -> the command line."""
+LiveCommand = Callable[[Path, Path], Sequence[str]]  # (scan file, output file) -> the command line
 
 _SILENCE = 300.0  # real s without output, after which the process is ended
 _GRACE = 120.0  # real s in which it may still write its volume, unless the operator aborts

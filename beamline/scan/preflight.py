@@ -32,8 +32,7 @@ from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, Tr
 from recon.base.choices import AUTO
 from recon.methods import streams
 
-Remaining = Callable[[ScanPlan], ScanPlan]
-"""A plan without the frames in earlier files of the same scan."""
+Remaining = Callable[[ScanPlan], ScanPlan]  # A plan without the frames in earlier files of the same scan
 
 
 def all_of(plan: ScanPlan) -> ScanPlan:
@@ -200,6 +199,8 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "exposure_s": plan.exposure,
         "period_s": plan.period,
         "settle_s": plan.settle,
+        "warm_up_s": plan.warm_up,
+        "return_views": plan.return_views,
         "darks": {"count": plan.darks.count, "at": plan.darks.at, "exposure_s": plan.darks.exposure},
         "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},
         "angles_deg": np.degrees(plan.angles).tolist(),

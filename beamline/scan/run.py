@@ -33,6 +33,7 @@ from beamline.instrument.operator import enter_pressed
 from beamline.instrument.simulated import clock_of
 from beamline.monitor.rehearsal import rehearse
 from beamline.plan.retake import Retake, spread
+from beamline.projections.returned import ReturnedView, returned_views
 from beamline.scan.acquisition import Acquisition
 from beamline.scan.beam_log import BeamLog, beam_log
 from beamline.scan.control import verbs_taken
@@ -47,12 +48,12 @@ from beamline.scan.states import NEXT, State, StateMachine
 from beamline.scan.supervision import PAUSE_POLL, AlarmReaction, Supervision
 from beamline.scan.watchdog import watched
 from beamline.simulate.labels import LabelLog, labels_path, write_labels
+from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock
 from drivers.manual import Ask
 
-SAFE = "Stage stopped, shutter closed; the last frames are being written"
-"""Message of the state `finishing`."""
+SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
 
 READY_WITHIN = 300.0
 """Real s that a scan waits for its live reconstruction, which compiles once on a machine; see `_Run._compiled`."""
@@ -80,6 +81,7 @@ class RunResult:
         seconds: real time of the whole run.
         bytes: size of the file that was written.
         recon: data of the live reconstruction's `done` event; None without one, or where it failed.
+        returned: views on the way back, with the motion of the sample.
     """
 
     path: Path
@@ -93,6 +95,7 @@ class RunResult:
     seconds: float
     bytes: int
     recon: Mapping[str, Any] | None
+    returned: tuple[ReturnedView, ...] = ()
 
 
 def run_scan(
@@ -137,6 +140,7 @@ def run_scan(
         instrument = instrument or connected.enter_context(
             connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
         )
+        instrument.watch_sample(stop.refuse_abort)
         ready = preflight(config, instrument, place, series.remaining if series else all_of)
         _refuse_stop(stop)
         folder = series.begin(ready) if series else create_run_folder(place, config.sample.name, SystemClock().now())
@@ -294,6 +298,7 @@ class _Run:
             seconds=time.monotonic() - self.began,
             bytes=writer.path.stat().st_size,
             recon=None,
+            returned=self._returned(path) if unfinished is None else (),
         )
         self.sink(ScanDone(**vars(result), status=status))
         if follower is not None:
@@ -303,6 +308,20 @@ class _Run:
         if error is not None:
             raise error
         return replace(result, seconds=time.monotonic() - self.began)
+
+    def _returned(self, path: Path) -> tuple[ReturnedView, ...]:
+        """Views on the way back; a warning says where the sample has moved."""
+        if not self.ready.plan.return_views:
+            return ()
+        try:
+            with open_scan(path) as source:
+                found = tuple(returned_views(source))
+        except (DataError, OSError, ValueError) as error:  # the scan is stored, whatever this says
+            self.sink(Warned(f"Views on the way back could not be compared: {error}"))
+            return ()
+        if moved := [view.said() for view in found if view.moved]:
+            self.sink(Warned(f"On the way back: {'; '.join(moved)}. Let it settle, fix it, or scan faster."))
+        return found
 
     def _acquire(self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog) -> None:
         # Closing the iterator is what makes the instrument safe when the recorder fails.

@@ -14,8 +14,7 @@ from beamline.core.files import OURS
 SCAN, RECON, CONFIG = "scan.h5", "recon.h5", "config.resolved.yaml"
 USER_LOG, RECON_LOG = "user.log", "recon.log"
 CONTROL, WATCHDOG_LOG = "control", "watchdog.log"
-STAMP = "%Y-%m-%dT%H-%M-%S"
-"""The UTC time at the head of a run folder's name, before "_"."""
+STAMP = "%Y-%m-%dT%H-%M-%S"  # The UTC time at the head of a run folder's name, before "_"
 
 
 def create_run_folder(runs: Path, sample: str, seconds: float) -> Path:

@@ -15,12 +15,12 @@ from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import EVENTS, parts_of
+from beamline.core.text import printable, size
 from beamline.scan.control import running, state_of
 from beamline.scan.run_folder import CONTROL, SCAN, STAMP
 from beamline.scan.states import State
 
-DIED = "died"
-"""State of a run whose process has ended without a final event."""
+DIED = "died"  # State of a run whose process has ended without a final event
 
 _HEAD, _TAIL = 2**16, 2**17  # bytes of a log that are read: the sample is at its head, the outcome at its end
 _ENDING = 600.0  # real s since the last line of a log, within which a complete scan may still be ending
@@ -54,6 +54,11 @@ class Run:
     state: str
     bytes: int
     parts: int
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more happens, unless it is resumed."""
+        return self.state == DIED or self.state in _ENDED
 
 
 def runs_in(folder: Path) -> list[Path]:
@@ -93,6 +98,24 @@ def describe(run: Path) -> Run:
         bytes=sum(_sizes(run)),
         parts=len(parts),
     )
+
+
+HEAD = ("time (UTC)", "sample", "frames", "state", "size", "flags", "folder")
+
+
+def cells(run: Run) -> tuple[str, ...]:
+    """The row of a run under HEAD, each cell one line of printable text."""
+    from beamline.storage.flag_legend import counted
+
+    frames = "not known" if run.frames is None else str(run.frames)
+    if run.planned is not None and run.state != State.DONE:
+        frames += f" of {run.planned}"
+    parts = f" in {run.parts} parts" if run.parts > 1 else ""
+    row = (
+        time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(run.time)), run.sample, frames + parts, run.state,
+        size(run.bytes), counted(run.flags) if run.flags else "-", run.folder.name,
+    )  # fmt: skip
+    return tuple(printable(cell).replace("\n", " ").replace("\t", " ") for cell in row)
 
 
 def _is_run(run: Path) -> bool:

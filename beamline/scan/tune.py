@@ -120,17 +120,35 @@ def tune(
     plan, camera = plan_of(config), instrument.devices.camera
     angle = float(plan.angles[0]) if angle is None else angle
     exposures = _accepted(instrument, config, plan.exposure)
-    settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
+    frames, settings = take(_blocks(exposures, angle), config, instrument, stop, sink)
     timing = camera.timing
-    blocks = _blocks(exposures, angle)
-    worked = Timeline(tuple(blocks), 0.0, 2 * math.prod(timing.shape), 0, 0, 0.0, 0.0, 0.0, (), ())
-    acquisition = Acquisition(instrument.devices, worked, settings, plan.settle, instrument.clock, stop, sink)
-    try:
-        frames = list(acquisition.frames())
-    except LedgerError as error:
-        raise InstrumentError(f"{camera.name}: frames are missing. {error}") from error
     longest = _longest(plan, settings, timing)
     return evaluate(frames, plan, 2.0**timing.bits - 1, longest, reference_limits(config.references))
+
+
+def take(
+    blocks: Sequence[Block], config: Config, instrument: ConnectedDevices, stop: StopRequest, sink: Sink
+) -> tuple[list[Frame], CameraSettings]:
+    """Frames of these blocks, which are kept in memory, and what the camera was set to. Errors are those of `tune`."""
+    plan, camera = plan_of(config), instrument.devices.camera
+    settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
+    worked = Timeline(tuple(blocks), 0.0, 2 * math.prod(camera.timing.shape), 0, 0, 0.0, 0.0, 0.0, (), ())
+    instrument.watch_sample(stop.refuse_abort)
+    acquisition = Acquisition(instrument.devices, worked, settings, plan.settle, instrument.clock, stop, sink)
+    try:
+        return list(acquisition.frames()), settings
+    except LedgerError as error:
+        raise InstrumentError(f"{camera.name}: frames are missing. {error}") from error
+
+
+def static_block(kind: FrameKind, n: int, exposure: float) -> Block:
+    """Frames at no angle: darks or flats."""
+    return Block(kind, Mode.STATIC, 0, np.full(n, np.nan), exposure, exposure)
+
+
+def mean_counts(frames: Sequence[Frame]) -> F64:
+    """[row, col]."""
+    return np.asarray(np.mean([frame.counts for frame in frames], axis=0, dtype=np.float64))
 
 
 def evaluate(
@@ -144,11 +162,11 @@ def evaluate(
     darks = [frame for frame in frames if frame.kind is FrameKind.DARK]
     flats = [frame for frame in frames if frame.kind is FrameKind.FLAT]
     first = max(frame.exposure for frame in flats)
-    dark = _mean(darks)
+    dark = mean_counts(darks)
     used = _unsaturated(flats, saturation, limits)
     pair = [frame for frame in flats if frame.exposure == used]
     (view,) = [frame for frame in frames if frame.kind is FrameKind.PROJECTION and frame.exposure == used]
-    flat = _mean(pair)
+    flat = mean_counts(pair)
     light = flat - dark
     lit = light > UNLIT * np.percentile(light, BRIGHTEST)
     of_darks, of_flats = _variance(darks, np.ones(lit.shape, bool)), _variance(pair, lit)
@@ -186,10 +204,6 @@ def evaluate(
         angle=view.angle,
         faults=tuple(fault.message for fault in faults),
     )
-
-
-def _mean(frames: Sequence[Frame]) -> F64:
-    return np.asarray(np.mean([frame.counts for frame in frames], axis=0, dtype=np.float64))
 
 
 def _noise(share: float, light: float, gain: float, of_darks: float, n_flats: int) -> float:
@@ -235,13 +249,10 @@ def _accepted(instrument: ConnectedDevices, config: Config, exposure: float) -> 
 
 
 def _blocks(exposures: Sequence[float], angle: float) -> list[Block]:
-    def static(kind: FrameKind, n: int, exposure: float) -> Block:
-        return Block(kind, Mode.STATIC, 0, np.full(n, np.nan), exposure, exposure)
-
     views = [Block(FrameKind.PROJECTION, Mode.STEP, 0, np.array([angle]), t, t) for t in exposures]
     return [
-        static(FrameKind.DARK, 2, exposures[0]),
-        *(static(FrameKind.FLAT, 2, exposure) for exposure in exposures),
+        static_block(FrameKind.DARK, 2, exposures[0]),
+        *(static_block(FrameKind.FLAT, 2, exposure) for exposure in exposures),
         *views,
     ]
 

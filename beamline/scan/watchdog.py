@@ -23,7 +23,7 @@ from pathlib import Path
 
 import psutil
 
-from beamline.config.devices import StageOutputShutter
+from beamline.config.devices import EpicsShutter, Simple, StageMover
 from beamline.config.load import Config, load
 from beamline.core.events import Sink, Warned
 from beamline.core.process import ChildProcess
@@ -31,6 +31,7 @@ from beamline.core.stop import PauseRequest, StopRequest
 from beamline.instrument.connect import shutter_of
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from drivers.base.clock import Clock, SystemClock
+from drivers.epics.devices import PvShutter
 
 PATIENCE = 60.0  # s for each step; a stage refuses to be opened while it slows down
 BETWEEN = 0.5  # s between attempts
@@ -137,16 +138,25 @@ class _Keeper:
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     """Stop the stage, then disarm its trigger output and close the shutter; True: all obeyed. `say`: takes a sentence
     on each step."""
-    stage, shutter = config.devices.stage, config.devices.shutter
-    closed = "its shutter is closed" if isinstance(shutter, StageOutputShutter) else "the shutter is moved by hand"
+    stage, shutter, mover = config.devices.stage, config.devices.shutter, config.devices.sample_mover
+    apart = shutter if isinstance(shutter, EpicsShutter) else None
+    closed = "the shutter is moved by hand"
+    if not isinstance(shutter, Simple):
+        closed = "its shutter is closed" if apart is None else "the shutter has a step of its own"
 
     def disarm() -> None:
         with closing(stage.connect(clock)) as connected:
             connected.disarm()
-            shutter_of(config, connected, clock, say).close()
+            if apart is None:
+                shutter_of(config, connected, clock, say).close()
 
-    stopped = _insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")
-    return _insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}.") and stopped
+    done = [_insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")]
+    if apart:
+        done.append(_insist(lambda: PvShutter(apart.pvs, clock).close(), clock, say, "The shutter is closed."))
+    if isinstance(mover, StageMover):
+        done.append(_insist(lambda: mover.stage.halt(clock), clock, say, "The sample mover was told to stop."))
+    done.append(_insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}."))
+    return all(done)
 
 
 def _insist(step: Callable[[], None], clock: Clock, say: Callable[[str], None], done: str) -> bool:

@@ -19,7 +19,7 @@ from beamline.core.version import version
 from beamline.segment.picture import picture_of
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
-from beamline.storage.volume_file import read_volume
+from beamline.storage.volume_file import axes_of, read_volume
 from beamline.storage.writers.recon_file import DEVIATION
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
@@ -161,7 +161,7 @@ def _read(options: SegmentOptions) -> tuple[Volume, str]:
         with hdf5.open_hdf5(path) as file:
             if dataset is None and isinstance(file.get(_SIGNAL), h5py.Dataset):
                 dataset = _SIGNAL
-            spacing, first = _axes_of(file, dataset)
+            spacing, first = axes_of(file, dataset)
     data, stated = read_volume(path, dataset)
     if data.ndim != 3 or data.dtype.kind not in "fiub" or min(data.shape) < 3:
         raise DataError(f"{path} holds {data.dtype} of shape {data.shape}; expected real numbers [z, y, x], 3 or more.")
@@ -187,18 +187,6 @@ def _is_scan(path: Path) -> bool:
             return True
     except DataError:
         return False
-
-
-def _axes_of(file: h5py.File, dataset: str | None) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
-    """Spacing and first coordinates (z, y, x) in mm by the arrays z, y, x beside a dataset; None without them."""
-    node = None if dataset is None else file.get(dataset)
-    axes = [] if node is None else [node.parent.get(name) for name in "zyx"]
-    if not axes or any(not isinstance(axis, h5py.Dataset) or axis.size < 2 for axis in axes):
-        return None, None
-    if any(axis.attrs.get("units") != "mm" for axis in axes):
-        return None, None
-    ends = [(float(axis[0]), float(axis[-1]), axis.size) for axis in axes]
-    return tuple((last - low) / (n - 1) for low, last, n in ends), tuple(low for low, _, _ in ends)
 
 
 def table_of(found: Segmented) -> str:

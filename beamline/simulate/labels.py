@@ -74,12 +74,3 @@ def write_labels(path: Path, runs: Sequence[LabelledRun], n_frames: int) -> None
         ],
     }
     write_whole(path, json.dumps(content) + "\n")
-
-
-def read_labels(path: Path) -> tuple[LabelledRun, ...]:
-    """The labels of a file from `write_labels`."""
-    content = json.loads(path.read_text(encoding="utf-8"))
-    return tuple(
-        LabelledRun(entry["kind"], entry["first_frame"], tuple(tuple(region) for region in entry["regions"]))
-        for entry in content["anomalies"]
-    )

@@ -16,10 +16,8 @@ from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.samples.sample import Sample
 
-LARGEST = 256
-"""Voxels across by default: 256³ take 84 MB with the labels."""
-BYTES_A_VOXEL = 16
-"""Peak memory as measured: 12 for solids (float64 and float32), 16 for volumes."""
+LARGEST = 256  # Voxels across by default: 256³ take 84 MB with the labels
+BYTES_A_VOXEL = 16  # Peak memory as measured: 12 for solids (float64 and float32), 16 for volumes
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,12 +40,32 @@ def figures_of_rows(table: StudyTable) -> bytes:
     return png(figure)
 
 
+def against_cost(table: StudyTable) -> bytes:
+    """The first figure of all rows against dose and against time, a colour a method."""
+    name = "psnr_truth" if "psnr_truth" in table.names else table.names[0]
+    figure = Figure(figsize=(WIDTH, 3.6), dpi=DPI, layout="constrained")
+    by_dose, by_time = figure.subplots(1, 2, sharey=True)
+    for method in dict.fromkeys(cell.method for cell in table.done):
+        cells = [c for c in table.done if c.method == method and math.isfinite(c.figures[name])]
+        values = [cell.figures[name] for cell in cells]
+        for axes, cost in ((by_dose, [c.row.frames for c in cells]), (by_time, [c.cpu_seconds for c in cells])):
+            axes.plot(cost, values, "o", ms=4, color=colour_of(method), label=method)
+    by_dose.set(xlabel="dose: frames that were exposed", ylabel=f"{HEADINGS[name]} (dB)", xscale="log")
+    by_time.set(xlabel="processor time (s)", xscale="log")
+    for axes in (by_dose, by_time):
+        axes.grid(alpha=0.3)
+    by_dose.legend(fontsize=8)
+    return png(figure)
+
+
 def write_page(folder: Path, table: StudyTable, slices: SliceSheet) -> None:
     """Write the pictures and report.html."""
     pictures = []
     if table.done:
         caption = "What each figure is of is said below the table. A smoother volume has more SNR and CNR."
         pictures.append(("figures.png", Picture("Figures of all rows", caption, figures_of_rows(table))))
+        caption = "Each frame of the scan has the same dose; one that several views share is counted once."
+        pictures.append(("cost.png", Picture("Quality against dose and time", caption, against_cost(table))))
     for method in dict.fromkeys(cell.method for cell in table.done):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
         picture = Picture(f"{by_name(method).label}, slice by slice", caption, slices.png(slices.labels(method)))

@@ -31,13 +31,13 @@ from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
 from drivers.base.clock import Clock
 from recon.assess import metrics
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Plain
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE
 from recon.voxels.fbp import Filter
 
-F32 = NDArray[np.float32]
 REFERENCE = "FBP of all views"
 
 
@@ -128,7 +128,9 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     with result_folder(folder) as work:
         try:
             write_array(work / "views.npy", prepared.projections.data)
-            del prepared  # from here on the views are in the file alone
+            if (rays := prepared.rays_there()) is not None:
+                write_array(work / "rays.npy", rays)
+            del prepared, rays  # from here on the views are in the file alone
             rig = _Rig(work, geometry, options.seed, options.settings)
             whole = StudyRow(REFERENCE, np.arange(geometry.n_views)[:, None])
             reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
@@ -163,7 +165,9 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
 
 def _planned(options: StudyOptions, geometry: Geometry, facts: Mapping[str, str], truth: bool) -> StudyTable:
     """The table before any row is done."""
-    rows = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws))
+    turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
+    places = np.concatenate((geometry.shifts, turns), axis=1)
+    rows = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places))
     notes = [
         f"PSNR and SSIM are against the {REFERENCE} ({geometry.n_views}, {options.filter}): it has noise and streaks "
         "of its own, which rows share as far as they share its views.",
@@ -188,7 +192,10 @@ def _planned(options: StudyOptions, geometry: Geometry, facts: Mapping[str, str]
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
-    """Where rows are reconstructed: a folder with the views of the scan, views.npy, and their geometry."""
+    """Where rows are reconstructed: a folder with the views of the scan, views.npy, and their geometry.
+
+    Where rays have weights, rays.npy has them.
+    """
 
     work: Path
     geometry: Geometry
@@ -204,7 +211,11 @@ class _Rig:
         data, angles = averaged(np.load(self.work / "views.npy", mmap_mode="r"), self.geometry.angles, row.groups)
         angles.setflags(write=False)
         geometry = replace(self.geometry.select(row.groups[:, row.window // 2]), angles=angles)
-        Data(data, geometry, None, None).save(self.work / "data.npz")
+        weights = None
+        if (self.work / "rays.npy").exists():
+            of_scan = np.load(self.work / "rays.npy", mmap_mode="r")
+            weights = np.stack([of_scan[group].min(axis=0) for group in row.groups])
+        Data(data, geometry, None, None, weights).save(self.work / "data.npz")
         del data
         kept = self.work / "volume.npy"
         trial = Trial(

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.base.arrays import I64
 from recon.base.views import parse_views
-
-I64 = NDArray[np.int64]
 
 COUNTS = 360, 180, 90, 45
 SECTORS = ((30, 150, 120), (45, 135, 90), (60, 120, 60))
@@ -18,8 +17,8 @@ SECTORS = ((30, 150, 120), (45, 135, 90), (60, 120, 60))
 EQUAL_COUNTS = 120, 60
 DISJOINT_DEG = 1.0, 2.0, 3.0
 OVERLAPPING_DEG = 2.0, 3.0, 4.0, 5.0, 6.0
-OVERLAPPING = 180
-"""Number of overlapping windows of each width."""
+OVERLAPPING = 180  # Number of overlapping windows of each width
+_APART = 0.25  # px between views of a window: a mean of views that lie further apart is blurred
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +43,11 @@ class StudyRow:
         return 0 if self.groups is None else self.groups.shape[1]
 
     @property
+    def frames(self) -> int:
+        """Frames of the scan that it takes, each counted once: its dose."""
+        return 0 if self.groups is None else np.unique(self.groups).size
+
+    @property
     def n_views(self) -> int:
         return 0 if self.groups is None else self.groups.shape[0]
 
@@ -57,12 +61,14 @@ class ViewSet:
         period: radians after which views see the same rays, see `Geometry.period`.
         seed: of the first random draw.
         draws: how often a random choice is repeated.
+        places: [view, place], px, how far poses move the image or its edge; None: views lie alike.
     """
 
     angles: NDArray[np.float64]
     period: float
     seed: int = 0
     draws: int = 3
+    places: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -186,4 +192,10 @@ def _windows(views: ViewSet, width: float, count: int | None) -> StudyRow:
     together = np.ptp(angles[groups], axis=1) < 2 * np.radians(width)  # none across a gap of the scan
     if together.sum() < 2:
         return StudyRow(label, None, reason="the scan's views are too unevenly spread to have neighbours")
-    return StudyRow(label, groups[together].astype(np.int64))
+    groups = groups[together].astype(np.int64)
+    apart = 0.0 if views.places is None else float(np.ptp(views.places[groups], axis=1).max())
+    if apart > _APART:
+        return StudyRow(
+            label, None, reason=f"views of a window are displaced by up to {apart:.2g} px, so that a mean is blurred"
+        )
+    return StudyRow(label, groups)

@@ -154,6 +154,7 @@ def write_table(folder: Path, table: StudyTable) -> None:
 def _record(cell: Cell) -> dict[str, str | float | None]:
     return {
         "row": cell.row.label, "method": cell.method, "views": cell.row.n_views, "window": cell.row.window,
+        "frames": cell.row.frames,
         "status": cell.status, "seconds": cell.seconds, "cpu_seconds": cell.cpu_seconds,
         **{name: cell.figures.get(name) for name in HEADINGS},
         "message": cell.message,

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.files import named_on_failure
+from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
-
-F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +24,14 @@ class Data:
         projections, geometry: of the views that may be used.
         held_out: views that no trial uses, and their geometry.
         truth: the volume [z, y, x] on Grid.matching(geometry).
+        weights: [view, row, col] of the rays of these views, then of those held out; 0: not measured. None: all alike.
     """
 
     projections: F32
     geometry: Geometry
     held_out: tuple[F32, Geometry] | None
     truth: F32 | None
+    weights: F32 | None = None
 
     def save(self, path: Path) -> None:
         """As .npz, without pickle.
@@ -43,6 +44,8 @@ class Data:
             arrays |= {"held_out": self.held_out[0], **_geometry_arrays("held_out_geometry", self.held_out[1])}
         if self.truth is not None:
             arrays["truth"] = self.truth
+        if self.weights is not None:
+            arrays["weights"] = self.weights
         with named_on_failure(path):
             np.savez(path, allow_pickle=False, **arrays)
 
@@ -51,7 +54,7 @@ class Data:
         with np.load(path, allow_pickle=False) as file:
             geometry = _geometry("geometry", file)
             held = (file["held_out"], _geometry("held_out_geometry", file)) if "held_out" in file else None
-            return cls(file["projections"], geometry, held, file.get("truth"))
+            return cls(file["projections"], geometry, held, file.get("truth"), file.get("weights"))
 
 
 def write_array(path: Path, array: F32) -> None:

@@ -202,7 +202,6 @@ def _pareto(table: TrialTable, cost: TrialCost) -> bytes:
 
 
 def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
-    """The page."""
     names = _metric_names(table)
     on_front = {table.compared[i].trial for i in table.front(TIME)}
     return render(

@@ -128,7 +128,10 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
     """
     if truth is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
-    return Data(prepared.projections.data, prepared.geometry, prepared.held_out, truth)
+    others = 0 if prepared.held_out is None else prepared.held_out[1].n_views
+    return Data(
+        prepared.projections.data, prepared.geometry, prepared.held_out, truth, prepared.rays_there(others)
+    )  # fmt: skip
 
 
 def _each(

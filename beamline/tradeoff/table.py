@@ -12,8 +12,7 @@ from beamline.core.events import TrialDone
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
 
-LEAST_GAIN = 0.01
-"""dB: the smallest difference that tables show."""
+LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
 
 

@@ -23,6 +23,7 @@ _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
 _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
 _PUBLISHED_STEPS = {"quick": (1000,), "full": (3000, 10_000)}
+_FIELD_STEPS = {"quick": (300,), "full": (1000, 3000)}
 _BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
 
 
@@ -98,6 +99,11 @@ def _fits(gaussians: int, depth: Depth) -> list[TrialSettings]:
     return found
 
 
+def _fields(gaussians: int, depth: Depth) -> list[TrialSettings]:
+    base, *longer = ({"steps": steps} for steps in _FIELD_STEPS[depth])
+    return [TrialSettings("method", base), *(TrialSettings("steps", one) for one in longer)]
+
+
 def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:
     """The published fit in fewer than its 30 000 steps, which would take a trade-off hours."""
     base, *longer = ({"steps": steps, "gaussians": gaussians} for steps in _PUBLISHED_STEPS[depth])
@@ -107,6 +113,7 @@ def _published(gaussians: int, depth: Depth) -> list[TrialSettings]:
 TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
     "r2": _fits,
     "r2-published": _published,
+    **dict.fromkeys(("naf", "intratomo", "sax-nerf"), _fields),
     "sirt": partial(_iterations, (20, 60), (10, 30, 100, 300)),
     "sart": partial(_iterations, (2, 6), (1, 3, 10, 30)),
     "cgls": partial(_iterations, (5, 15), (5, 10, 20, 40)),
@@ -118,5 +125,6 @@ TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
 COLOURS: Mapping[str, str] = {
     "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
+    "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
 }  # fmt: skip
 _SPARE = ("tab:pink", "black", "gold", "teal")

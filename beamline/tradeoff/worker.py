@@ -32,8 +32,10 @@ from beamline.tradeoff.trials import Trial
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
+from recon.base.arrays import F32
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
+from recon.base.masks import masked
 from recon.base.method import DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
@@ -41,7 +43,6 @@ from recon.reconstruction import Reconstruction
 from recon.voxels.projector import data_residual, project
 from recon.warm_up import warm_up
 
-F32 = NDArray[np.float32]
 Say = Callable[[Mapping[str, Any]], None]
 
 _SAY_EVERY = 0.5  # s
@@ -67,12 +68,16 @@ def run(
     """
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
+    weights, n = data.weights, data.geometry.n_views
+    unseen_rays = None if weights is None else weights[n:]
+    if weights is not None:
+        weights = np.concatenate((weights[views], weights[n:]))
     grid = Grid.matching(data.geometry)
     # On a toy of the same kind, so that compilation is in no trial's time.
     warm_up(trial.build(), data.geometry)
     reset_peak_memory()
     before = cpu()
-    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now))
+    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now), weights)
     cpu_seconds = cpu() - before
     peak = peak_memory()  # before measuring, which has needs of its own
     volume = on_grid(result.volume, grid)
@@ -84,11 +89,14 @@ def run(
         found["ssim3d"] = metrics.ssim3d(data.truth, volume.data)
     left: list[float] = []
     if data.held_out is not None:
-        found["residual_held_out"] = data_residual(volume, *data.held_out)
+        found["residual_held_out"] = data_residual(volume, *data.held_out, unseen_rays)
         unseen, views_of = data.held_out
-        left = ((project(volume, views_of) - unseen) ** 2).sum(axis=(1, 2), dtype=np.float64).tolist()
+        squares = (project(volume, views_of) - unseen) ** 2
+        if unseen_rays is not None:
+            squares *= unseen_rays
+        left = squares.sum(axis=(1, 2), dtype=np.float64).tolist()
     if trial.halves and trial.views >= 4:
-        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed)
+        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, weights)
     return {
         "seconds": result.seconds,
         "cpu_seconds": cpu_seconds,
@@ -101,12 +109,15 @@ def run(
     }
 
 
-def half_set_resolution(trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int) -> float:
+def half_set_resolution(
+    trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int, weights: F32 | None = None
+) -> float:
     """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
 
     def half(views: NDArray[np.int64]) -> F32:
-        result = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None)
+        rays = None if weights is None else weights[views]
+        result = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None, rays)
         return on_grid(result.volume, grid).data
 
     even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
@@ -121,15 +132,21 @@ def reconstruct(
     held_out: tuple[F32, Geometry] | None,
     seed: int,
     on_progress: Callable[[recon.Progress], None] | None,
+    weights: F32 | None = None,
 ) -> Reconstruction:
     """The one place that turns a trial into a call of recon.reconstruct.
 
-    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel.
+    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel. `weights`
+    are of the views, and of those held out after them.
     """
-    method, use = trial.build(), DataUse()
+    method, unseen = trial.build(), list[int]()
     if method.traits.held_out:
         projections, geometry, unseen = with_held_out(projections, geometry, held_out)
-        use = DataUse(held_out=unseen)
+    if weights is not None:
+        weights = weights[: len(projections)]
+        if trial.binning > 1:
+            projections, weights = masked(projections, weights)[0], bin_views(weights, trial.binning)
+    use = DataUse(weights, unseen)
     binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
     target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(coarse)
     control = RunControl(on_progress=on_progress)

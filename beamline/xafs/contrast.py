@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 
+from recon.base.arrays import Mask
+
 Reals = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 NEARLY_BEST = 0.95
 WINDOW = 7  # energies

@@ -13,8 +13,7 @@ from beamline.xafs.contrast import local_parabolas
 
 Reals = NDArray[np.float64]
 
-LEAST = 9
-"""Energies that a curve must have."""
+LEAST = 9  # Energies that a curve must have
 WINDOW = 5  # points of a local parabola
 SURE = 5.0  # least ratio of the misfit of a smooth curve to the noise
 FALSE_ALARM = 1e-6  # probability for a curve without an edge, under normal noise of any size

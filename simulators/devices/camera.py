@@ -19,7 +19,7 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from simulators.devices.camera_view import CameraView, Exposed
-from simulators.devices.shutter import BeamGate, SimulatedSampleMover
+from simulators.devices.shutter import BeamGate, SampleGate
 from simulators.devices.trigger_line import TriggerLine
 from simulators.effects.anomaly import Label
 from simulators.frame.detector import Detector
@@ -28,10 +28,8 @@ from simulators.frame.shot import CannotExposeError
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene
 
-POLL = 0.02
-"""s between looks at the trigger line while waiting: a stop may cancel pulses, a move may add some."""
-TOLERANCE = 1e-6
-"""s by which a trigger may come early; a float64 of seconds since 1970 resolves 2e-7 s."""
+POLL = 0.02  # s between looks at the trigger line while waiting: a stop may cancel pulses, a move may add some
+TOLERANCE = 1e-6  # s: a trigger may come so early; a float64 of seconds since 1970 resolves 2e-7 s
 
 
 class SimulatedOrcaQuest:
@@ -51,6 +49,7 @@ class SimulatedOrcaQuest:
         ignored: external or software triggers that the camera does not react to: no frame and no framestamp. They are
             numbered over the camera's life too, among the triggers that it was ready for (internal ones count).
         unplug_at: frame at which the camera is unplugged.
+        model: one of `drivers.orca_quest.LINE_TIMES`.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class SimulatedOrcaQuest:
         clock: Clock,
         seed: int,
         shutter: BeamGate,
-        sample: SimulatedSampleMover,
+        sample: SampleGate,
         *,
         pixel_pitch: float = orca_quest.PITCH_MM,
         ring_frames: int = 128,
@@ -68,13 +67,14 @@ class SimulatedOrcaQuest:
         ignored: Set[int] = frozenset(),
         unplug_at: int | None = None,
         name: str = "camera",
+        model: str = orca_quest.MODEL,
     ) -> None:
-        self.name = name
+        self.name, self._model = name, model
         self._scene, self._line, self._clock, self._seed = scene, line, clock, seed
         self._shutter, self._sample, self._pitch, self._ring_frames = shutter, sample, pixel_pitch, ring_frames
         self._lost, self._ignored, self._unplug_at = lost, ignored, unplug_at
         self._settings = CameraSettings(exposure=8.2944e-3, trigger=TriggerSource.INTERNAL)
-        self._timing = orca_quest.timing(self._settings)
+        self._timing = orca_quest.timing(self._settings, model=model)
         self._connected = clock.now()
         self._triggers = self._frames = self._views = 0  # over the camera's life
         self._ring: deque[Exposed] = deque()
@@ -110,13 +110,13 @@ class SimulatedOrcaQuest:
         """Apply and read back; the exposure is rounded to 10 ns. Raises DeviceRefused: nothing has changed."""
         with self._lock:
             self._answer()
-            problem = orca_quest.refusal(settings)
+            problem = orca_quest.refusal(settings, self._model)
             if self._armed_for:
                 problem = "is capturing and takes no settings; disarm it first"
             if problem:
                 raise DeviceRefused(self.name, problem, request=str(settings), state="Its settings are as they were")
             self._settings = replace(settings, exposure=round(settings.exposure, 8))
-            self._timing = orca_quest.timing(self._settings)
+            self._timing = orca_quest.timing(self._settings, model=self._model)
             return self._settings
 
     def arm(self, n_frames: int) -> None:
@@ -182,7 +182,7 @@ class SimulatedOrcaQuest:
     def describe(self) -> dict[str, str | int | float]:
         row0, col0, rows, cols = self._camera_view().roi
         return {
-            "model": "C15550-20UP (simulated)",
+            "model": f"{self._model} (simulated)",
             "exposure": self._settings.exposure,
             "trigger": str(self._settings.trigger),
             "readout": self._settings.readout,
@@ -204,7 +204,9 @@ class SimulatedOrcaQuest:
         self._gone = self._gone or "was closed"
 
     def _camera_view(self) -> CameraView:
-        return CameraView(self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected)
+        return CameraView(
+            self._scene, self._settings, self._pitch, self._seed, self._line.angle_at, self._connected, self._model
+        )
 
     def _answer(self, armed: bool = False) -> None:
         """Raises DeviceError if the camera is gone (once its last frame is taken), or must be armed and is not."""

@@ -47,6 +47,7 @@ class CameraView:
         seed: of all random numbers.
         angle_at: of the stage, radians at s since the Unix epoch.
         connected: s since the Unix epoch; the age of drifts counts from here.
+        model: of the camera.
     """
 
     scene: Scene
@@ -55,6 +56,7 @@ class CameraView:
     seed: int
     angle_at: AngleAt
     connected: float
+    model: str = orca_quest.MODEL
 
     @property
     def roi(self) -> tuple[int, int, int, int]:
@@ -69,7 +71,7 @@ class CameraView:
         axis_col += self.scene.axis_offset_px
         middle = (binning - 1) / 2  # middle of a binned pixel, in sensor pixels from the middle of its first
         return Detector(
-            shape=orca_quest.timing(self.settings).shape,
+            shape=orca_quest.timing(self.settings, model=self.model).shape,
             pitch=self.pitch * binning,
             axis_col=(axis_col - col0 - middle) / binning,
             axis_row=(axis_row - row0 - middle) / binning,
@@ -84,7 +86,8 @@ class CameraView:
             angle=frame.angle,
             angle_at=self.angle_at,
             elapsed=frame.time - self.connected,
-            row_period=orca_quest.timing(self.settings).row_period,
+            row_period=orca_quest.timing(self.settings, model=self.model).row_period,
+            model=self.model,
             roi=self.roi,
             binning=self.settings.binning,
             readout=self.settings.readout,

@@ -16,8 +16,7 @@ from drivers.base.clock import Clock
 from simulators.devices.motion import TrapezoidMove
 from simulators.devices.trigger_line import Pulse, TriggerLine
 
-MOVES_REMEMBERED = 4096
-"""A camera on a virtual clock may ask for past angles. They are known for this many moves."""
+MOVES_REMEMBERED = 4096  # A camera on a virtual clock may ask for past angles. They are known for this many moves.
 
 
 class Ended(IntFlag):

@@ -1,15 +1,37 @@
-"""Simulated shutter and sample mover: one state each, no travel time; the simulated camera asks both."""
+"""Simulated shutter and sample mover: one state each, no travel time, or on a cable; the simulated camera asks both."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Protocol
+
+from simulators.devices.trigger_line import TriggerLine
 
 
 class BeamGate(Protocol):
     """The part of a shutter that a simulated camera asks."""
 
     def is_open(self) -> bool: ...
+
+
+class SampleGate(Protocol):
+    """The part of a sample mover that a simulated camera asks."""
+
+    def is_in(self) -> bool: ...
+
+
+IN_PLACE = math.radians(0.1)  # How far a motor may be from its place while the sample is seen there
+
+
+class MovedSample:
+    """A sample that a motor moves: it is in the beam while the motor stands at `inside` (rad)."""
+
+    def __init__(self, axis: TriggerLine, inside: float) -> None:
+        self._axis, self._inside = axis, inside
+
+    def is_in(self) -> bool:
+        return abs(self._axis.angle_at(self._axis.clock.now()) - self._inside) < IN_PLACE
 
 
 class SimulatedShutter:

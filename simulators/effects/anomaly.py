@@ -11,10 +11,8 @@ from pydantic import AfterValidator
 
 from simulators.frame.shot import Shot
 
-VISIBLE = 1e-3
-"""Least change of the light that is labelled, as a share."""
-NARROWEST = 1e-9
-"""mm: an edge with a smaller penumbra is a step."""
+VISIBLE = 1e-3  # Least change of the light that is labelled, as a share
+NARROWEST = 1e-9  # mm: an edge with a smaller penumbra is a step
 
 
 def _in_order(views: tuple[int, int]) -> tuple[int, int]:

@@ -13,12 +13,9 @@ from simulators.frame.mapping import Positive
 from simulators.frame.pose import Pose
 from simulators.frame.shot import AngleAt, Shot
 
-STILL = 1e-9
-"""Radians below which the stage does not move."""
-LOOK = 1e-3
-"""s: first step back in time; also the precision of the end of the last move."""
-HISTORY = 3600.0
-"""s before the frame within which a move is searched."""
+STILL = 1e-9  # Radians below which the stage does not move
+LOOK = 1e-3  # s: first step back in time; also the precision of the end of the last move
+HISTORY = 3600.0  # s before the frame; an earlier move is not looked for
 
 
 @dataclass(frozen=True)

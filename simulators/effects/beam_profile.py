@@ -23,7 +23,7 @@ class BeamProfile(ImageEffect):
         sigma: (horizontal, vertical) in mm.
         stripes: amplitude of the stripes, as a share of the beam.
         stripe_period: mm, vertically.
-        drift: mm/s by which the stripes move down the rows within the beam.
+        drift: mm/s, speed of the stripes down the rows within the beam.
         centre: (horizontal, vertical) in mm from the rotation axis and z = 0.
         wander_speed: (horizontal, vertical) in mm/s.
         wander: amplitude (horizontal, vertical) in mm.

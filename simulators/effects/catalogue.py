@@ -108,16 +108,10 @@ _OURS: Mapping[str, EffectRow] = MappingProxyType(
         "hot_pixels": EffectRow(Domain.ELECTRONS, "a few pixels have a large dark current"),
         "zingers": EffectRow(Domain.ELECTRONS, "stray X-rays hit the sensor"),
         "saturation": EffectRow(
-            Domain.ELECTRONS,
-            "a pixel holds no more than its full well",
-            _CHARGE,
-            "charge of any origin fills a pixel",
+            Domain.ELECTRONS, "a pixel holds no more than its full well", _CHARGE, "charge of any origin fills a pixel"
         ),
         "dead_pixels": EffectRow(
-            Domain.ELECTRONS,
-            "a few pixels do not respond to light",
-            _CHARGE,
-            "dead pixels hold a constant charge",
+            Domain.ELECTRONS, "a few pixels do not respond to light", _CHARGE, "dead pixels hold a constant charge"
         ),
         "read_noise": EffectRow(Domain.ELECTRONS, "noise of the readout"),
         "offset": EffectRow(Domain.COUNTS, "the digital bias"),

@@ -42,14 +42,12 @@ class Effect(Protocol):
 class SamplingEffect(Effect, Protocol):
     def moments(self, moments: Moments, shot: Shot) -> Moments:
         """More moments at which each row is exposed: a frame is the weighted mean over them."""
-        ...
 
 
 @runtime_checkable
 class PoseEffect(Effect, Protocol):
     def pose(self, pose: Pose, times: NDArray[np.float64], shot: Shot) -> Pose:
         """The changed pose of the sample at `times` (float64 [row], s after the trigger)."""
-        ...
 
 
 @runtime_checkable
@@ -57,21 +55,18 @@ class AreaEffect(Effect, Protocol):
     @property
     def offsets(self) -> Sequence[tuple[float, float]]:
         """(row, col) of each ray of a pixel, in pixels from its middle: its light is the mean over them."""
-        ...
 
 
 @runtime_checkable
 class ImageEffect(Effect, Protocol):
     def apply(self, image: Image, shot: Shot) -> Image:
         """The changed image, float64 [row, col] in the effect's domain. The effect may work in place."""
-        ...
 
 
 @runtime_checkable
 class Anomaly(Effect, Protocol):
     def labels(self, shot: Shot) -> Sequence[Label]:
         """Where the anomaly changes this frame, regardless of other effects; empty without a change."""
-        ...
 
 
 AnyEffect: TypeAlias = SamplingEffect | PoseEffect | AreaEffect | ImageEffect

@@ -12,8 +12,7 @@ from simulators.frame.sensor import DARK_CURRENT
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import poisson
 
-FEW = 1.0
-"""Electrons a pixel: below this, placing single electrons is faster than drawing a number for every pixel."""
+FEW = 1.0  # Electrons a pixel: below this, placing single electrons is faster than drawing a number for every pixel
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from simulators.frame.mapping import Positive, Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
 
 Reals = NDArray[np.float64]
-REACH = 4.0
-"""A Gaussian is drawn up to so many sigmas; less than 4e-4 of its depth lies beyond."""
+REACH = 4.0  # A Gaussian is drawn up to so many sigmas; less than 4e-4 of its depth lies beyond
 
 
 @dataclass(frozen=True)

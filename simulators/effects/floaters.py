@@ -63,7 +63,7 @@ class Floaters(ImageEffect, Anomaly):
         depth: largest optical depth through the middle of a crumb; the smallest is half of it.
         heights: [least, most] mm, down the rows from z = 0.
         motion: "turning" with the stage, or "loose".
-        speed: mm a view by which a loose crumb drifts, in either direction.
+        speed: mm a view, the drift of a loose crumb in either direction.
         views: [first, one after the last] in which crumbs exist; a loose one passes the axis within it.
         seed: of sizes, places and depths.
     """
@@ -102,7 +102,6 @@ class Floaters(ImageEffect, Anomaly):
         return [Label(self.name, crumb.box(shot.detector.shape), crumb.which) for crumb in self.crumbs(shot)]
 
     def crumbs(self, shot: Shot) -> Iterator[Crumb]:
-        """The crumbs in the frame."""
         loose = self.motion == "loose"
         if not (loose or within(self.views, shot)):
             return

@@ -10,8 +10,7 @@ from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import Share
 from simulators.frame.shot import Image, Shot
 
-PHOTOELECTRIC = 3.0**-3
-"""Attenuation at three times the energy over that at the energy itself."""
+PHOTOELECTRIC = 3.0**-3  # Attenuation at three times the energy over that at the energy itself
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ from simulators.frame.mapping import Whole
 from simulators.frame.pose import Pose
 from simulators.frame.shot import Shot
 
-SEEN_PX = 0.01
-"""Smallest shift in pixels that is labelled; a shift along the beam is invisible."""
+SEEN_PX = 0.01  # Smallest shift in pixels that is labelled; a shift along the beam is invisible
 
 
 @dataclass(frozen=True)

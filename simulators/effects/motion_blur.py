@@ -14,8 +14,7 @@ from simulators.effects.chain import SamplingEffect
 from simulators.frame.mapping import Positive
 from simulators.frame.shot import Moments, Shot
 
-LOOKS = 5
-"""Times of the exposure at which the stage's angle is read, so that a reversal within it counts as motion."""
+LOOKS = 5  # Times of the exposure at which the stage's angle is read, so that a reversal within it counts as motion
 
 
 @dataclass(frozen=True)

@@ -164,7 +164,7 @@ def _transported(light: Image, share: float) -> Image:
 
 @njit(cache=True, nogil=True)
 def _keep(begin: int, end: int, light: Image, share: float, kept: Image) -> None:
-    """Factor by which the light given by the pixels of rows begin ... end is limited to what they have."""
+    """Limits what pixels of rows begin ... end give to the light that they have: writes a factor for each to `kept`."""
     rows, cols = light.shape
     for j in range(begin, end):
         above, below = light[max(j - 1, 0)], light[min(j + 1, rows - 1)]

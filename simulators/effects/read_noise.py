@@ -10,7 +10,7 @@ from pydantic import Field
 
 from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import NotNegative, Whole
-from simulators.frame.sensor import READ_NOISE
+from simulators.frame.sensor import READ_NOISES
 from simulators.frame.shot import Image, Shot, frame_rng
 from simulators.pixels.noise import add_normal
 from simulators.pixels.pattern import binned, normals
@@ -31,7 +31,7 @@ class ReadNoise(ImageEffect):
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
-        rms = READ_NOISE[shot.readout] if self.rms is None else self.rms
+        rms = READ_NOISES[shot.model][shot.readout] if self.rms is None else self.rms
         add_normal(image, rms * self._spreads(shot), frame_rng(self.name, shot))
         return image
 

@@ -10,10 +10,8 @@ from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import NotNegative, Positive, Share
 from simulators.frame.shot import CannotExposeError, Image, Shot, frame_rng
 
-DROPS = 200
-"""Number of parts into which a spread charge is split."""
-MOST = 100_000
-"""Largest number of zingers in a frame; the work grows with it."""
+DROPS = 200  # Number of parts into which a spread charge is split
+MOST = 100_000  # Largest number of zingers in a frame; the work grows with it
 
 
 @dataclass(frozen=True)

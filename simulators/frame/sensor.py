@@ -17,7 +17,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.orca_quest import BITS
+from drivers.orca_quest import BITS, MODEL
 
 CONVERSION = MappingProxyType({"standard": 0.107, "ultra_quiet": 0.107, "photon_number": 1.0})
 """Electrons a count in each readout."""
@@ -25,12 +25,14 @@ OFFSET = MappingProxyType({"standard": 200.0, "ultra_quiet": 200.0, "photon_numb
 """Counts of a pixel without charge in each readout."""
 READ_NOISE = MappingProxyType({"standard": 0.43, "ultra_quiet": 0.27, "photon_number": 0.27})
 """Electrons rms in each readout."""
-LARGEST_PHOTON_NUMBER = 200
-"""Values of an unbinned pixel."""
+LARGEST_PHOTON_NUMBER = 200  # Values of an unbinned pixel
+READ_NOISES = MappingProxyType(
+    {MODEL: READ_NOISE, "C15550-22UP": READ_NOISE | {"ultra_quiet": 0.3, "photon_number": 0.3}}
+)
+"""By model; that of C15550-22UP in photon number resolving is taken as in ultra quiet."""
 DARK_CURRENT = 0.0036
-"""Electrons a second and pixel."""
-FULL_WELL = 7000.0
-"""Electrons that a pixel holds."""
+"""Electrons a second and pixel, as measured on two C15550-20UP; the catalogue's most of C15550-22UP is 0.016 (air)."""
+FULL_WELL = 7000.0  # Electrons that a pixel holds
 
 
 def largest_count(readout: str, binning: int) -> int:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.orca_quest import MODEL
 from simulators.frame.detector import Detector
 
 Image = NDArray[np.float64]
@@ -41,6 +42,7 @@ class Shot:
         seed: of all random numbers.
         frame: number since the camera was connected, of any kind.
         view: projections exposed before this frame.
+        model: of the camera.
     """
 
     detector: Detector
@@ -60,6 +62,7 @@ class Shot:
     seed: int
     frame: int
     view: int
+    model: str = MODEL
 
     def later(self, seconds: float) -> Shot:
         """The same shot with time and angle `seconds` after the trigger."""

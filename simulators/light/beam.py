@@ -11,8 +11,7 @@ from pydantic import Field
 
 from simulators.frame.mapping import NotNegative, Positive
 
-NEAREST, FARTHEST = 1e-6, 1e9
-"""mm, of a cone's source: squares of far larger distances overflow."""
+NEAREST, FARTHEST = 1e-6, 1e9  # mm, of a cone's source: squares of far larger distances overflow
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Reals = NDArray[np.float64]
-MassAttenuation = Callable[[Reals], Reals]
-"""Mass attenuation in cm²/g at energies in keV, as tabulated."""
+MassAttenuation = Callable[[Reals], Reals]  # Mass attenuation in cm²/g at energies in keV, as tabulated
 
 NEAR, FAR = 60.0, 150.0
-MOST_SHIFT = 20.0
-"""eV by which an edge may move, so that it stays in the range where the form replaces the table."""
-CLEAR = 1.0
-"""eV from the edge at which a table is read: closer, an interpolating spline may still be rising."""
+MOST_SHIFT = 20.0  # eV: an edge may move so far, so that it stays in the range where the form replaces the table
+CLEAR = 1.0  # eV from the edge at which a table is read: closer, an interpolating spline may still be rising
 
 
 @dataclass(frozen=True)
@@ -51,11 +48,7 @@ class KEdge:
 
 
 K_EDGES: Mapping[int, KEdge] = MappingProxyType(
-    {
-        25: KEdge(6.5610, shift=0.0),
-        27: KEdge(7.7290, shift=1.0),
-        28: KEdge(8.3485, shift=2.0),
-    }
+    {25: KEdge(6.5610, shift=0.0), 27: KEdge(7.7290, shift=1.0), 28: KEdge(8.3485, shift=2.0)}
 )
 """By atomic number. The Ni line of the charged state is the peak in the battery thesis that this instrument
 follows (figure 2.1: 8348.5 eV). It is given for LiCoO2 there, but lies next to the K edge of nickel, 640 eV above that

@@ -15,12 +15,10 @@ from scipy.optimize import nnls
 from simulators.light.beam import Beam, Tube
 
 Reals = NDArray[np.float64]
-Attenuation = Callable[[ArrayLike], Reals]
-"""Linear attenuation in 1/mm at energies in keV."""
+Attenuation = Callable[[ArrayLike], Reals]  # Linear attenuation in 1/mm at energies in keV
 
 NODES = (3, 5, 9, 17, 33, 65, 129, 257, 513)
-ENOUGH = 1e-5
-"""Tolerance, as a share of the open beam: far below the noise of a pixel with 7000 electrons."""
+ENOUGH = 1e-5  # Tolerance, as a share of the open beam: far below the noise of a pixel with 7000 electrons
 _FWHM = math.sqrt(8 * math.log(2))
 _LEAST_KEV = 1.0
 _NOTHING = 1e-7  # share of the light: smaller weights, of energies that a filter stops, are dropped
@@ -148,8 +146,7 @@ def _tube(tube: Tube, n: int, filters: Callable[[str], Attenuation]) -> Spectrum
     return Spectrum.of(energies, np.where(weights > _NOTHING * weights.sum(), weights, 0.0))
 
 
-STEPS = 40
-"""Number of thicknesses, from the full one down to a 8000th of it."""
+STEPS = 40  # Number of thicknesses, from the full one down to a 8000th of it
 SHARES = (0.125, 0.5, 0.875)
 """Shares of the first of each pair of materials. Halves alone do not suffice: for one sample in 1000, with an edge
 in each of two materials, the error is ten times the tolerance."""

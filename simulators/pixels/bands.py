@@ -8,8 +8,7 @@ from itertools import pairwise
 
 from numba import config
 
-SMALL = 1 << 16
-"""Pixels below which threads cost more than they gain."""
+SMALL = 1 << 16  # Pixels below which threads cost more than they gain
 
 
 def share_rows(work: Callable[[int, int], None], shape: tuple[int, int]) -> None:

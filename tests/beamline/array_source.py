@@ -28,6 +28,7 @@ class ArraySource:
     flags = None
     currents: NDArray[np.float64] | None = None
     replaces = None
+    shifts: NDArray[np.float64] | None = None
     part_starts: NDArray[np.int64] = np.zeros(1, np.int64)
     checksummed = False
     altered: frozenset[int] = frozenset()

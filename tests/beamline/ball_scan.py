@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from beamline.config import load as config
@@ -29,8 +31,14 @@ def shipped(name: str, *overrides: str) -> Config:
 
 def small(*overrides: str) -> Config:
     loaded = shipped("simulated", "devices.camera.roi=[1136, 2028, 32, 40]", "simulation.clock=virtual", *overrides)
-    simulation = loaded.simulation.model_copy(update={"scene": BALL})  # type: ignore[union-attr]
-    return loaded.model_copy(update={"simulation": simulation})
+    return with_scene(loaded, BALL)
+
+
+def with_scene(settings: Config, scene: dict[str, Any]) -> Config:
+    """Settings of a simulated instrument, of another scene."""
+    assert settings.simulation is not None
+    simulation = settings.simulation.model_copy(update={"scene": scene})
+    return settings.model_copy(update={"simulation": simulation})
 
 
 def fly(instrument: devices.ConnectedDevices, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:

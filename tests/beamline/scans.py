@@ -112,10 +112,14 @@ def write_flagged(
     levels: Mapping[int, Level],
     pixel_size_mm: float = 1.0,
     flags: Sequence[Flag] = (),
+    energy_kev: float | None = None,
 ) -> Path:
     """The frames as our scan file, in which the first check of the monitor flagged rows at these levels, or `flags`."""
     with NXtomoWriter(
-        path, ScanInfo("flagged", pixel_size_mm=pixel_size_mm), frames[0].counts.shape, clock=SystemClock()
+        path,
+        ScanInfo("flagged", pixel_size_mm=pixel_size_mm, energy_kev=energy_kev),
+        frames[0].counts.shape,
+        clock=SystemClock(),
     ) as writer:
         for frame in frames:
             said = (

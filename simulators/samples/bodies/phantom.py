@@ -63,11 +63,7 @@ class Phantom:
         across = np.linalg.inv(p.matrix[round_])[:, :2]  # columns: the semi-axes, projected along z
         half = np.linalg.norm(across, ord=2, axis=(1, 2))
         corners = np.repeat(p.centre, np.diff(p.first_vertex), axis=0)[:, :2] + p.vertices[:, :2]
-        reaches = (
-            (out + p.size[:, 0])[p.kind == CYLINDER],
-            out[round_] + half,
-            np.hypot(corners[:, 0], corners[:, 1]),
-        )
+        reaches = ((out + p.size[:, 0])[p.kind == CYLINDER], out[round_] + half, np.hypot(corners[:, 0], corners[:, 1]))
         return max(float(reach.max(initial=0.0)) for reach in reaches)
 
     @property

@@ -20,12 +20,9 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
-LEAST, MOST = 1e-9, 1e9
-"""mm: with far larger lengths, squares and quotients in the kernels overflow."""
-DENSEST = 1e12
-"""1/mm: with far larger ones, sums over chords overflow."""
-FLAT = 1e-9
-"""Share of a body's size: corners closer than this to a plane count as in it."""
+LEAST, MOST = 1e-9, 1e9  # mm: with far larger lengths, squares and quotients in the kernels overflow
+DENSEST = 1e12  # 1/mm: with far larger ones, sums over chords overflow
+FLAT = 1e-9  # Share of a body's size: corners closer than this to a plane count as in it
 
 
 @dataclass(frozen=True)

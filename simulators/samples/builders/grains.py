@@ -19,14 +19,11 @@ from simulators.samples.bodies.solids import Ellipsoid, Polyhedron, Quaternion, 
 Grain = Ellipsoid | Polyhedron
 
 Habit = Literal["sphere", "ellipsoid", "octahedron", "truncated_octahedron", "plate"]
-TAIL = 2.5
-"""Standard deviations beyond which no size is drawn."""
+TAIL = 2.5  # Standard deviations beyond which no size is drawn
 HOLLOW, CRACK = 0.5, (0.95, 0.06)
 """Size of a pore over the grain's; radius and half width of a crack over the inscribed sphere's radius."""
-MOST = 100_000
-"""Largest number of grains in a cell: this many take minutes to arrange."""
-ROUNDEST, FLATTEST = 0.6, 0.85
-"""Least and largest cut of truncated octahedra; see `truncated_octahedron`."""
+MOST = 100_000  # Largest number of grains in a cell: this many take minutes to arrange
+ROUNDEST, FLATTEST = 0.6, 0.85  # Least and largest cut of truncated octahedra; see `truncated_octahedron`
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from simulators.samples.bodies.solids import LEAST, MOST, Solid
 
 Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
 Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]
-Gap = Annotated[float, Field(ge=0, le=1e3 * MOST)]
-"""um."""
+Gap = Annotated[float, Field(ge=0, le=1e3 * MOST)]  # um
 
 
 @dataclass(frozen=True)
@@ -49,11 +48,9 @@ class PieceBuilder(Protocol):
     @property
     def default_attenuation(self) -> Mapping[str, float]:
         """1/mm of each role, in a beam without energies."""
-        ...
 
     def pieces(self) -> tuple[Piece, ...]:
         """All pieces. Raises ValueError where they cannot be placed."""
-        ...
 
 
 def check_roles(settings: PieceBuilder) -> None:

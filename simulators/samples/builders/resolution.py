@@ -22,8 +22,7 @@ MADE_OF: Mapping[str, str] = MappingProxyType({"carrier": "polypropylene", "bar"
 GREY: Mapping[str, float] = MappingProxyType({"carrier": 0.5, "bar": 2.0, "star": 2.0, "ball": 2.0})
 """Attenuation times the carrier's radius, in a beam without energies."""
 MOST_LISTED = 100
-MARGIN = 1.1
-"""The carrier's size over that of its contents."""
+MARGIN = 1.1  # The carrier's size over that of its contents
 
 
 @dataclass(frozen=True)

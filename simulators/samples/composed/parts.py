@@ -153,8 +153,7 @@ def sample_of(parts: Sequence[Part], beam: Beam, filters: Callable[[str], Attenu
     return whole if spectrum.energies.size == 1 else Mixture(groups, spectrum, whole)
 
 
-ROUNDING = 1e-14
-"""A smaller depth counts as no matter."""
+ROUNDING = 1e-14  # A smaller depth counts as no matter
 
 
 def effective_depth(thickness: Reals, attenuation: Reals, weights: Reals) -> Reals:

@@ -133,12 +133,7 @@ def _of_materials(
     used = {role for piece in pieces for role in (piece.role, piece.instead_of) if role is not None}
     found = {role: palette(material_of[role]) for role in sorted(used)}
     parts = [
-        Part(
-            piece.solid,
-            found[piece.role],
-            found[piece.instead_of] if piece.instead_of else None,
-            piece.role,
-        )
+        Part(piece.solid, found[piece.role], found[piece.instead_of] if piece.instead_of else None, piece.role)
         for piece in pieces
     ]
     return sample_of(parts, beam, palette.filters)

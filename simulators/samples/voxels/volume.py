@@ -25,8 +25,7 @@ from simulators.frame.pose import Pose
 from simulators.samples.voxels.voxels import Voxels
 
 MOST_COLUMNS = 100_000
-VIEWS = 8
-"""Views over half a turn in which the largest line integral is searched."""
+VIEWS = 8  # Views over half a turn in which the largest line integral is searched
 
 
 @dataclass(frozen=True, eq=False)

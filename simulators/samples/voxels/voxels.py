@@ -21,8 +21,7 @@ from simulators.samples.bodies.solids import LEAST, MOST
 from simulators.samples.voxels.projector import padded, project
 
 MOST_LABELS = 255
-ON = 1e-9
-"""Voxels: a point closer than this to a centre counts as on it."""
+ON = 1e-9  # Voxels: a point closer than this to a centre counts as on it
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from beamline.config.load import config_folder
+from tests.beamline.api.test_tutorials import TUTORIALS
 
 EXAMPLES = Path(__file__).parents[3] / "docs" / "examples"
 
@@ -42,11 +43,8 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 
 def test_there_is_a_test_of_each_example() -> None:
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {
-        "day_of_samples.py",
-        "energy_series.py",
-        "inspect_and_rescan.py",
-    }
+    here = {"day_of_samples.py", "energy_series.py", "inspect_and_rescan.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == here | {f"{name}.py" for name in TUTORIALS}
 
 
 @pytest.mark.slow

@@ -32,15 +32,20 @@ effects: [BEND, photon_noise, offset]
 BEND = "{kind: beam_bend, curvature: [0.06, 0.03], level: -0.06, drift: -2.0e-4}"
 
 
-@pytest.fixture(scope="module")
-def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder, found = tmp_path_factory.mktemp("air"), {}
+def bent_and_straight(scene: str, folder: Path) -> dict[str, Path]:
+    """Scans of a scene with and without the effect in place of BEND."""
+    found = {}
     for name, effect in (("bent", f"{BEND}, "), ("straight", "")):
-        (folder / f"{name}.yaml").write_text(SCENE.replace("BEND, ", effect), encoding="utf-8")
+        (folder / f"{name}.yaml").write_text(scene.replace("BEND, ", effect), encoding="utf-8")
         found[name] = folder / f"{name}.h5"
         done = CliRunner().invoke(main, ["simulate", str(folder / f"{name}.yaml"), "--out", str(found[name])])
         assert done.exit_code == 0, done.output
     return found
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return bent_and_straight(SCENE, tmp_path_factory.mktemp("air"))
 
 
 def _prepared(path: Path, model: str = "auto", spill: Spill | None = None) -> PreparedProjections:

@@ -16,9 +16,11 @@ from beamline.projections.selection import Selection
 from beamline.projections.steps.calibrate import Calibrate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
+from tests.beamline.cli.test_air import bent_and_straight
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHAPE, VIEWS = (24, 56), 60  # pixels binned by 2
+
 SCENE = """
 # A thorax: soft tissue with two lungs, beside spine and ribs. It nearly fills the light of a narrow field.
 phantom:
@@ -35,18 +37,11 @@ detector: {shape: [48, 112], pixel_size_um: 6.0, exposure_s: 0.02}
 scan: {views: 60, darks: 2, flats: 8}
 effects: [BEND, {kind: narrow_field, width: 0.576}, photon_noise, offset]
 """
-BEND = "{kind: beam_bend, curvature: [0.06, 0.03], level: -0.06, drift: -2.0e-4}"
 
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder, found = tmp_path_factory.mktemp("terms"), {}
-    for name, effect in (("bent", f"{BEND}, "), ("straight", "")):
-        (folder / f"{name}.yaml").write_text(SCENE.replace("BEND, ", effect), encoding="utf-8")
-        found[name] = folder / f"{name}.h5"
-        done = CliRunner().invoke(main, ["simulate", str(folder / f"{name}.yaml"), "--out", str(found[name])])
-        assert done.exit_code == 0, done.output
-    return found
+    return bent_and_straight(SCENE, tmp_path_factory.mktemp("terms"))
 
 
 def _prepared(path: Path, *terms: str, spill: Spill | None = None) -> PreparedProjections:
@@ -127,4 +122,4 @@ def test_views_held_out_lose_the_surface_of_their_time(scans: dict[str, Path]) -
 
 def test_gains_of_few_columns_are_refused(scans: dict[str, Path]) -> None:
     done = CliRunner().invoke(main, ["recon", str(scans["bent"]), "--bin", "2", "--calibrate", "gains"])
-    assert done.exit_code == 5 and "56 columns are too few" in done.output
+    assert done.exit_code == 5 and "56 columns are too few" in done.output and "No view was read" in done.output

@@ -17,7 +17,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
-from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange
+from tests.beamline.scans import TwoCylinders, frames_of, seal, write_exchange, write_flagged
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0)), shape=(4, 40), pixel_size_mm=0.5)
 
@@ -276,3 +276,13 @@ def test_a_file_that_hdf5_cannot_follow_is_called_damaged(folder: Path, command:
     result = _beamline(command, "scan.h5")
     assert result.exit_code == 5, result.output
     assert len(parts) > 1 and "damaged" in result.output
+
+
+def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:
+    scan = write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
+    result = CliRunner().invoke(main, ["info", str(scan), "--statistics", "-o", str(tmp_path / "h.png")])
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.stdout.splitlines()] == ["kind", "dark", "flat", "projection", "output"]
+    assert (tmp_path / "h.png").read_bytes().startswith(b"\x89PNG")
+    for wrong in (["-o", "x.png"], ["--statistics", "--truth", "t.npy"]):
+        assert CliRunner().invoke(main, ["info", str(scan), *wrong]).exit_code == 2

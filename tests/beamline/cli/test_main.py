@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,6 +19,7 @@ from click.shell_completion import get_completion_class
 from click.testing import CliRunner
 
 from beamline.cli import main as module
+from beamline.cli import man
 from beamline.core import errors
 from beamline.core.errors import leave_traceback, user_message
 from drivers.base.errors import DeviceError, DeviceTimeout
@@ -177,7 +179,10 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
     kind = get_completion_class(shell)
     assert kind is not None
     completion = kind(module.main, {}, "beamline", "_BEAMLINE_COMPLETE")
-    assert "_BEAMLINE_COMPLETE" in completion.source()
+    printed = CliRunner().invoke(module.main, ["completion", shell])
+    assert printed.exit_code == 0
+    assert printed.stdout == completion.source() + "\n"
+    assert "_BEAMLINE_COMPLETE" in printed.stdout
 
     def completed(*words: str) -> list[str]:
         return [item.value for item in completion.get_completions(list(words[:-1]), words[-1])]
@@ -186,3 +191,31 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
     monkeypatch.setattr(module, "import_module", None)
     assert completed("re") == ["resume", "recon", "recover", "render"]
     assert completed("--v") == ["--version"]
+
+
+@pytest.mark.parametrize("words", [[], ["scan"], ["recon"], ["config"]])
+def test_a_manual_page_has_what_the_help_has(words: list[str]) -> None:
+    printed = CliRunner().invoke(module.main, ["man", *words])
+    assert (printed.exit_code, printed.stderr) == (0, "")
+    page = printed.stdout.replace("\\-", "-")
+    command = module.main.get_command(click.Context(module.main), words[0]) if words else module.main
+    assert command is not None
+    context = click.Context(command)
+    for option in (param for param in command.get_params(context) if isinstance(param, click.Option)):
+        record = option.get_help_record(context)
+        assert record is None or f".B {record[0]}\n" in page
+    assert "\n130  interrupted" in page and ".B NO_COLOR" in page
+    sections = [line.removeprefix(".SH ") for line in page.splitlines() if line.startswith(".SH")]
+    assert sections[:4] == ["NAME", "SYNOPSIS", "DESCRIPTION", "OPTIONS"]
+    assert ("COMMANDS" in sections) is isinstance(command, click.Group)
+    if (groff := shutil.which("groff")) is not None:
+        said = subprocess.run([groff, "-ww", "-man", "-Tutf8"], input=printed.stdout, capture_output=True, text=True)
+        assert (said.returncode, said.stderr) == (0, "")
+
+
+def test_text_of_a_manual_page_is_never_a_request() -> None:
+    assert [man._text(text) for text in (".sp 99", "'a", "C:\\x", "--y")] == ["\\&.sp 99", "\\&'a", "C:\\ex", "\\-\\-y"]
+
+
+def test_a_manual_page_of_no_command_is_refused() -> None:
+    assert CliRunner().invoke(module.main, ["man", "nothing"]).exit_code == 2

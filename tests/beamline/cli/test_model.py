@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from beamline.reconstruct.model import read_model
-from beamline.storage.writers.recon_file import read_reconstruction
+from beamline.reconstruct.model import read_model, write_views
+from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from tests.beamline.cli.small_scan import beamline
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,6 +56,28 @@ def test_views_of_the_model_are_a_scan_that_gives_the_volume_again(folder: Path)
     _made("voxelise", "v.h5", "-o", "u.h5")
     found, known = (read_reconstruction(folder / name).volume.data for name in ("w.h5", "u.h5"))
     assert np.corrcoef(found.ravel(), known.ravel())[0, 1] > 0.98
+
+
+def test_a_volume_with_error_bars_and_fbp_beside_it_is_voxelised_without_them(folder: Path) -> None:
+    _made("recon", "scan.h5", *FIT, "--uncertainty", "-o", "v.h5")
+    made = read_reconstruction(folder / "v.h5")
+    assert made.deviation is not None
+    write_reconstruction(folder / "w.h5", replace(made, fbp=made.volume.data))
+    _made("voxelise", "w.h5", "-o", "again.h5")
+    again = read_reconstruction(folder / "again.h5")
+    assert again.deviation is None and again.fbp is None and again.volume.grid == made.volume.grid
+
+
+def test_views_of_a_model_of_displaced_views_are_in_their_place(folder: Path) -> None:
+    _made("recon", "scan.h5", *FIT, "-o", "v.h5")
+    straight = read_model(folder / "v.h5")
+    moved = replace(
+        straight, geometry=replace(straight.geometry, shifts=straight.geometry.shifts + np.array([3.0, 1.0]))
+    )
+    for name, model in (("a.h5", straight), ("b.h5", moved)):
+        write_views(folder / name, model, np.array([0.3]), lambda n, of: None)
+    with h5py.File(folder / "a.h5") as a, h5py.File(folder / "b.h5") as b:
+        np.testing.assert_array_equal(a["exchange/data"], b["exchange/data"])
 
 
 def test_a_ply_holds_every_gaussian(folder: Path) -> None:

@@ -148,7 +148,11 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
     assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
-OTHER_TAKERS = {"--device": "auto, r2, r2-published", "--budget": "auto, r2, fista-tv, os-sirt-tv"}
+MODELS = "r2, r2-published, naf, intratomo, sax-nerf"
+OTHER_TAKERS = {
+    "--device": f"auto, {MODELS}", "--budget": "auto, r2, fista-tv, os-sirt-tv",
+    **dict.fromkeys(("--steps", "--seconds", "--early-stop"), MODELS),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

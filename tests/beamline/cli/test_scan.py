@@ -70,6 +70,56 @@ def test_0_a_scan_prints_its_file_on_stdout_and_its_story_on_stderr(
     assert instrument.log[-1] == "close"  # devices that the command opened are closed
 
 
+def test_0_with_documents_each_is_valid_and_they_lead_to_the_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = pytest.importorskip("event_model")
+    on(monkeypatch, FakeInstrument())
+    told = tmp_path / "told.jsonl"
+    for _ in range(2):
+        assert scan("-o", str(tmp_path / "runs"), "--documents", str(told)).exit_code == 0
+    found = [json.loads(line) for line in told.read_text("utf-8").splitlines()]
+    for each in found:
+        model.schema_validators[model.DocumentNames[each["name"]]].validate(each["doc"])
+    names = [each["name"] for each in found]
+    assert names.count("start") == names.count("descriptor") == names.count("stop") == 2
+    assert names.count("stream_resource") == 6 and names[-1] == "stop"
+    docs = [each["doc"] for each in found[names.index("stop") + 1 :]]
+    start, descriptor, stop = docs[0], docs[1], docs[-1]
+    assert start["sample"]["name"] == "battery" and start["num_points"] == 17
+    assert stop["exit_status"] == "success" and stop["num_events"] == {"primary": 17}
+    assert descriptor["data_keys"]["camera"]["shape"] == [144, 160]  # of the configuration
+    for key in ("camera", "camera-angle", "camera-kind"):
+        (resource,) = [doc for doc in docs if doc.get("data_key") == key]
+        assert resource["run_start"] == start["uid"]
+        rows = [doc["indices"] for doc in docs if doc.get("stream_resource") == resource["uid"]]
+        assert [row["start"] for row in rows] == [0, *(row["stop"] for row in rows[:-1])] and rows[-1]["stop"] == 17
+        assert Path(resource["uri"].removeprefix("file://localhost")).is_file()
+
+
+def test_4_with_documents_a_scan_that_is_stopped_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("event_model")
+    on(monkeypatch, FakeInstrument(on_frame=press(signal.SIGINT, 9)))
+    told = tmp_path / "told.jsonl"
+    assert scan("-o", str(tmp_path / "runs"), "--documents", str(told)).exit_code == 4
+    stop = json.loads(told.read_text("utf-8").splitlines()[-1])
+    assert stop["name"] == "stop" and stop["doc"]["exit_status"] == "abort"
+    assert "Stopped after" in stop["doc"]["reason"]
+
+
+def test_2_documents_go_to_a_file(tmp_path: Path) -> None:
+    result = scan("-o", str(tmp_path / "runs"), "--documents", "tcp://localhost:5577")
+    assert (result.exit_code, "--documents takes a file" in result.stderr) == (2, True)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_2_documents_without_the_library_name_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "event_model", None)
+    result = scan("-o", str(tmp_path / "runs"), "--documents", str(tmp_path / "told.jsonl"))
+    assert result.exit_code == 2 and "splatline[bluesky]" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_0_with_json_stdout_is_the_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     on(monkeypatch, FakeInstrument())
     result = scan("-o", str(tmp_path), "--json")

@@ -18,13 +18,13 @@ from beamline.cli import simulate as module
 from beamline.cli.main import main
 from beamline.core.shipped import shipped_scenes
 from beamline.simulate import figure, write
-from beamline.simulate.labels import read_labels
 from beamline.simulate.scene_file import open_scene, scan_of
 from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from simulators.frame.shot import CannotExposeError
+from tests.beamline.simulate.read_labels import read_labels
 
 SCENE = """
 phantom:

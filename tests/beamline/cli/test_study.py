@@ -78,7 +78,8 @@ def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: 
     assert first[0].settings == {"filter": "shepp-logan"} and first[1].geometry.n_views == 96
     assert [data.geometry.n_views for _, data in others] == [90, 45]
     left = {path.name for path in (folder / "many_fixed-views").iterdir()}
-    assert left == {"study.csv", "study.json", "report.html", "figures.png", "slices_fbp.png"}
+    assert left == {"study.csv", "study.json", "report.html", "figures.png", "cost.png", "slices_fbp.png"}
+    assert [row["frames"] for row in rows[2:]] == ["90", "45"]
     page = parsed_page((folder / "many_fixed-views" / "report.html").read_text(encoding="utf-8"))
     assert f"{peak:.2f}" in page.text and any("asks for 360 views" in text for text in page.text)
 

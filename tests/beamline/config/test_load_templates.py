@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -50,14 +51,16 @@ def test_templates_are_complete_and_differ_only_in_devices() -> None:
 def test_every_alternative_in_a_template_is_one(name: str) -> None:
     """The commented devices, put in the place of the ones that stand there."""
     text = (config.config_folder() / f"{name}.yaml").read_text("utf-8")
-    offered = re.findall(r"^  # (stage|shutter|beam_monitor): (\{.*?\})(?=\s|$)", text, re.MULTILINE)
+    joined = re.sub(r",\n  #  +", ", ", text)
+    kind = r"^  # (stage|shutter|sample_mover|beam_monitor): (\{.*?\})(?=\s|$)"
+    offered = re.findall(kind, joined, re.MULTILINE)
     kinds = set()
     for key, flow in offered:
         tree = yaml.safe_load(text)
         mine = yaml.safe_load(flow)
-        of_the_pm16c = ("channel", "first_pulse", "home_deg", "home_speed_deg_s")
-        old = {"stage": of_the_pm16c}.get(key, tuple(tree["devices"][key]))
-        tree["devices"][key] = {k: v for k, v in tree["devices"][key].items() if k not in old} | mine
+        of_the_pm16c = {"channel", "first_pulse", "home_deg", "home_speed_deg_s"}
+        kept = STAGE_SECTIONS[mine["kind"]].model_fields.keys() - of_the_pm16c if key == "stage" else ()
+        tree["devices"][key] = {k: v for k, v in tree["devices"][key].items() if k in kept} | mine
         if mine["kind"] == "stage_output":  # which the PM16C has not
             stage = yaml.safe_load(next(flow for _, flow in offered if "zaber" in flow))
             tree["devices"]["stage"] = {
@@ -66,9 +69,19 @@ def test_every_alternative_in_a_template_is_one(name: str) -> None:
         loaded = Config.model_validate(tree)
         assert getattr(loaded.devices, key).kind == mine["kind"]
         kinds.add(mine["kind"])
-    assert kinds == {"pi_gcs", "zaber", "stage_output", "electrometer"} | (
+    assert kinds == {"pi_gcs", "zaber", "epics", "stage_output", "electrometer", "stage"} | (
         {"ring_current"} if name == "instrument" else set()
     )
+
+
+def test_the_devices_of_the_page_on_epics_are_ones() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "epics.md").read_text("utf-8")
+    (block,) = re.findall(r"(?s)```yaml\n(.*?)```", page)
+    tree = yaml.safe_load((config.config_folder() / "instrument.yaml").read_text("utf-8"))
+    tree["devices"] |= yaml.safe_load(block)["devices"]
+    loaded = Config.model_validate(tree).devices
+    assert {loaded.stage.kind, loaded.shutter.kind, loaded.beam_monitor.kind} == {"epics"}
+    assert loaded.sample_mover.kind == "stage"
 
 
 def _keys(value: Any, path: tuple[str, ...] = ()) -> set[tuple[str, ...]]:

@@ -19,13 +19,13 @@ from beamline.projections.steps.air import Air
 from beamline.scan import run as module
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
-from beamline.simulate.labels import read_labels
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid
 from recon.voxels.fdk import fdk
-from tests.beamline.ball_scan import BALL, shipped
+from tests.beamline.ball_scan import BALL, shipped, with_scene
+from tests.beamline.simulate.read_labels import read_labels
 
 ROI = [1136, 2028, 32, 40]
 GHOST = {"kind": "ghost", "view": 4, "width": 0.05, "speed": 0.02}
@@ -41,8 +41,7 @@ def _config(scene: dict[str, object], *overrides: str) -> Config:
         "scan.flats.count=1",
     )
     loaded = shipped("simulated", f"devices.camera.roi={ROI}", "simulation.clock=virtual", *few, *overrides)
-    simulation = loaded.simulation.model_copy(update={"scene": scene})  # type: ignore[union-attr]
-    return loaded.model_copy(update={"simulation": simulation})
+    return with_scene(loaded, scene)
 
 
 def _labels(folder: Path) -> dict[str, tuple[int, int]]:

@@ -175,7 +175,7 @@ def test_the_shortest_fit_is_said_to_be_late_too(
 ) -> None:
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
     warned: list[str] = []
-    _spend(_cone(prepared, 3.6), 0.001, Ticking(0.01), warned)
+    _spend(_cone(prepared, 3.0), 0.001, Ticking(0.01), warned)
     assert len(warned) == 1 and "the cheapest choice, r2, binned" in warned[0]
 
 
@@ -313,9 +313,9 @@ def test_views_that_lean_have_a_direct_method(prepared: PreparedProjections, mon
 def test_views_without_a_direct_method_get_the_shortest_fit(
     prepared: PreparedProjections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cone's short scan is for neither FBP nor FDK."""
+    """Less than a short scan of a cone is for neither FBP nor FDK."""
     _as_fast_as(monkeypatch, 20.0, 50.0, 3.0, 10.0, 9.0)
-    done = _spend(_cone(prepared, 3.6), 5.0, Ticking(0.01))
+    done = _spend(_cone(prepared, 2.8), 5.0, Ticking(0.01))
     assert done.choice.is_gaussian_fit and done.result.method == "r2" and done.choice.binning == 4
     assert done.result.history[-1].step > 0 and 0 < done.result.settings["gaussians_at_start"] < 100
     assert done.result.volume.data.max() > 0

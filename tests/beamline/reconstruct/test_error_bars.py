@@ -117,13 +117,14 @@ def test_memory_of_the_dry_run_counts_it(folder: Path) -> None:
     ("options", "why"),
     [
         (("-m", "sirt"), "--uncertainty is calibrated for r2, fbp, fista-tv"),
+        (("-m", "sirt", "--dry-run"), "--uncertainty is calibrated for r2, fbp, fista-tv"),
         (("-m", "fbp", "-o", "out.tif"), "give -o out.h5"),
         (("-m", "r2", "--finish", "0"), "r2 has no finish there with --finish 0"),
         (("-m", "fbp", "--views", "fixed:6"), "needs 8 at least; here are 6"),
         (("-m", "r2", "--seconds", "5"), "--uncertainty does not go with"),
         (("-m", "r2", "--follow"), "--uncertainty does not go with"),
     ],
-    ids=["sirt", "tif", "finish", "views", "seconds", "follow"],
+    ids=["sirt", "dry", "tif", "finish", "views", "seconds", "follow"],
 )
 def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options: tuple[str, ...], why: str) -> None:
     result = beamline("recon", "scan.h5", "--uncertainty", *options)

@@ -7,11 +7,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import tifffile
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct import measure as module
-from beamline.reconstruct.measure import fit_truth, measure, read_truth, regions
+from beamline.reconstruct.measure import fit_truth, measure, measured_file, read_truth, regions
+from recon.assess.metrics import ssim_of_whole_slices
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.prep.correct import Projections
@@ -141,3 +143,33 @@ def test_a_constant_truth_is_refused() -> None:
     for value in (1.0, np.nan):
         with pytest.raises(ConfigError, match="nothing to compare"):
             fit_truth(np.full((4, 8, 8), value, np.float32), Grid((4, 8, 8)), 1)
+
+
+def test_a_volume_file_is_measured_by_masks_that_somebody_drew(tmp_path: Path, rng: np.random.Generator) -> None:
+    volume = rng.normal(0, 0.1, (4, 6, 8)).astype(np.float32)
+    labels = np.zeros(volume.shape, np.uint8)
+    labels[:, :2], labels[:, 4:] = 1, 2
+    volume[labels == 1] += 1
+    np.save(tmp_path / "v.npy", volume)
+    tifffile.imwrite(tmp_path / "m.tif", labels, photometric="minisblack")
+    found = measured_file(tmp_path / "v.npy", None, tmp_path / "m.tif")
+    dense, empty = volume[labels == 1].astype(float), volume[labels == 2].astype(float)
+    assert found == {
+        "snr": pytest.approx(20 * np.log10(dense.mean() / empty.std()), abs=1e-4),
+        "cnr": pytest.approx(20 * np.log10((dense.mean() - empty.mean()) / empty.std()), abs=1e-4),
+    }
+    for wrong, said in {"3": labels + 2, "shape": labels[:3]}.items():
+        tifffile.imwrite(tmp_path / f"{wrong}.tif", said, photometric="minisblack")
+        with pytest.raises(DataError, match="cannot be measured so"):
+            measured_file(tmp_path / "v.npy", None, tmp_path / f"{wrong}.tif")
+
+
+def test_a_volume_file_is_measured_against_a_truth(tmp_path: Path, rng: np.random.Generator) -> None:
+    truth = rng.random((14, 16, 18), np.float32)
+    np.save(tmp_path / "t.npy", truth)
+    np.save(tmp_path / "v.npy", truth / 2)
+    found = measured_file(tmp_path / "v.npy", str(tmp_path / "t.npy"), None)
+    assert set(found) == {"psnr", "nrmse", "ssim3d", "ssim_slices"}
+    assert found["ssim_slices"] == pytest.approx(ssim_of_whole_slices(truth, truth / 2))
+    with pytest.raises(DataError, match="cannot be measured so"):
+        measured_file(tmp_path / "v.npy", f"{tmp_path / 't.npy'}:0:7", None)

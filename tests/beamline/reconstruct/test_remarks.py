@@ -10,11 +10,13 @@ import pytest
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.recon_report import ReconOutcome
-from beamline.reconstruct.remarks import odd_views_warning
+from beamline.reconstruct.remarks import needles_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.prep.correct import Projections
+from recon.splatting.gaussians import Gaussians
 from recon.voxels.projector import project
+from recon.voxels.stray_mass import stray_mass
 
 FIRST_FRAME, FIRST_ROW = 20, 30
 
@@ -44,6 +46,27 @@ def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.ra
     first, last, left, right = map(int, worst)
     assert FIRST_ROW + 2 * 10 >= first > FIRST_ROW + 2 * 6 and FIRST_ROW + 2 * 14 <= last + 1 < FIRST_ROW + 2 * 18
     assert 2 * 22 >= left > 2 * 18 and 2 * 26 <= right + 1 < 2 * 30
+
+
+def test_mass_where_views_show_nothing_is_told_and_that_of_a_direct_method_is_not(rng: np.random.Generator) -> None:
+    made, prepared = _made(rng, {}, "sirt")
+    spoiled = made.volume.data.copy()
+    spoiled[:, 2:8, 2:8] += 0.02
+    for data, told in ((made.volume.data, False), (spoiled, True)):
+        found = stray_mass(replace(made.volume, data=data), prepared.projections.data, prepared.geometry)
+        assert found is not None
+        said = stray_mass_warning(made, found)
+        assert ("% of the mass of the SIRT volume is stray, where the views show nothing" in said) is told
+        assert stray_mass_warning(replace(made, method="fbp"), found) == ""
+
+
+def test_a_model_of_needles_is_told(rng: np.random.Generator) -> None:
+    made, prepared = _made(rng, {}, "r2")
+    for width, told in ((3.0, False), (0.2, True)):
+        model = Gaussians.from_physical(np.zeros((5, 3)), np.tile([width, 4.0, width], (5, 1)), np.ones(5))
+        said = needles_warning(replace(made, gaussians=model), prepared.geometry)
+        assert ("100% of the mass of the model is in Gaussians thinner than a pixel" in said) is told
+    assert needles_warning(made, prepared.geometry) == ""
 
 
 def test_of_many_views_the_worst_five_are_named(rng: np.random.Generator) -> None:

@@ -26,7 +26,7 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -51,7 +51,7 @@ def _scan(folder: Path, turn: float) -> tuple[PreparedProjections, ReportContext
     return views, ReportContext(facts, selection, "beamline recon scan.h5", 0)
 
 
-@pytest.mark.parametrize(("turn", "compared"), [(2 * np.pi, True), (3.6, False)])
+@pytest.mark.parametrize(("turn", "compared"), [(2 * np.pi, True), (3.6, True), (2.8, False)])
 def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(tmp_path: Path, turn: float, compared: bool) -> None:
     prepared, context = _scan(tmp_path, turn)
     result = recon.reconstruct(prepared.projections.data, prepared.geometry, recon.OsSirtTv(iterations=3))
@@ -102,7 +102,24 @@ def test_fbp_is_kept_beside_a_volume_that_hides_something(tmp_path: Path, doubtf
     np.testing.assert_allclose(record.fbp, expected, atol=1e-6)
     with closing(ShownVolume(target.output, fbp=True)) as fbp:
         assert fbp.facts()["name"] == "out.h5, FBP"
-        np.testing.assert_array_equal(fbp.cut(0, 5, TileRegion(0, 40, 0, 40))[0], record.fbp[5])
+        np.testing.assert_array_equal(fbp.cut(0, 5, TileRegion(0, 40, 0, 40)).values, record.fbp[5])
+
+
+def test_fbp_that_another_format_cannot_keep_is_told(tmp_path: Path) -> None:
+    write_exchange(tmp_path / "scan.h5", replace(SCAN, shape=(12, 40)))
+    with SourceOptions(tmp_path / "scan.h5").open() as source:
+        facts, selection = facts_of(source), Selection(axis_col=SCAN.axis_col)
+        prepared = prepare_projections(source, selection, lambda said: None)
+    grid = Grid.matching(prepared.geometry)
+    sharp = direct(prepared.projections.data, prepared.geometry, grid, "hann")
+    made = ReconOutcome(Volume(gaussian_filter(sharp, (0, 2, 2)), grid), "fista-tv", 1.0, (), {})
+    events: list[Event] = []
+    target = OutputPaths(tmp_path / "out.npy", tmp_path / "out.html")
+    context = ReportContext(facts, selection, "beamline recon scan.h5", 0)
+    write_result(made, prepared, None, target, context, events.append, SystemClock())
+    said = [str(event.data.get("message")) for event in events]
+    assert any("may hide" in each for each in said)
+    assert any("FBP of the same views is not kept" in each and "--method fbp" in each for each in said)
 
 
 def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,10 +20,13 @@ from beamline.scan import watchdog
 from beamline.scan.run_folder import CONFIG, WATCHDOG_LOG
 from beamline.scan.watchdog import BETWEEN, FROZEN, inhibited, until_dead, watched
 from drivers.base.clock import Clock, SystemClock
+from drivers.epics.channel import PvValue
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
+from simulators.wires.epics.wire import MotorRecord
 from simulators.wires.registry import WIRES
 from tests.beamline.ball_scan import COMMON
+from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.simulators.wires.transports import serve_tcp
 
 OTHERS = (("pi_gcs", False), ("pm16c", False), *((("zaber", True),) if os.name == "posix" else ()))
@@ -220,3 +223,61 @@ def test_the_system_is_asked_not_to_shut_down_where_it_can_be(tmp_path: Path, mo
     program.chmod(0o644)  # nothing that can be executed
     with inhibited():
         pass
+
+
+class _Behind:
+    """A soft IOC: a motor record, the variables of a shutter, whose blade follows, and the stop of another motor."""
+
+    def __init__(self, record: MotorRecord, lost: bool) -> None:
+        self._record, self.values = record, {"open": 0.0, "close": 0.0, "blade": 1.0, "M.STOP": 0.0}
+        if lost:
+            del self.values["blade"]
+
+    @property
+    def suffixes(self) -> list[str]:
+        return [*self._record.suffixes, *self.values]
+
+    def read(self, suffix: str) -> PvValue:
+        return PvValue(self.values[suffix], "", 0) if suffix in self.values else self._record.read(suffix)
+
+    def write(self, suffix: str, value: float | str) -> None:
+        if suffix not in self.values:
+            self._record.write(suffix, value)
+        elif suffix == "M.STOP":
+            self.values[suffix] = float(value)
+        else:
+            self.values["blade"] = float(suffix == "open")
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.MonkeyPatch, lost: bool) -> None:
+    """A shutter whose status is lost leaves the other steps to be done."""
+    pytest.importorskip("p4p")
+    monkeypatch.setattr(watchdog, "PATIENCE", 1.0)
+    motor = f"{COMMON}, timeout_s: 0.5, port: 'pva://{PREFIX}"
+    words = [
+        f"devices.stage={{kind: epics, {motor}'}}",
+        f"devices.shutter={{kind: epics, open_pv: 'pva://{PREFIX}open', close_pv: 'pva://{PREFIX}close', "
+        f"status_pv: 'pva://{PREFIX}blade', timeout_s: 0.5}}",
+        f"devices.sample_mover={{kind: stage, in_deg: 0, out_deg: 10, stage: {{kind: epics, {motor}M'}}}}",
+        "scan.mode=step",
+    ]
+    config = load(config_folder() / "instrument.yaml", words, {})
+    clock, said = TickingClock(), list[str]()
+    served = _Behind(record_of(clock, TriggerLine(clock)), lost)
+    with serve_pva(served, clock, monkeypatch):
+        stage = config.devices.stage.connect(clock)
+        stage.start_move(3.0, 0.5)
+        clock.sleep(1)
+        assert stage.moving()
+        assert watchdog.make_safe(config, clock, said.append) is not lost
+        clock.sleep(5)
+        assert not stage.moving()
+        assert stage.position() < 2.9  # it was on its way to 3
+        stage.close()
+    assert (served.values.get("blade", 0.0), served.values["M.STOP"]) == (0.0, 1.0)
+    stopped, shutter, mover, disarmed = said
+    assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")
+    assert (shutter == "The shutter is closed.") is not lost
+    assert ("LOOK AT THE INSTRUMENT" in shutter) is lost
+    assert disarmed == "The stage stands, its trigger output is disarmed, the shutter has a step of its own."

@@ -80,6 +80,16 @@ def test_no_window_spans_a_gap_or_half_a_turn() -> None:
     assert max(widest) < 12
 
 
+def test_views_that_lie_apart_are_not_averaged() -> None:
+    angles = np.radians(np.arange(0, 180, 0.5))
+    drift, jitter = np.linspace(0, 10, 360), 0.5 * (-1.0) ** np.arange(360)
+    for places, kept in ((drift, 6), (jitter, 0)):
+        row = STUDIES["window-average"].rows(ViewSet(angles, np.pi, places=places[:, None]))
+        means = [each for each in row if each.label.startswith("mean of")]
+        assert sum(each.groups is not None for each in means) == kept
+        assert all("displaced by up to" in each.reason for each in means if each.groups is None)
+
+
 @pytest.mark.parametrize("name", STUDIES)
 def test_rows_that_ask_for_too_much_are_left_out_with_the_reason(name: str) -> None:
     few = np.radians(np.arange(0, 180, 2.0))
@@ -105,3 +115,9 @@ def test_a_mean_of_views_is_that_of_their_light(window: int, offset: float) -> N
     expected = [-np.log(sum(light[g] for g in group) / window) for group in groups]
     np.testing.assert_allclose(data, np.array(expected, np.float64), rtol=3e-6, atol=1e-5)
     np.testing.assert_allclose(at, [angles[group].mean() for group in groups])
+
+
+def test_a_frame_that_several_views_share_is_dose_once() -> None:
+    row = StudyRow("overlapping", np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4]]))
+    assert (row.n_views, row.window, row.frames) == (3, 3, 5)
+    assert StudyRow("left out", None, reason="too few").frames == 0

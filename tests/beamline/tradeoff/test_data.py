@@ -17,7 +17,7 @@ def test_arrays_survive_the_file(tmp_path: Path) -> None:
         rng.random(5), (4, 6), 0.5, 60.0, 120.0, shifts=rng.random((5, 2)), roll=0.1, tilt=rng.random(5)
     )
     images = rng.random((5, 4, 6)).astype(np.float32)
-    data = Data(images[:3], views.select([0, 1, 2]), (images[3:], views.select([3, 4])), images)
+    data = Data(images[:3], views.select([0, 1, 2]), (images[3:], views.select([3, 4])), images, images / 2)
     data.save(tmp_path / "data.npz")
     back = Data.load(tmp_path / "data.npz")
     assert data.held_out is not None and back.held_out is not None
@@ -27,9 +27,10 @@ def test_arrays_survive_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.projections, data.projections)
     np.testing.assert_array_equal(back.held_out[0], data.held_out[0])
     np.testing.assert_array_equal(back.truth, data.truth)
+    np.testing.assert_array_equal(back.weights, data.weights)
     Data(data.projections, data.geometry, None, None).save(tmp_path / "bare.npz")
     bare = Data.load(tmp_path / "bare.npz")
-    assert bare.held_out is None and bare.truth is None
+    assert bare.held_out is None and bare.truth is None and bare.weights is None
 
 
 def test_the_geometry_comes_without_the_views(tmp_path: Path) -> None:

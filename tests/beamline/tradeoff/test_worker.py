@@ -48,6 +48,25 @@ def _silent(line: object) -> None:
     pass
 
 
+@pytest.mark.parametrize(("method", "binning"), [("fbp", 1), ("fista-tv", 1), ("sirt", 2)])
+def test_rays_that_were_not_measured_do_not_count(data: Data, method: str, binning: int) -> None:
+    """Whatever stands for them in the views that are used, and in those held out."""
+    assert data.held_out is not None
+    weights = np.ones((30, 4, 40), np.float32)
+    weights[:, :, :5] = 0
+    figures = []
+    for filled in (0.0, 3.0):
+        used, held = data.projections.copy(), data.held_out[0].copy()
+        used[:, :, :5] = held[:, :, :5] = filled
+        given = replace(data, projections=used, held_out=(held, data.held_out[1]), weights=weights)
+        trial = Trial("method", method, data.geometry.n_views, binning, halves=True)
+        found = run(trial, given, 0, _silent)
+        figures.append([*found["metrics"].values(), *found["left"]])
+    np.testing.assert_array_equal(*figures)
+    blind = run(trial, replace(given, weights=None), 0, _silent)
+    assert blind["metrics"]["residual_held_out"] > 1.2 * found["metrics"]["residual_held_out"]
+
+
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: Data) -> None:
     found = run(Trial("method", "fbp", data.geometry.n_views, halves=True), data, 0, _silent)
     expected = fbp(data.projections, data.geometry, filter="hann")

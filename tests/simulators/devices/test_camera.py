@@ -211,6 +211,13 @@ def test_timing_is_the_orca_quest_s(readout: str, line_time: float) -> None:
         bench.camera.disarm()
 
 
+def test_the_second_model_has_its_own_times() -> None:
+    bench = _Bench(model="C15550-22UP")
+    bench.camera.configure(replace(SETTINGS, readout="ultra_quiet", exposure=1e-4))  # shorter than the first one takes
+    assert bench.camera.timing.row_period == pytest.approx(17e-6)
+    assert bench.camera.describe()["model"] == "C15550-22UP (simulated)"
+
+
 def test_a_frame_is_there_once_it_is_exposed_and_read_out() -> None:
     bench = _Bench()
     bench.camera.configure(replace(SETTINGS, trigger=TriggerSource.SOFTWARE, readout="ultra_quiet"))

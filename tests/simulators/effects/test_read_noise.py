@@ -20,6 +20,11 @@ def test_read_noise_is_normal_with_the_readout_s_rms(readout: str, rms: float, b
     chance.normal_like((noise - 9) / (rms * binning))
 
 
+def test_the_second_model_reads_ultra_quiet_with_more_noise() -> None:
+    noise = ReadNoise().apply(np.zeros((300, 400)), shots.sized(300, 400, readout="ultra_quiet", model="C15550-22UP"))
+    chance.variance_is(noise, 0.3**2)
+
+
 def test_read_noise_and_offset_make_the_dark() -> None:
     dark = shots.frame(shots.scene("read_noise", "offset"), beam=False).astype(float)
     variance = (0.43 / 0.107) ** 2 + 1 / 12  # of rounding (Janesick 2007)

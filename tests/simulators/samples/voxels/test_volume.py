@@ -19,7 +19,9 @@ VALUES = np.arange(60, dtype=np.int16).reshape(3, 4, 5) - 10
 
 
 def _voxels(values: np.ndarray = VALUES, spacing: Any = None, **settings: Any) -> Voxels:
-    read = lambda file, dataset: Stored(values if file == "v" else values.clip(0, 3), spacing)  # noqa: E731
+    def read(file: str, dataset: str | None) -> Stored:
+        return Stored(values if file == "v" else values.clip(0, 3), spacing)
+
     return voxels_of(VolumeSettings("v", **({"voxel_mm": 0.1} | settings)), read)
 
 
