@@ -85,10 +85,14 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """Tiny fits on one thread: on a busy machine, waiting for a second one takes ten times as long as the work."""
-    before = numba.get_num_threads()
+    import torch  # here: most tests need none
+
+    before = numba.get_num_threads(), torch.get_num_threads()
     numba.set_num_threads(1)
+    torch.set_num_threads(1)
     yield
-    numba.set_num_threads(before)
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
+from simulators.samples.voxels.voxels import Voxels
 
 F32 = NDArray[np.float32]
 
@@ -42,15 +43,29 @@ class Case:
     peak: float
 
 
-def cone(folder: Path, name: str, views: int, size: int) -> Case:
-    """An object of the protocol on size³ voxels and (2 size)² pixels."""
+def seen_by_simulator(fine: F32, geometry: Geometry) -> F32:
+    """Line integrals [view, row, col] by the simulator's projector, 2 x 2 rays a pixel: no method uses it."""
+    sample = Voxels.of(fine, 2 / len(fine))
+    rows, cols = geometry.detector_shape
+    pitch = geometry.pixel_pitch * geometry.sod / geometry.sdd / 2  # at the sample
+    detector = Detector.centred((2 * rows, 2 * cols), pitch, geometry.sod)
+    views = [sample.line_integrals(float(a), detector).reshape(rows, 2, cols, 2) for a in geometry.angles]
+    return np.stack([view.mean(axis=(1, 3)) for view in views]).astype(np.float32)
+
+
+def seen_by_engine(fine: F32, geometry: Geometry) -> F32:
+    """Line integrals [view, row, col] by the projector of the classical methods."""
+    return Projector(geometry, Grid(fine.shape, 2 / len(fine))).forward(fine)
+
+
+def cone(folder: Path, name: str, views: int, size: int, seen: Callable[[F32, Geometry], F32] = seen_by_engine) -> Case:
+    """An object of the protocol on size³ voxels and (2 size)² pixels, seen as 256³ voxels."""
     fine = _padded(OBJECTS[name](folder), 256)
     factor = 256 // size
     truth = fine.reshape(size, factor, size, factor, size, factor).mean(axis=(1, 3, 5), dtype=np.float32)
     angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
     geometry = Geometry.cone(angles, (2 * size, 2 * size), 4 / (2 * size), 5.0, 7.0)
-    clean = Projector(geometry, Grid((256, 256, 256), 2 / 256)).forward(fine)
-    return Case(name, _noisy(clean), geometry, Grid((size, size, size), 2 / size), truth, 1.0)
+    return Case(name, _noisy(seen(fine, geometry)), geometry, Grid((size, size, size), 2 / size), truth, 1.0)
 
 
 def walnut(folder: Path, views: int) -> Case:

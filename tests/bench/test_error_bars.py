@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -67,10 +68,13 @@ def case_of(folder: Path, name: str, views: int, photons: float) -> Case:
     return few_rows(slab(folder, name, views, photons))
 
 
-def timed(work: Callable[[], object]) -> float:
+Found = TypeVar("Found")
+
+
+def timed(work: Callable[..., Found], *arguments: object) -> tuple[float, Found]:
     before = time.process_time()
-    work()
-    return time.process_time() - before
+    found = work(*arguments)
+    return time.process_time() - before, found
 
 
 @pytest.mark.parametrize(("name", "views", "photons"), CHOSEN + CHECKED)
@@ -79,11 +83,10 @@ def test_voxels_of_the_truth_within_one_deviation(shared_data: Path, name: str, 
     problem = ReconProblem(case.projections, case.geometry, case.grid, DataUse(), 0, "cpu")
     parts = regions(case.truth)
     for label, method in METHODS.items():
-        decide, found = Decisions(0), []
-        run = timed(lambda: found.append(method.run(problem, RunControl(decide=decide)).volume))  # noqa: B023
-        volume = found[0]
-        bars = timed(lambda: found.append(error_bars(method, problem, volume, decide.made, RunControl())))  # noqa: B023
-        within = np.abs(volume.data - case.truth) <= found[1].deviation
+        decide = Decisions(0)
+        run, made = timed(method.run, problem, RunControl(decide=decide))
+        bars, found = timed(error_bars, method, problem, made.volume, decide.made, RunControl())
+        within = np.abs(made.volume.data - case.truth) <= found.deviation
         shares = {part: float(within[parts[part]].mean()) for part in ("flat", "weak", "edge", "air") if part in parts}
         said = "  ".join(f"{part} {share:4.0%}" for part, share in shares.items())
         print(

@@ -37,6 +37,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project
 from recon.warm_up import warm_up
+from tests.recon.helpers import run_steps
 
 F32 = NDArray[np.float32]
 N, SIDE = 50_000, 256
@@ -221,7 +222,7 @@ def test_a_whole_fit_of_published_length(steps: int, side: int) -> None:
     state = fit.init(start, 0)
     before = fit.misfit_of(state, problem, settings)
     begin, worked = time.perf_counter(), time.process_time()
-    fit.run_steps(state, problem, settings, steps)
+    run_steps(state, problem, settings, steps)
     seconds, cpu = time.perf_counter() - begin, time.process_time() - worked
     after = fit.misfit_of(state, problem, settings)
     print(f"\n{steps} steps, {state.n} Gaussians, {side}²: {seconds:.1f} s ({cpu:.1f} CPU s)")
