@@ -8,13 +8,21 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.scan.control import state_of
 from beamline.scan.states import State
-from tests.beamline.page.chromium import BEAMLINE, MARKS, WITHIN, Browser, browser, canvas_has_picture, page_of, selenium
+from tests.beamline.page.chromium import (
+    BEAMLINE,
+    MARKS,
+    WITHIN,
+    Browser,
+    browser,
+    canvas_has_picture,
+    page_of,
+    selenium,
+)
 from tests.beamline.page.served import listed, served, viewed
 from tests.beamline.page.test_runs import made
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged

@@ -11,7 +11,16 @@ import pytest
 
 from beamline.scan.control import state_of
 from beamline.scan.states import State
-from tests.beamline.page.chromium import BEAMLINE, MARKS, WITHIN, Browser, browser, canvas_has_picture, page_of, selenium
+from tests.beamline.page.chromium import (
+    BEAMLINE,
+    MARKS,
+    WITHIN,
+    Browser,
+    browser,
+    canvas_has_picture,
+    page_of,
+    selenium,
+)
 
 __all__ = ["browser"]
 pytestmark = MARKS
