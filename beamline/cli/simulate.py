@@ -45,7 +45,9 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     metavar="N",
     help="Number of views over the scene's range, at the same speed of the stage. Default: as in the scene.",
 )
-@click.option("--out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it.")
+@click.option(
+    "-o", "--output", "--out", "out", type=_FILE, help="Write the scan to this HDF5 file and its labels beside it."
+)
 @click.option("--truth", type=_FILE, help="Write the sample's attenuation and labels to this HDF5 file.")
 @click.option(
     "--truth-bin",
