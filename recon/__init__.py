@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
+    from recon.spectral import EnergyViews, Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
     from recon.splatting.r2 import R2
@@ -55,6 +56,7 @@ __all__ = [
     "CorrectionSettings",
     "Counts",
     "DataUse",
+    "EnergyViews",
     "Fbp",
     "FistaTv",
     "FitSettings",
@@ -63,6 +65,7 @@ __all__ = [
     "Grid",
     "IntraTomo",
     "Kernel",
+    "Materials",
     "OsSirtTv",
     "Progress",
     "Projections",
@@ -81,6 +84,7 @@ __all__ = [
     "axis_by_views",
     "correct",
     "find_axis",
+    "fit_materials",
     "project",
     "reconstruct",
     "remove_rings",
@@ -97,6 +101,7 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
+    **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
     "Projector": "recon.voxels.projector",

@@ -59,6 +59,7 @@ _COMMANDS = {
     "simulate": _Entry("simulate", "Simulate a scan of a scene, with labels and truth."),
     "xafs": _Entry("xafs", "Find a material's absorption edge and the energy of its highest contrast."),
     "recon": _Entry("recon", "Reconstruct a scan, finished or still running."),
+    "materials": _Entry("materials", "Fit the volume of each material to scans at several energies."),
     "batch": _Entry("batch", "Reconstruct many scans by one recipe; a table says what became of each."),
     "tradeoff": _Entry("tradeoff", "Compare methods and settings on a scan: quality against time and memory."),
     "study": _Entry("study", "Say what fewer views, narrower sectors, random angles or averaged views cost on a scan."),

@@ -1,0 +1,56 @@
+"""`beamline materials`: a volume of each material, from scans at several energies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.options import json_option, refuse_shared
+from beamline.cli.selection_options import chosen, selection_options
+from beamline.cli.terminal import counting, events_shown
+from beamline.core.errors import ScanStopped
+from beamline.core.events import Done
+from beamline.core.signals import StopOnSignal
+from drivers.base.clock import SystemClock
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@click.argument("files", metavar="SCAN...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--spectra",
+    type=_FILE,
+    required=True,
+    help="CSV table: energy_kev and the name of each material in the first line, then keV and 1/mm.",
+)
+@click.option(
+    "-o", "--output", metavar="PATH.h5", type=_FILE, required=True, help="_NAME joins its stem for each material."
+)
+@selection_options
+@json_option
+def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
+    """Fit the volume fraction of each material to scans of one sample at several energies, all at once.
+
+    Each SCAN states its energy. Few views an energy are enough: all views together determine the materials. Views of
+    different energies should have different angles. The sample must not move between the scans.
+
+    Ctrl-C ends the fit with the volumes so far (exit code 4).
+    """
+    from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
+
+    refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
+    table = read_spectra(spectra)
+    with events_shown(as_json) as sink:
+        clock = SystemClock()
+        made = reconstruct_materials(
+            [chosen(path, 0, values) for path in files], table, output, sink, clock,
+            lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False),
+        )  # fmt: skip
+        sink(Done({"outputs": made.outputs, "residual": made.residual, "stopped": made.early}, time=clock.now()))
+    if not as_json:
+        click.echo("\n".join(f"{name:<20}{path}" for name, path in made.outputs.items()))
+    if made.early:
+        raise ScanStopped("The fit was stopped; the volumes are those reached so far.")

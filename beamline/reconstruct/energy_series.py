@@ -1,0 +1,243 @@
+"""Scans of one sample at several energies, and a table of spectra: one volume for each material."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.events import Sink, Warned
+from beamline.core.files import refuse_existing, remove
+from beamline.core.machine import free_memory
+from beamline.core.signals import StopOnSignal
+from beamline.core.text import size
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.projections.selection import Selection
+from beamline.reconstruct.slabs import SHARE
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.volumes.files import write_volume
+from beamline.storage.writers.recon_file import ReconRecord
+from drivers.base.clock import Clock
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.spectral import EnergyViews, Materials, fit_materials
+
+_SWEEPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Attenuation of materials.
+
+    Attributes:
+        names: of the materials.
+        energies: keV, [n], rising.
+        attenuation: 1/mm of the pure material, [n, material].
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    energies: NDArray[np.float64]
+    attenuation: NDArray[np.float64]
+
+    def at(self, energy_kev: float) -> NDArray[np.float64]:
+        """[material], between the energies of the table. ConfigError outside of them."""
+        if not self.energies[0] <= energy_kev <= self.energies[-1]:
+            raise ConfigError(
+                f"{self.path} has energies from {self.energies[0]:g} to {self.energies[-1]:g} keV; a scan was made at "
+                f"{energy_kev:g} keV. Nothing was written."
+            )
+        return np.array([np.interp(energy_kev, self.energies, column) for column in self.attenuation.T])
+
+
+def read_spectra(path: Path) -> Spectra:
+    """A CSV table: `energy_kev` and the names of materials in the first line, keV and 1/mm below.
+
+    Raises:
+        DataError: the file cannot be read, or is no such table.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            head, *lines = [line for line in csv.reader(file) if line]
+        values = np.array([[float(value) for value in line] for line in lines])
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} is no table of spectra: {error}. Expected {_TABLE}.") from error
+    names = tuple(name.strip() for name in head[1:])
+    wanted = (len(lines), len(head))
+    if head[0].strip() != "energy_kev" or not names or len(set(names)) < len(names) or values.shape != wanted:
+        raise DataError(f"{path} is no table of spectra. Expected {_TABLE}.")
+    values = values[np.argsort(values[:, 0])]
+    if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
+        raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")
+    if any(not name or set(name) & set('/\\:*?"<>|') for name in names):
+        raise DataError(f"{path}: names of materials are parts of file names; found {', '.join(map(repr, names))}.")
+    return Spectra(path, names, values[:, 0], values[:, 1:])
+
+
+_TABLE = "a first line 'energy_kev,NAME,NAME,...', then a line of keV and 1/mm for each energy"
+
+
+@dataclass(frozen=True, eq=False)
+class MaterialRun:
+    """What `reconstruct_materials` made.
+
+    Attributes:
+        outputs: the volume file of each material, by name.
+        residual: what the volumes leave of the views, over the norm of the views.
+        early: the fit was stopped, and the volumes are those reached.
+    """
+
+    outputs: dict[str, Path]
+    residual: float
+    early: bool
+
+
+def reconstruct_materials(
+    scans: Sequence[tuple[SourceOptions, Selection]],
+    spectra: Spectra,
+    output: Path,
+    sink: Sink,
+    clock: Clock,
+    counting: Callable[[str], Callable[[int, int], None]],
+    stop: StopOnSignal,
+) -> MaterialRun:
+    """Fit the volume fraction of each material to all scans, and write OUTPUT's stem + _NAME.h5 for each of them.
+
+    The rotation axis of the first scan is used for the others, unless it is told. Ctrl-C ends the fit with the volumes
+    so far.
+
+    Raises:
+        ConfigError: scans that do not fit together, energies that are missing or do not tell the materials apart, or
+            too little memory. DataError: a scan cannot be read, or an output exists. Nothing is written then.
+    """
+    outputs = {name: output.with_name(f"{output.stem}_{name}.h5") for name in spectra.names}
+    for path in outputs.values():
+        refuse_existing(path)
+    parts: list[PreparedProjections] = []
+    attenuation, axis_col, progress = [], None, counting("scans")
+    for n, (source, selection) in enumerate(scans, 1):
+        with ExitStack() as opened:
+            scan = opened.enter_context(source.open())
+            if scan.energy_kev is None:
+                raise ConfigError(f"{scan.path} does not state its energy. Nothing was written.")
+            attenuation.append(spectra.at(scan.energy_kev))
+            chosen = replace(selection, axis_col=axis_col if selection.axis_col is None else selection.axis_col)
+            parts.append(prepare_projections(scan, chosen, lambda said: sink(Warned(said, time=clock.now()))))
+        axis_col = parts[0].axis_col
+        progress(n, len(scans))
+    views = _joined(parts, np.array(attenuation))
+    grid = Grid.matching(views.geometry)
+    _refuse_memory(views, grid)
+    early = False
+
+    def go_on(sweep: int, residual: float) -> bool:
+        nonlocal early
+        if sweep:
+            progress(sweep, _SWEEPS)
+        early = stopping()
+        return not early
+
+    stop.ready, progress = True, counting("sweeps")
+    with stop() as stopping:
+        made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
+    _write(made, parts[0], scans, outputs, clock)
+    return MaterialRun(outputs, made.residual, early)
+
+
+def _joined(parts: Sequence[PreparedProjections], attenuation: NDArray[np.float64]) -> EnergyViews:
+    """The views of all scans."""
+    first = parts[0].geometry
+    for part in parts[1:]:
+        own = part.geometry
+        if (own.detector_shape, own.pixel_pitch, own.sod, own.sdd) != (
+            first.detector_shape, first.pixel_pitch, first.sod, first.sdd
+        ):  # fmt: skip
+            raise ConfigError(
+                f"The scans do not fit together: {first.detector_shape} pixels of {first.pixel_pitch:g} "
+                f"{parts[0].length_unit}, and {own.detector_shape} of {own.pixel_pitch:g}. Nothing was written."
+            )
+    if parts[0].length_unit != "mm":
+        raise ConfigError("The spectra are in 1/mm; give --pixel-size-um, as the scans do not state it.")
+    weights = [part.ray_weights() for part in parts]
+    data = np.concatenate([part.projections.data for part in parts])
+    weight = None
+    if any(each is not None for each in weights):
+        weight = np.concatenate(
+            [
+                np.broadcast_to(np.float32(1) if each is None else each, part.projections.data.shape)
+                for each, part in zip(weights, parts, strict=True)
+            ]
+        ).astype(np.float32)
+        data = np.where(weight > 0, data, np.float32(0))
+
+    def of_views(name: str) -> NDArray[np.float64]:
+        return np.concatenate([getattr(part.geometry, name) for part in parts])
+
+    energy = np.repeat(np.arange(len(parts)), [part.geometry.n_views for part in parts])
+    geometry = replace(
+        first, angles=of_views("angles"), shifts=of_views("shifts"), roll=of_views("roll"), tilt=of_views("tilt")
+    )
+    try:
+        return EnergyViews(data, _placed(geometry, parts, energy), energy, attenuation, weight)
+    except ValueError as error:
+        raise ConfigError(f"{error}. Nothing was written.") from error
+
+
+def _placed(geometry: Geometry, parts: Sequence[PreparedProjections], energy: NDArray[np.intp]) -> Geometry:
+    """The geometry of all views; a scan with another rotation axis than the first has displaced views."""
+    columns = np.array([part.geometry.axis_col for part in parts])
+    shifts = geometry.shifts.copy()
+    shifts[:, 0] += (columns - columns[0])[energy]
+    return replace(geometry, shifts=shifts)
+
+
+def _refuse_memory(views: EnergyViews, grid: Grid) -> None:
+    materials = views.cross_sections.shape[1]
+    needs = 4 * (8 * materials * math.prod(grid.shape) + (4 + 2 * (views.weight is not None)) * views.projections.size)
+    if needs > SHARE * free_memory():
+        raise ConfigError(
+            f"{materials} materials of {grid.shape} voxels need {size(needs)} of memory; {size(SHARE * free_memory())} "
+            "may be used. Give --rows, --views or --bin. Nothing was written."
+        )
+
+
+def _write(
+    made: Materials,
+    first: PreparedProjections,
+    scans: Sequence[tuple[SourceOptions, Selection]],
+    outputs: dict[str, Path],
+    clock: Clock,
+) -> None:
+    """All files, or none of them."""
+    written: list[Path] = []
+    try:
+        for (name, path), density in zip(outputs.items(), made.densities, strict=True):
+            record = ReconRecord(
+                volume=Volume(density, made.grid),
+                length_unit=first.length_unit,
+                raw_file=", ".join(str(Path(source.path).resolve()) for source, _ in scans),
+                title=f"volume fraction of {name}",
+                sample="not stated",
+                time=clock.now(),
+                parameters={
+                    "method": "materials",
+                    "material": name,
+                    "axis_col": first.axis_col,
+                    "weights": made.weights,
+                },
+                metrics={"residual": made.residual},
+            )
+            write_volume(path, record)
+            written.append(path)
+    except BaseException:
+        for path in written:
+            remove(path)
+        raise
