@@ -218,5 +218,6 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         plan=json.dumps(asked),
         config=resolved_yaml(config),
         devices={device.name: device.describe() for device in (devices.stage, devices.camera)},
+        filter=config.scan.filter or (devices.filter.place() if devices.filter is not None else None),
         beam_unit=None if isinstance(monitor, NoBeamMonitor) else monitor.unit,
     )
