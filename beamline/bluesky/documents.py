@@ -6,9 +6,13 @@ One index is one row of the file, darks and flats included. A trigger without a 
 from __future__ import annotations
 
 import json
+import socket
+import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
+from urllib.parse import urlsplit
 
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError
@@ -20,6 +24,10 @@ Emit = Callable[[str, Mapping[str, Any]], object]
 """Takes a document: its name and its values."""
 
 STREAM = "primary"
+REACH = 1.0
+"""s that a proxy of 0MQ has to answer, and at the end to take what it was sent."""
+JOIN = 0.5
+"""s until a proxy takes documents: 0MQ connects in the background, and drops what comes before."""
 _COLUMNS = {  # ending of the data key: dataset, numpy type, unit
     "": (layout.DATA, "<u2", "counts"),
     "-angle": (layout.ANGLE, "<f8", "degree"),
@@ -171,3 +179,37 @@ def json_lines(stream: TextIO) -> Emit:
         stream.flush()
 
     return emit
+
+
+@contextmanager
+def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
+    """Sends documents to a proxy of 0MQ, by bluesky's own Publisher. It never waits: what nobody takes is dropped.
+
+    Args:
+        address: tcp://HOST:PORT, where the proxy takes documents.
+        warn: is told that nobody listens there.
+
+    Raises:
+        ConfigError: another address, or bluesky or pyzmq are not installed.
+    """
+    try:
+        from bluesky.callbacks.zmq import Publisher
+        from zmq import ZMQError  # type: ignore[attr-defined,unused-ignore]
+    except ImportError as error:
+        raise ConfigError('0MQ needs: pip install "splatline[bluesky]". Nothing was started.') from error
+    try:
+        url = urlsplit(address)
+        if url.scheme != "tcp" or not url.hostname or url.port is None:
+            raise ValueError(address)
+        publisher = Publisher(address)
+    except (ValueError, ZMQError) as error:
+        raise ConfigError(f"{address} is no address of 0MQ; expected tcp://HOST:PORT. Nothing was started.") from error
+    try:
+        try:
+            socket.create_connection((url.hostname, url.port), REACH).close()
+            time.sleep(JOIN)
+        except OSError as error:
+            warn(f"Nobody listens at {address} ({error}): documents are dropped until somebody does.")
+        yield publisher
+    finally:  # its own close would wait for ever for a proxy that no longer reads
+        publisher._context.destroy(linger=round(1000 * REACH))
