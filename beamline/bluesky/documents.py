@@ -28,7 +28,7 @@ REACH = 1.0
 """s that a proxy of 0MQ has to answer, and at the end to take what it was sent."""
 JOIN = 0.5
 """s until a proxy takes documents: 0MQ connects in the background, and drops what comes before."""
-_COLUMNS = {  # ending of the data key: dataset, numpy type, unit
+COLUMNS = {  # ending of the data key: dataset, numpy type, unit
     "": (layout.DATA, "<u2", "counts"),
     "-angle": (layout.ANGLE, "<f8", "degree"),
     "-kind": (layout.KIND, "<i4", ""),
@@ -69,7 +69,7 @@ class ScanStream:
                 "units": unit,
                 "external": "STREAM:",
             }
-            for ending, (dataset, kind, unit) in _COLUMNS.items()
+            for ending, (dataset, kind, unit) in COLUMNS.items()
         }
 
     def __call__(self, event: Event) -> None:
@@ -99,11 +99,15 @@ class ScanStream:
 
     def _resources(self) -> Iterator[Any]:
         compose = self._library.ComposeStreamResource()
-        uri = self._path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
-        for ending, (dataset, _, _) in _COLUMNS.items():
+        for ending, (dataset, _, _) in COLUMNS.items():
             chunk = (1, *self.shape) if ending == "" else (1,)
             parameters = {"dataset": dataset, "chunk_shape": chunk, "swmr": True}
-            yield compose(mimetype="application/x-hdf5", uri=uri, data_key=self._name + ending, parameters=parameters)
+            yield compose(
+                mimetype="application/x-hdf5",
+                uri=file_url(self._path),
+                data_key=self._name + ending,
+                parameters=parameters,
+            )
 
 
 class Documents:
@@ -169,6 +173,11 @@ class Documents:
         stop = self._run.compose_stop(exit_status=status, reason=reason)
         self._emit("stop", stop | {"num_events": {STREAM: self._stream.rows}})
         self._run = None
+
+
+def file_url(path: Path) -> str:
+    """As resources name a file."""
+    return path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
 
 
 def json_lines(stream: TextIO) -> Emit:
