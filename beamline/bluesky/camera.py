@@ -45,7 +45,7 @@ PATIENCE = 5.0
 SLICE = 0.2  # s between looks at a request to stop
 
 
-class Kind(StrictEnum):
+class ShownFrames(StrictEnum):
     """What frames show. Shutter and sample are brought where they need them."""
 
     PROJECTION = "projection"
@@ -62,7 +62,7 @@ class _Frames(DetectorAcquireLogic):
         self._runs, self._stop, self._ending = runs or Path(config.storage.folder), Event(), asyncio.Lock()
         self._writer: NXtomoWriter | None = None
         self._task: asyncio.Task[None] | None = None
-        self.kind, (self.rows, self._set_rows) = soft_signal_rw(Kind), soft_signal_r_and_setter(int)
+        self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
     async def prepare(self, trigger: TriggerSource, n: int, exposure: float, apart: float = 0.0) -> None:
