@@ -1,4 +1,4 @@
-"""Manual shutter and sample mover: the driver asks an operator to act and keeps the state that was confirmed."""
+"""Manual shutter, sample mover and filter: asks an operator to act and keeps the state that was confirmed."""
 
 from __future__ import annotations
 
@@ -54,3 +54,20 @@ class ManualSampleMover:
         if not self._in:
             self._ask("Move the sample back into the beam, to the same place.")
             self._in = True
+
+
+class ManualFilter:
+    """Implements `drivers.base.protocols.Filter` by asking the operator; which one is in at the start is not known."""
+
+    def __init__(self, ask: Ask, name: str = "filter") -> None:
+        self.name = name
+        self._ask = ask
+        self._place: str | None = None
+
+    def put(self, place: str) -> None:
+        if place != self._place:
+            self._ask(f"Put the filter into the beam: {place}.")
+            self._place = place
+
+    def place(self) -> str | None:
+        return self._place

@@ -6,9 +6,13 @@ One index is one row of the file, darks and flats included. A trigger without a 
 from __future__ import annotations
 
 import json
+import socket
+import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
+from urllib.parse import urlsplit
 
 from beamline.config.load import Config
 from beamline.core.errors import ConfigError
@@ -20,7 +24,11 @@ Emit = Callable[[str, Mapping[str, Any]], object]
 """Takes a document: its name and its values."""
 
 STREAM = "primary"
-_COLUMNS = {  # ending of the data key: dataset, numpy type, unit
+REACH = 1.0
+"""s that a proxy of 0MQ has to answer, and at the end to take what it was sent."""
+JOIN = 0.5
+"""s until a proxy takes documents: 0MQ connects in the background, and drops what comes before."""
+COLUMNS = {  # ending of the data key: dataset, numpy type, unit
     "": (layout.DATA, "<u2", "counts"),
     "-angle": (layout.ANGLE, "<f8", "degree"),
     "-kind": (layout.KIND, "<i4", ""),
@@ -61,7 +69,7 @@ class ScanStream:
                 "units": unit,
                 "external": "STREAM:",
             }
-            for ending, (dataset, kind, unit) in _COLUMNS.items()
+            for ending, (dataset, kind, unit) in COLUMNS.items()
         }
 
     def __call__(self, event: Event) -> None:
@@ -91,11 +99,15 @@ class ScanStream:
 
     def _resources(self) -> Iterator[Any]:
         compose = self._library.ComposeStreamResource()
-        uri = self._path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
-        for ending, (dataset, _, _) in _COLUMNS.items():
+        for ending, (dataset, _, _) in COLUMNS.items():
             chunk = (1, *self.shape) if ending == "" else (1,)
             parameters = {"dataset": dataset, "chunk_shape": chunk, "swmr": True}
-            yield compose(mimetype="application/x-hdf5", uri=uri, data_key=self._name + ending, parameters=parameters)
+            yield compose(
+                mimetype="application/x-hdf5",
+                uri=file_url(self._path),
+                data_key=self._name + ending,
+                parameters=parameters,
+            )
 
 
 class Documents:
@@ -163,6 +175,11 @@ class Documents:
         self._run = None
 
 
+def file_url(path: Path) -> str:
+    """As resources name a file."""
+    return path.absolute().as_uri().replace("file:///", "file://localhost/", 1)
+
+
 def json_lines(stream: TextIO) -> Emit:
     """Writes each document as one line, as bluesky's own JSONLinesWriter does, and flushes it."""
 
@@ -171,3 +188,37 @@ def json_lines(stream: TextIO) -> Emit:
         stream.flush()
 
     return emit
+
+
+@contextmanager
+def published(address: str, warn: Callable[[str], None]) -> Iterator[Emit]:
+    """Sends documents to a proxy of 0MQ, by bluesky's own Publisher. It never waits: what nobody takes is dropped.
+
+    Args:
+        address: tcp://HOST:PORT, where the proxy takes documents.
+        warn: is told that nobody listens there.
+
+    Raises:
+        ConfigError: another address, or bluesky or pyzmq are not installed.
+    """
+    try:
+        from bluesky.callbacks.zmq import Publisher
+        from zmq import ZMQError  # type: ignore[attr-defined,unused-ignore]
+    except ImportError as error:
+        raise ConfigError('0MQ needs: pip install "splatline[bluesky]". Nothing was started.') from error
+    try:
+        url = urlsplit(address)
+        if url.scheme != "tcp" or not url.hostname or url.port is None:
+            raise ValueError(address)
+        publisher = Publisher(address)
+    except (ValueError, ZMQError) as error:
+        raise ConfigError(f"{address} is no address of 0MQ; expected tcp://HOST:PORT. Nothing was started.") from error
+    try:
+        try:
+            socket.create_connection((url.hostname, url.port), REACH).close()
+            time.sleep(JOIN)
+        except OSError as error:
+            warn(f"Nobody listens at {address} ({error}): documents are dropped until somebody does.")
+        yield publisher
+    finally:  # its own close would wait for ever for a proxy that no longer reads
+        publisher._context.destroy(linger=round(1000 * REACH))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,9 +38,10 @@ if TYPE_CHECKING:
 @click.option("--no-live", is_flag=True, help="Run without a reconstruction, live or afterwards.")
 @click.option(
     "--documents",
-    metavar="FILE",
+    metavar="FILE|tcp://HOST:PORT",
     type=click.Path(dir_okay=False),
-    help='Add the documents of bluesky to FILE, one a line. Needs: pip install "splatline[bluesky]".',
+    help="Add the documents of bluesky to FILE, one a line, or send them to a proxy of 0MQ. "
+    'Needs: pip install "splatline[bluesky]".',
 )
 @json_option
 @click.option(
@@ -86,8 +88,6 @@ def scan(
         raise click.UsageError("--resume goes on in RUN, with the configuration there: leave -o and --set out.")
     if run is not None and documents is not None:
         raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
-    if documents is not None and "://" in documents:
-        raise click.UsageError("--documents takes a file; a program that follows its lines can publish them (0MQ).")
     with json_events(as_json) as json_sink, ExitStack() as held:
         config = None if file is None else load(file, overrides)
         try:
@@ -110,7 +110,7 @@ def scan(
         with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
             sinks: list[Sink] = [terminal, json_sink, *([beside] if page else [])]
             if documents is not None:
-                sinks.append(_documents(config, Path(documents), held))
+                sinks.append(_documents(config, documents, held))
             result = run_scan(
                 config, series or output, sinks, stop, live=how.live, afterwards=how.afterwards,
                 ask=lambda request: terminal.ask(request, ask_operator),
@@ -121,10 +121,14 @@ def scan(
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
 
 
-def _documents(config: Config, path: Path, held: ExitStack) -> Sink:
-    from beamline.bluesky.documents import Documents, event_model, json_lines
+def _documents(config: Config, place: str, held: ExitStack) -> Sink:
+    from beamline.bluesky.documents import Documents, event_model, json_lines, published
 
     event_model()  # where it is missing, no file is made
+    if "://" in place:
+        warn = partial(click.echo, err=True)
+        return Documents(config, held.enter_context(published(place, warn)))
+    path = Path(place)
     try:
         stream = held.enter_context(path.open("a", encoding="utf-8"))
     except OSError as error:

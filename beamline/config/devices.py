@@ -1,26 +1,31 @@
-"""Configuration of the devices: stage, camera, shutter, sample mover and beam monitor, real or simulated."""
+"""Configuration of the devices: stage, camera, shutter, sample mover, filter and beam monitor, real or simulated."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
+from beamline.config.places import (
+    FilterConfig,
+    MotorFilter,
+    NoFilter,
+    PvUrl,
+    PvValue,
+    Seconds,
+    StageMover,
+    without,
+)
 from beamline.config.section import Section, declared, read_from, section_of
 from beamline.config.stages import StageConfig
 from drivers import orca_quest
 from drivers.base.clock import Clock
-from drivers.base.errors import DeviceError
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.beam_monitors.page import url_problem
 from drivers.beam_monitors.reading import pattern_problem
 from drivers.beam_monitors.serial import PATTERN, QUERY
 from drivers.cameras import CAMERAS
-from drivers.epics.channel import url_problem as pv_problem
 from drivers.epics.devices import ShutterPvs
-from drivers.sample import MoverPlaces, StageSampleMover
 from drivers.stages.registry import STAGES
 
 Roi = Annotated[
@@ -144,21 +149,7 @@ class StageOutputShutter(Section):
     """How long the blade travels."""
 
 
-def _without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """Refuses a text that has a problem."""
-
-    def checked(text: str) -> str:
-        if problem := problem_of(text):
-            raise ValueError(problem)
-        return text
-
-    return AfterValidator(checked)
-
-
-Pattern = Annotated[str, _without(pattern_problem)]
-PvUrl = Annotated[str, _without(pv_problem)]
-PvValue = float | str
-Seconds = Annotated[float, Field(gt=0, le=1e6)]
+Pattern = Annotated[str, without(pattern_problem)]
 
 
 class EpicsShutter(Section):
@@ -186,48 +177,6 @@ class EpicsShutter(Section):
         closing = self.close_pv or self.open_pv
         values = self.open_value, self.close_value, self.status_open
         return ShutterPvs(self.open_pv, closing, self.status_pv, *values, self.timeout_s, self.travel_s)
-
-
-class StageMover(Section):
-    """A motor that takes the sample out of the beam for flats: any stage, between two named places.
-
-    A linear axis has its own unit (mm, say) wherever a key says deg.
-    """
-
-    kind: Literal["stage"]
-    in_deg: float
-    """Where the sample is in the beam."""
-    out_deg: float
-    """Where flats are taken."""
-    speed_deg_s: Annotated[float, Field(gt=0)] | None = None
-    """null: the stage's max_speed_deg_s."""
-    stage: Annotated[StageConfig, Field(discriminator="kind")]
-
-    @model_validator(mode="after")
-    def _places_can_be_reached(self) -> Self:
-        figures = self.stage.settings.figures
-        low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
-        for name, place in (("in_deg", self.in_deg), ("out_deg", self.out_deg)):
-            if not low - 1e-9 <= place <= high + 1e-9:
-                raise ValueError(f"{name} {place:g} is beyond the limits of its stage, {low:g} ... {high:g}")
-        if self.in_deg == self.out_deg:
-            raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}; flats would show the sample")
-        if self.speed_deg_s is not None and self.speed_deg_s > fastest * (1 + 1e-9):
-            raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
-        return self
-
-    def connect(self, clock: Clock, url: str | None = None) -> StageSampleMover:
-        """The mover, connected at its port or at `url`. Nothing moves.
-
-        Raises:
-            DeviceError: its stage does not answer, or does not fit.
-        """
-        speed = self.stage.settings.figures.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
-        places = MoverPlaces(math.radians(self.in_deg), math.radians(self.out_deg), speed)
-        try:
-            return StageSampleMover(self.stage.connect(clock, url), places, clock)
-        except DeviceError as cause:
-            raise cause.told_by("sample mover", cause.problem) from cause
 
 
 class _BeamMonitor(Section):
@@ -290,7 +239,7 @@ class RingCurrentConfig(_BeamMonitor):
     """The ring current from a page or a text file."""
 
     kind: Literal["ring_current"]
-    url: Annotated[str, _without(url_problem)]
+    url: Annotated[str, without(url_problem)]
     """http://..., https://... or file:///..."""
     pattern: Pattern
     """Regular expression whose first group is the number."""
@@ -309,8 +258,8 @@ class EpicsBeamConfig(_BeamMonitor):
 BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig | EpicsBeamConfig
 
 
-def _simulated(mover: Simple | StageMover) -> bool:
-    return mover.stage.simulated if isinstance(mover, StageMover) else mover.kind == "simulated"
+def _simulated(device: Simple | StageMover | FilterConfig) -> bool:
+    return device.stage.simulated if isinstance(device, StageMover | MotorFilter) else device.kind == "simulated"
 
 
 class DeviceSection(Section):
@@ -318,6 +267,7 @@ class DeviceSection(Section):
     camera: Annotated[CameraConfig, Field(discriminator="kind")]
     shutter: Annotated[Simple | StageOutputShutter | EpicsShutter, Field(discriminator="kind")]
     sample_mover: Annotated[Simple | StageMover, Field(discriminator="kind")]
+    filter: Annotated[FilterConfig, Field(discriminator="kind")] = NoFilter()
     beam_monitor: Annotated[BeamMonitorConfig, Field(discriminator="kind")] = NoBeamMonitor()
 
     @model_validator(mode="after")
@@ -348,12 +298,16 @@ class DeviceSection(Section):
 
     @model_validator(mode="after")
     def _port_is_free(self) -> Self:
-        mover = self.sample_mover
-        if isinstance(mover, StageMover) and not mover.stage.simulated and mover.stage.port == self.stage.port:
-            raise ValueError(
-                f"sample_mover.stage.port {mover.stage.port} is that of devices.stage, and a port is opened once; the "
-                "sample mover needs a controller, or a record, of its own"
-            )
+        taken = {self.stage.port: "devices.stage"}
+        for name, device in (("sample_mover", self.sample_mover), ("filter", self.filter)):
+            if not isinstance(device, StageMover | MotorFilter) or device.stage.simulated:
+                continue
+            if (port := device.stage.port) in taken:
+                raise ValueError(
+                    f"{name}.stage.port {port} is that of {taken[port]}, and a port is opened once; the "
+                    f"{name.replace('_', ' ')} needs a controller, or a record, of its own"
+                )
+            taken[port] = f"devices.{name}"
         return self
 
     def simulated_or_not(self) -> dict[str, bool]:
@@ -365,6 +319,8 @@ class DeviceSection(Section):
             "shutter": shutter == "simulated" or (shutter == "stage_output" and stage),
             "sample_mover": _simulated(self.sample_mover),
         }
+        if not isinstance(self.filter, NoFilter):
+            simulated["filter"] = _simulated(self.filter)
         if isinstance(self.beam_monitor, ElectrometerConfig):
             simulated["beam_monitor"] = self.beam_monitor.simulated
         return simulated

@@ -123,6 +123,7 @@ def plan_of(config: Config) -> ScanPlan:
         settle=scan.settle_s,
         warm_up=scan.warm_up_s,
         return_views=scan.return_views,
+        filter=scan.filter,
         darks=_field(scan.darks, scan.exposure_s),
         flats=_field(scan.flats, scan.exposure_s),
         scheme=scan.angles.scheme,

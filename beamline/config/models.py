@@ -114,6 +114,8 @@ class ScanSection(Section):
     """Wait after each move of a step scan."""
     warm_up_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Light on the scintillator before frames with light, each time the shutter opens; it glows brighter when warm."""
+    filter: str | None = None
+    """Name of one of the places of devices.filter, where it is before the first frame; null: as it stands."""
     return_views: Annotated[int, Field(ge=0, le=100)] = 0
     """Views that are taken a second time on the way back, evenly spread: they tell whether the sample has moved."""
     without_watchdog: Literal["warn", "pause"] = "warn"
@@ -215,6 +217,14 @@ class Config(Section):
             raise ValueError("simulated devices need a simulation section; `simulation: {}` takes its defaults")
         if self.simulation is not None and not any(simulated.values()):
             raise ValueError("the simulation section belongs to simulated devices and every device is real; remove it")
+        return self
+
+    @model_validator(mode="after")
+    def _filter_is_there(self) -> Self:
+        named, there = self.scan.filter, list(self.devices.filter.places)
+        if named is not None and named not in there:
+            legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has none"
+            raise ValueError(f"scan.filter {named!r} is no place of the filter; {legal}")
         return self
 
     @property

@@ -10,6 +10,7 @@ from typing import Any
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
 from beamline.config.load import Config
 from beamline.config.models import StorageSection
+from beamline.config.places import EpicsFilter, FilterConfig, MotorFilter
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.doctor import camera, disk
@@ -54,6 +55,7 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
     else:
         yield port("stage port", config.devices.stage.port, found)
         yield from _monitor(config.devices.beam_monitor, found, clock)
+        yield from _filter(config.devices.filter, found, clock)
     folder = Path((StorageSection() if config is None else config.storage).folder)
     yield disk.room(folder, need)
     yield disk.speed(folder, need, clock)
@@ -98,6 +100,26 @@ def _monitor(config: BeamMonitorConfig, found: Sequence[SerialPort], clock: Cloc
         return
     values = {"value": reading.value, "unit": reading.unit}
     yield Diagnosis(name, Grade.OK, f"{reading.value:.6g} {reading.unit}.", "a reading", values=values)
+
+
+def _filter(config: FilterConfig, found: Sequence[SerialPort], clock: Clock) -> Iterator[Diagnosis]:
+    """A filter that is not moved by hand: its port, or the place at which it stands."""
+    name, expected = "filter", f"one of its places: {', '.join(config.places)}"
+    if isinstance(config, MotorFilter):
+        yield port(f"{name} port", config.stage.port, found)
+    if not isinstance(config, EpicsFilter):
+        return
+    try:
+        with closing(config.connect(clock)) as connected:
+            place = connected.place()
+    except DeviceError as error:
+        yield of_error(name, error, expected)
+        return
+    if place is None:
+        advice = "Compare devices.filter.places with the values of status_pv; a scan that names its place moves it"
+        yield Diagnosis(name, Grade.WARNING, "It stands at none of its places.", expected, advice)
+    else:
+        yield Diagnosis(name, Grade.OK, f"{place}.", expected, values={"place": place})
 
 
 def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:

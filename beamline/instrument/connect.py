@@ -1,4 +1,4 @@
-"""Devices: the composition root, where a configuration becomes stage, camera, shutter, sample mover and beam monitor.
+"""Devices: the composition root, where a configuration becomes the devices of an instrument.
 
 Each is made by a module of its own; `simulated` makes them all where the instrument is simulated, and is the only one
 that names a simulator.
@@ -11,8 +11,9 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
-from beamline.config.devices import DcamOrca, EpicsShutter, NoBeamMonitor, SimulatedOrca, StageMover, StageOutputShutter
+from beamline.config.devices import DcamOrca, EpicsShutter, NoBeamMonitor, SimulatedOrca, StageOutputShutter
 from beamline.config.load import Config
+from beamline.config.places import EpicsFilter, MotorFilter, NoFilter, StageMover
 from beamline.core.errors import ConfigError
 from beamline.instrument.devices import make_beam_monitor, make_camera, wait_until_cold
 from beamline.instrument.operator import ask_operator
@@ -24,15 +25,16 @@ from drivers.base.protocols import (
     CameraSettings,
     CameraTiming,
     Devices,
+    Filter,
     RotationStage,
     Shutter,
     StageLimits,
     TriggerSource,
 )
-from drivers.epics.devices import PvShutter
+from drivers.epics.devices import PvFilter, PvShutter
 from drivers.frame_memory import FrameMemory
-from drivers.manual import Ask, ManualSampleMover, ManualShutter
-from drivers.sample import StageSampleMover
+from drivers.manual import Ask, ManualFilter, ManualSampleMover, ManualShutter
+from drivers.places import StageFilter, StageSampleMover
 from drivers.shutter import OutputShutter
 from drivers.stages.travel import Travel
 
@@ -50,7 +52,7 @@ class ConnectedDevices:
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None if none is configured.
         frame_memory: of the camera's frames; None for a simulated camera.
-        watch_sample: takes what is called again and again while a motor moves the sample; its exception stops it.
+        watch_moves: takes what is called again and again while sample or filter moves; its exception ends the move.
     """
 
     devices: Devices
@@ -59,7 +61,7 @@ class ConnectedDevices:
     close: Callable[[], None]
     beam_monitor: BeamMonitor | None = None
     frame_memory: FrameMemory | None = None
-    watch_sample: Callable[[Callable[[], None]], None] = lambda check: None
+    watch_moves: Callable[[Callable[[], None]], None] = lambda check: None
 
     @property
     def truth(self) -> Callable[[Grid], Volume] | None:
@@ -95,6 +97,7 @@ def connect(
                 mover = chosen.connect(clock)
                 opened.callback(mover.close)
                 devices = replace(devices, sample=mover)
+            devices = replace(devices, filter=_filter(config, clock, ask or ask_operator, opened))
         else:
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
@@ -102,7 +105,12 @@ def connect(
         if not isinstance(config.devices.beam_monitor, NoBeamMonitor):
             monitor = make_beam_monitor(config.devices.beam_monitor, clock)
             opened.callback(monitor.close)
-        watch = devices.sample.watch if isinstance(devices.sample, StageSampleMover) else lambda check: None
+
+        def watch(check: Callable[[], None]) -> None:
+            for device in (devices.sample, devices.filter):
+                if isinstance(device, StageSampleMover | StageFilter | PvFilter):
+                    device.watch(check)
+
         return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory, watch)
 
 
@@ -167,6 +175,17 @@ def _instrument(
     if isinstance(shutter, PvShutter):
         opened.callback(shutter.disconnect)
     return Devices(stage, camera, shutter, ManualSampleMover(ask))
+
+
+def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter | None:
+    wanted = config.devices.filter
+    if isinstance(wanted, NoFilter):
+        return None
+    if not isinstance(wanted, MotorFilter | EpicsFilter):
+        return ManualFilter(ask)
+    found = wanted.connect(clock)
+    opened.callback(found.close)
+    return found
 
 
 def shutter_of(config: Config, stage: RotationStage, clock: Clock, ask: Ask) -> Shutter:

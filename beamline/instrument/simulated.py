@@ -12,19 +12,23 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 from uuid import uuid4
 
-from beamline.config.devices import SimulatedOrca, StageMover, StageOutputShutter
+from beamline.config.devices import SimulatedOrca, StageOutputShutter
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
+from beamline.config.places import MotorFilter, NoFilter, StageMover
+from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
-from drivers.base.protocols import Devices, SampleMover, Shutter
+from drivers.base.protocols import Devices, Filter, SampleMover, Shutter
+from drivers.manual import ManualFilter
 from drivers.shutter import OutputShutter
 
 if TYPE_CHECKING:
     from recon.base.volume import Grid, Volume
     from simulators.devices.camera import SimulatedOrcaQuest
     from simulators.devices.shutter import BeamGate, SampleGate
+    from simulators.devices.trigger_line import TriggerLine
     from simulators.effects.anomaly import Label
     from simulators.scenes.scene import Scene
 
@@ -82,16 +86,30 @@ def simulated_devices(
     sample = inside = SimulatedSampleMover()
     if isinstance(mover := config.devices.sample_mover, StageMover):
         axis = TriggerLine(clock)
-        moved = WIRES[mover.stage.kind].matching(mover.stage.settings).controller(clock, axis)
-        sample = motor = mover.connect(clock, register(f"{mover.stage.kind}-{uuid4().hex}", moved))
+        sample = motor = mover.connect(clock, _wire(mover.stage, clock, axis))
         opened.callback(motor.close)
         inside = MovedSample(axis, math.radians(mover.in_deg))
+    changer: Filter | None = None
+    if isinstance(wheel := config.devices.filter, MotorFilter):
+        changer = turned = wheel.connect(clock, _wire(wheel.stage, clock, TriggerLine(clock)))
+        opened.callback(turned.close)
+    elif not isinstance(wheel, NoFilter):  # its light is that of the scene
+        changer = ManualFilter(lambda request: None)
     pitch = config.optics.pixel_size_um * 1e-3
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
     camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, pixel_pitch=pitch, model=model)
     opened.callback(camera.close)
     known = SimulatedScene(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
-    return Devices(stage, camera, shutter, sample), known
+    return Devices(stage, camera, shutter, sample, changer), known
+
+
+def _wire(stage: StageSection, clock: Clock, axis: TriggerLine) -> str:
+    """The port of a simulated controller that turns `axis`. Two in one process must not share one."""
+    from simulators.wires.registry import WIRES
+    from simulators.wires.serial_url import register
+
+    controller = WIRES[stage.kind].matching(stage.settings).controller(clock, axis)
+    return register(f"{stage.kind}-{uuid4().hex}", controller)
 
 
 def scene_of(config: Config) -> Scene:

@@ -40,10 +40,12 @@ def show(volumes: Sequence[Path], labels: Path | None) -> None:
         if found is not None:
             viewer.add_labels(found[0], name=str(labels), **found[1])
         if model := records[0].model:
-            size = 2 * np.asarray(model["widths"]).mean(axis=1)
+            place = _place(records[0])  # in voxels, for napari takes the points of a slice by whole numbers
+            centres = (np.asarray(model["centres"])[:, ::-1] - place["translate"]) / place["scale"]
+            size = 2 * np.asarray(model["widths"]).mean(axis=1) / records[0].volume.grid.voxel_size
             viewer.add_points(
-                np.asarray(model["centres"])[:, ::-1], size=size, name="Gaussians",
-                features={"density": np.asarray(model["densities"])}, units=_units(records[0]),
+                centres, size=size, name="Gaussians", features={"density": np.asarray(model["densities"])},
+                face_color="density", border_width=0, opacity=0.7, visible=False, **place,  # they would hide the volume
             )  # fmt: skip
         napari.run()
 

@@ -45,7 +45,9 @@ class VolumeSlices(Protocol):
 
 def slices_of(path: Path, values: Any, held: int) -> VolumeSlices:
     """Slices of the voxels in a file."""
-    return ScaledSlices(values) if isinstance(values, VolumeScale) else CopiedSlices(path, values, held)
+    if isinstance(values, VolumeScale) and 4 * math.prod((values, *values.coarser)[-1].shape) <= held:
+        return ScaledSlices(values)
+    return CopiedSlices(path, values, held)
 
 
 class ScaledSlices:
@@ -139,6 +141,7 @@ def _steps(finest: tuple[int, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _bytes_read(scale: VolumeScale, axis: int, first: list[int], end: list[int]) -> int:
-    """Of a box that is one voxel thick: chunks as a whole, but across z one plane of each."""
+    """Of a box that is one voxel thick: chunks as a whole, or across z one plane of each."""
     chunks = [-(-b // n) - a // n for a, b, n in zip(first, end, scale.chunk, strict=True)]
-    return math.prod(chunks) * scale.dtype.itemsize * math.prod(scale.chunk) // (1 if axis else scale.chunk[0])
+    planes = 1 if axis or scale.whole_chunks else scale.chunk[0]
+    return math.prod(chunks) * scale.dtype.itemsize * math.prod(scale.chunk) // planes

@@ -53,6 +53,7 @@ class ScanPlan:
         end_references: kinds of references that are still to be taken after the views, where all else is stored. None:
             all that are planned, before and after the views.
         return_views: views that are taken a second time on the way back, evenly spread; alignment frames.
+        filter: the place of the filter for all frames; None: as it stands.
     """
 
     angles: NDArray[np.float64]
@@ -68,6 +69,7 @@ class ScanPlan:
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0
     return_views: int = 0
+    filter: str | None = None
 
     @property
     def retakes(self) -> int:
@@ -129,7 +131,7 @@ class Timeline:
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
         retake_seconds: for the most views that may be taken again.
-        warm_up: as of the plan.
+        warm_up, filter: as of the plan.
     """
 
     blocks: tuple[Block, ...]
@@ -144,6 +146,7 @@ class Timeline:
     remarks: tuple[str, ...]
     retake_seconds: float = 0.0
     warm_up: float = 0.0
+    filter: str | None = None
 
     @property
     def n_frames(self) -> int:

@@ -94,6 +94,7 @@ def work_out(
         remarks=tuple(remarks(facts)),
         retake_seconds=retake_seconds,
         warm_up=plan.warm_up,
+        filter=plan.filter,
     )
 
 

@@ -29,14 +29,14 @@ _VOLUME_PATHS = ("entry/data/data", "volume", "data")
 
 def read_truth(spec: str) -> NDArray[np.float32]:
     """The volume [z, y, x] that `spec` names: FILE or FILE:first:end (slices), where FILE is any volume file
-    (.npz, .npy, HDF5, TIFF, NIfTI).
+    (.npz, .npy, HDF5, TIFF, NIfTI, Zarr).
 
     Raises:
         ConfigError: no such file, or slices outside it.
         DataError: the file holds no volume.
     """
     match = re.fullmatch(r"(?P<path>.+?)(:(?P<first>\d*):(?P<end>\d*))?", spec)
-    if match is None or not Path(match["path"]).is_file():
+    if match is None or not Path(match["path"]).exists():
         raise ConfigError(f"--truth {spec}: there is no such file. Expected FILE or FILE:first:end.")
     path = Path(match["path"])
     try:
@@ -51,7 +51,7 @@ def read_truth(spec: str) -> NDArray[np.float32]:
 
 def _volume_in(path: Path) -> str | None:
     """Where an HDF5 file has its volume; None for other files. Raises DataError: no volume at a known place."""
-    if not h5py.is_hdf5(path):
+    if not (path.is_file() and h5py.is_hdf5(path)):
         return None
     with hdf5.open_hdf5(path) as file:
         found = next((p for p in _VOLUME_PATHS if getattr(file.get(p), "ndim", 0) == 3), None)

@@ -116,6 +116,10 @@ class Acquisition:
         self._raise_outcome()
 
     def _blocks(self) -> Iterator[Frame]:
+        place, filter_ = self._timeline.filter, self._devices.filter
+        if filter_ is not None and place is not None and not self._stop.stopping:
+            self._sink(StateEntered(self._supervision.states.state, f"The filter goes to {place}"))
+            filter_.put(place)
         for block in self._timeline.blocks:
             if self._stop.aborting:
                 raise ScanAborted(f"Aborted: {self._stop.reason}.")

@@ -187,12 +187,6 @@ def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: Sca
 
 
 def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
-    optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
-    pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
-    if instrument.simulated is not None and instrument.simulated.cone is not None:
-        # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
-        source_distance, sdd = instrument.simulated.cone
-        pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     asked = {
         "scheme": plan.scheme,
         "mode": plan.mode,
@@ -205,6 +199,18 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},
         "angles_deg": np.degrees(plan.angles).tolist(),
     }
+    known = scan_info(config, instrument)
+    return replace(known, exposure=plan.exposure, period=timeline.views.period, plan=json.dumps(asked))
+
+
+def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
+    """Facts for the file that need no plan. DeviceError: a device does not answer."""
+    optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
+    pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
+    if instrument.simulated is not None and instrument.simulated.cone is not None:
+        # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
+        source_distance, sdd = instrument.simulated.cone
+        pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
     return ScanInfo(
         sample=config.sample.name,
         title=config.sample.description,
@@ -212,11 +218,9 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         energy_kev=optics.energy_kev,
         distance_mm=distance,
         source_distance_mm=source_distance,
-        exposure=plan.exposure,
-        period=timeline.views.period,
         axis_col=optics.axis_col,
-        plan=json.dumps(asked),
         config=resolved_yaml(config),
         devices={device.name: device.describe() for device in (devices.stage, devices.camera)},
+        filter=config.scan.filter or (devices.filter.place() if devices.filter is not None else None),
         beam_unit=None if isinstance(monitor, NoBeamMonitor) else monitor.unit,
     )

@@ -140,7 +140,7 @@ def run_scan(
         instrument = instrument or connected.enter_context(
             connect(config, clock=clock, ask=ask, check_stop=lambda: _refuse_stop(stop))
         )
-        instrument.watch_sample(stop.refuse_abort)
+        instrument.watch_moves(stop.refuse_abort)
         ready = preflight(config, instrument, place, series.remaining if series else all_of)
         _refuse_stop(stop)
         folder = series.begin(ready) if series else create_run_folder(place, config.sample.name, SystemClock().now())

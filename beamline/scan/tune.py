@@ -132,8 +132,9 @@ def take(
     """Frames of these blocks, which are kept in memory, and what the camera was set to. Errors are those of `tune`."""
     plan, camera = plan_of(config), instrument.devices.camera
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
-    worked = Timeline(tuple(blocks), 0.0, 2 * math.prod(camera.timing.shape), 0, 0, 0.0, 0.0, 0.0, (), ())
-    instrument.watch_sample(stop.refuse_abort)
+    frame_bytes = 2 * math.prod(camera.timing.shape)
+    worked = Timeline(tuple(blocks), 0.0, frame_bytes, 0, 0, 0.0, 0.0, 0.0, (), (), filter=plan.filter)
+    instrument.watch_moves(stop.refuse_abort)
     acquisition = Acquisition(instrument.devices, worked, settings, plan.settle, instrument.clock, stop, sink)
     try:
         return list(acquisition.frames()), settings

@@ -18,13 +18,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from io import BytesIO, RawIOBase
 from pathlib import Path
 
 import psutil
 
-from beamline.config.devices import EpicsShutter, Simple, StageMover
+from beamline.config.devices import EpicsShutter, Simple
 from beamline.config.load import Config, load
+from beamline.config.places import MotorFilter, StageMover
 from beamline.core.events import Sink, Warned
 from beamline.core.process import ChildProcess
 from beamline.core.stop import PauseRequest, StopRequest
@@ -138,7 +140,7 @@ class _Keeper:
 def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     """Stop the stage, then disarm its trigger output and close the shutter; True: all obeyed. `say`: takes a sentence
     on each step."""
-    stage, shutter, mover = config.devices.stage, config.devices.shutter, config.devices.sample_mover
+    stage, shutter = config.devices.stage, config.devices.shutter
     apart = shutter if isinstance(shutter, EpicsShutter) else None
     closed = "the shutter is moved by hand"
     if not isinstance(shutter, Simple):
@@ -153,8 +155,10 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     done = [_insist(lambda: stage.halt(clock), clock, say, "The stage was told to stop.")]
     if apart:
         done.append(_insist(lambda: PvShutter(apart.pvs, clock).close(), clock, say, "The shutter is closed."))
-    if isinstance(mover, StageMover):
-        done.append(_insist(lambda: mover.stage.halt(clock), clock, say, "The sample mover was told to stop."))
+    for name, device in (("sample mover", config.devices.sample_mover), ("filter", config.devices.filter)):
+        if isinstance(device, StageMover | MotorFilter):
+            halt = partial(device.stage.halt, clock)
+            done.append(_insist(halt, clock, say, f"The {name} was told to stop."))
     done.append(_insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}."))
     return all(done)
 

@@ -1,4 +1,4 @@
-"""Volume file: a volume [z, y, x] read from TIFF, NumPy, NIfTI or HDF5."""
+"""Volume file: a volume [z, y, x] read from TIFF, NumPy, NIfTI, HDF5 or Zarr."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.machine import free_memory
 from beamline.storage import hdf5
+from beamline.storage.foreign_zarr import is_zarr, open_zarr
 
 PACKED = 1e5
 """No TIFF holds so many times its own size: zeros come to 1000 times with deflate, and 20 000 with Zstandard."""
@@ -27,15 +28,19 @@ SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", 
 def read_volume(
     path: Path, dataset: str | None = None
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    """The volume, and mm from voxel to voxel along its axes where the file says (NIfTI; an .npz by its `voxel_mm`).
+    """The volume, and mm from voxel to voxel along its axes where NIfTI, OME-Zarr or `voxel_mm` of an .npz say it.
 
     Args:
-        dataset: path in an HDF5 file or name in an .npz; None: the only array of three axes.
+        dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array of three axes.
 
     Raises:
         DataError: no file of these kinds, not readable, too large for the memory, or no such array in it.
     """
     name = path.name.lower()
+    if is_zarr(path):
+        scale, spacing = open_zarr(path, dataset)
+        _check_size(path, math.prod(scale.shape) * scale.dtype.itemsize)
+        return scale[:], spacing
     if not path.is_file():
         raise DataError(f"There is no volume {path}.")
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):

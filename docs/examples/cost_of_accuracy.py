@@ -32,7 +32,7 @@ for (name, method), axis in zip(methods.items(), axes[1:], strict=True):
             axis.imshow(result.volume.data[2], cmap="gray", vmin=0, vmax=truth.max())
             axis.set(title=f"{name}, 30 views", xticks=(), yticks=())
     axes[0].plot(views, quality, "o-", label=name)
-axes[0].set(xlabel="views", ylabel="PSNR (dB)", xscale="log", xticks=views, xticklabels=views)
+axes[0].set(title="PSNR (dB)", xlabel="views", xscale="log", xticks=views, xticklabels=views)
 axes[0].minorticks_off()
 axes[0].legend()
 drawn.savefig("cost_of_accuracy.png", dpi=80)

@@ -1,4 +1,4 @@
-"""Device Protocols: the interfaces of stage, camera, shutter, sample mover and beam monitor, in rad and s."""
+"""Device Protocols: the interfaces of stage, camera, shutter, sample mover, filter and beam monitor, in rad and s."""
 
 from __future__ import annotations
 
@@ -223,6 +223,18 @@ class SampleMover(Protocol):
     def back(self) -> None: ...
 
 
+class Filter(Protocol):
+    """A filter (attenuator) in the beam, at one of some named places; one of them may be an empty one."""
+
+    name: str
+
+    def put(self, place: str) -> None:
+        """Bring it there, and return when it is. Raises DeviceError: it did not arrive."""
+
+    def place(self) -> str | None:
+        """Where it stands; None: at none of its places, or not known. Raises DeviceError."""
+
+
 @dataclass(frozen=True)
 class BeamReading:
     """A beam monitor's reading: a value in `unit` (A of an ion chamber, mA of the ring), at a time in s since 1970."""
@@ -251,3 +263,4 @@ class Devices:
     camera: Camera
     shutter: Shutter
     sample: SampleMover
+    filter: Filter | None = None

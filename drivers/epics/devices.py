@@ -1,14 +1,14 @@
-"""Shutter and beam monitor behind process variables."""
+"""Shutter, filter and beam monitor behind process variables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
-from drivers.epics.channel import ProcessVariable, open_channel, refuse_invalid
+from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid
 
 POLL = 0.05  # s between looks at a shutter that moves
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
@@ -50,15 +50,12 @@ class PvShutter:
         self.name = name
         self._pvs, self._clock = pvs, clock
         with ExitStack() as opened:
-
-            def channel(url: str) -> ProcessVariable:
-                found = open_channel(url, name, pvs.timeout)
-                opened.callback(found.close)
-                return found
-
-            self._opener, self._closer, self._status = map(channel, (pvs.open_pv, pvs.close_pv, pvs.status_pv))
+            self._opener, self._closer, self._status = (
+                _channel(url, name, pvs.timeout, opened) for url in (pvs.open_pv, pvs.close_pv, pvs.status_pv)
+            )
             _ = self.is_open()
-            self._disconnect: Callable[[], None] = opened.pop_all().close
+            self.disconnect: Callable[[], None] = opened.pop_all().close
+            """The shutter stays as it is."""
 
     def open(self) -> None:
         if not self.is_open():
@@ -73,20 +70,14 @@ class PvShutter:
         refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
         return status.is_one(self._pvs.status_open)
 
-    def disconnect(self) -> None:
-        """The shutter stays as it is."""
-        self._disconnect()
-
     def _put(self, channel: ProcessVariable, value: float | str, wanted: bool) -> None:
         request = f"{channel.name} = {value}"
         try:
             channel.write("", value)
-            deadline = self._clock.now() + self._pvs.travel
-            while (late := self.is_open() is not wanted) and self._clock.now() < deadline:
-                self._clock.sleep(POLL)
+            arrived = _waited(lambda: self.is_open() is wanted, self._pvs.travel, self._clock)
         except DeviceError as cause:
             raise cause.told_by(self.name, cause.problem, request=request, state=NOT_KNOWN) from cause
-        if late:
+        if not arrived:
             (status,) = self._status.read("")
             raise DeviceTimeout(
                 self.name,
@@ -97,6 +88,86 @@ class PvShutter:
                 advice="Check its permit, its interlock and the ring, and that this computer may write to it",
                 state=NOT_KNOWN,
             )
+
+
+@dataclass(frozen=True)
+class FilterPvs:
+    """The process variables of a filter, as pva://NAME or ca://NAME.
+
+    Attributes:
+        pv: takes the value of a place.
+        status_pv: where the filter itself is read, with the same values: numbers, texts or labels.
+        places: name -> value.
+        timeout: s, for each answer.
+        travel: s that the status may take to follow.
+    """
+
+    pv: str
+    status_pv: str
+    places: Mapping[str, float | str]
+    timeout: float = 2.0
+    travel: float = 30.0
+
+
+class PvFilter:
+    """Implements `drivers.base.protocols.Filter`. A move ends when the status says so.
+
+    Raises:
+        DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.
+    """
+
+    def __init__(self, pvs: FilterPvs, clock: Clock, name: str = "filter") -> None:
+        self.name = name
+        self._pvs, self._clock = pvs, clock
+        self._check: Callable[[], None] = lambda: None
+        with ExitStack() as opened:
+            self._setter, self._status = (_channel(url, name, pvs.timeout, opened) for url in (pvs.pv, pvs.status_pv))
+            _ = self.place()
+            self.close: Callable[[], None] = opened.pop_all().close
+            """The filter stays where it is."""
+
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again on the way; its exception ends the wait, not the move."""
+        self._check = check
+
+    def place(self) -> str | None:
+        status = self._said()
+        return next((name for name, value in self._pvs.places.items() if status.is_one(value)), None)
+
+    def put(self, place: str) -> None:
+        value = self._pvs.places[place]
+        if self.place() == place:
+            return
+        self._setter.write("", value)
+        if not _waited(lambda: self.place() == place, self._pvs.travel, self._clock, self._check):
+            raise DeviceTimeout(
+                self.name,
+                f"it did not come to {place} within {self._pvs.travel:g} s",
+                request=f"{self._setter.name} = {value}",
+                reply=f"{self._status.name} is {self._said()}",
+                expected=f"{value}",
+                advice="Look where it is, and whether this computer may write to it",
+            )
+
+    def _said(self) -> PvValue:
+        (status,) = self._status.read("")
+        refuse_invalid(self.name, self._status.name, status)
+        return status
+
+
+def _channel(url: str, device: str, timeout: float, opened: ExitStack) -> ProcessVariable:
+    found = open_channel(url, device, timeout)
+    opened.callback(found.close)
+    return found
+
+
+def _waited(arrived: Callable[[], bool], travel: float, clock: Clock, check: Callable[[], None] = lambda: None) -> bool:
+    """Wait at most `travel` s; whether it has arrived."""
+    deadline = clock.now() + travel
+    while not (there := arrived()) and clock.now() < deadline:
+        check()
+        clock.sleep(POLL)
+    return there
 
 
 class PvSource:

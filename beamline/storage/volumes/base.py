@@ -106,7 +106,12 @@ class VolumeFormat(Protocol):
 
 @runtime_checkable
 class VolumeScale(Protocol):
-    """A volume in chunks, read box by box; `coarser`: the same with fewer voxels."""
+    """A volume in chunks, read box by box.
+
+    Attributes:
+        coarser: the same with fewer voxels.
+        whole_chunks: a part of a chunk costs as much as all of it.
+    """
 
     @property
     def shape(self) -> tuple[int, int, int]: ...
@@ -116,6 +121,8 @@ class VolumeScale(Protocol):
     def dtype(self) -> np.dtype[Any]: ...
     @property
     def coarser(self) -> tuple[VolumeScale, ...]: ...
+    @property
+    def whole_chunks(self) -> bool: ...
     def box(self, first: tuple[int, int, int], end: tuple[int, int, int]) -> NDArray[Any]: ...
 
 

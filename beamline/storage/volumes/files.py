@@ -9,6 +9,7 @@ from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, whole_file
+from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import SUFFIXES, read_volume
@@ -96,11 +97,9 @@ def opened_volume(path: Path, dataset: str | None = None) -> Iterator[ReconRecor
         with kind.open(path) as record:
             yield record
         return
-    if (path / "zarr.json").is_file() or (path / ".zgroup").is_file() or (path / ".zarray").is_file():
-        raise DataError(
-            f"{path} is a Zarr of another program. OME-Zarr is read where `beamline export` wrote it (version 0.5, "
-            "without compression). Copy this one to a TIFF first, in napari, say."
-        )
+    if is_zarr(path):
+        yield bare_record(path, *open_zarr(path, dataset))
+        return
     if path.is_dir():
         raise DataError(f"{path} is a folder, and not one of slices that this program wrote; expected {SUFFIXES}.")
     values, spacing = read_volume(path, dataset)

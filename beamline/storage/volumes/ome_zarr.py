@@ -129,6 +129,7 @@ class _Chunks:
     chunk: tuple[int, int, int]
     dtype: np.dtype[Any]
     coarser: tuple[_Chunks, ...] = ()
+    whole_chunks = False
 
     def __getitem__(self, part: slice) -> NDArray[Any]:
         first, end, step = part.indices(self.shape[0])

@@ -4,6 +4,7 @@
       instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
                                 count_time (s), x_pixel_size, y_pixel_size, distance (mm), field_of_view
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
+      instrument/filter         NXattenuator: type, where there is a filter
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
       frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
@@ -130,6 +131,7 @@ class ScanInfo:
             detector, as NXtomo has it).
         plan: JSON; config: YAML; both as text for the record.
         devices: the description of each device, by its name.
+        filter: its place, by name.
         beam_unit: of the beam monitor's readings; None: there is none.
     """
 
@@ -146,6 +148,7 @@ class ScanInfo:
     config: str = ""
     devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
     beam_unit: str | None = None
+    filter: str | None = None
 
 
 def iso_time(seconds: float) -> str:
@@ -216,6 +219,9 @@ def create(
         ("program", f"splatline {version()}"),
     ):
         file[f"/entry/record/{name}"] = text
+    if info.filter is not None:
+        file.create_group("/entry/instrument/filter").attrs["NX_class"] = "NXattenuator"
+        file["/entry/instrument/filter/type"] = info.filter
     for device, description in info.devices.items():
         group = file.create_group(f"/entry/instrument/devices/{device.replace('/', '_')}")
         group.attrs["NX_class"] = "NXcollection"

@@ -9,7 +9,6 @@ import time
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import h5py
 import numpy as np
@@ -18,37 +17,14 @@ import pytest
 from beamline.config.load import Config
 from tests.beamline import ran
 from tests.beamline.ball_scan import small
+from tests.beamline.bluesky.heard import Heard
 from tests.beamline.bluesky.short_scan import PATHS, SHORT
 from tests.beamline.fakes import FakeInstrument, Faults
 
-event_model = pytest.importorskip("event_model")
 pytestmark = pytest.mark.skipif(find_spec("ophyd_async") is None, reason="could not find 'ophyd_async'")
 
 FLUSH = "storage.flush_every=4"
 N = 2 + 3 + 40 + 3
-
-
-class Heard:
-    """Documents, each validated by event-model as it comes."""
-
-    def __init__(self) -> None:
-        self.all: list[tuple[str, dict[str, Any]]] = []
-
-    def __call__(self, name: str, document: dict[str, Any]) -> None:
-        event_model.schema_validators[event_model.DocumentNames[name]].validate(document)
-        self.all.append((name, document))
-
-    def of(self, name: str) -> list[dict[str, Any]]:
-        return [document for found, document in self.all if found == name]
-
-    def read(self, key: str) -> np.ndarray:
-        """The data of a key as a client reads it: by resource and datums alone."""
-        (resource,) = [document for document in self.of("stream_resource") if document["data_key"] == key]
-        mine = [datum for datum in self.of("stream_datum") if datum["stream_resource"] == resource["uid"]]
-        path = unquote(urlsplit(resource["uri"]).path)
-        with h5py.File(path, "r", swmr=resource["parameters"]["swmr"]) as file:
-            dataset = file[resource["parameters"]["dataset"]]
-            return np.concatenate([dataset[d["indices"]["start"] : d["indices"]["stop"]] for d in mine])
 
 
 def _small(*more: str) -> Config:

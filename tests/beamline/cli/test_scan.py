@@ -107,9 +107,11 @@ def test_4_with_documents_a_scan_that_is_stopped_says_so(tmp_path: Path, monkeyp
     assert "Stopped after" in stop["doc"]["reason"]
 
 
-def test_2_documents_go_to_a_file(tmp_path: Path) -> None:
-    result = scan("-o", str(tmp_path / "runs"), "--documents", "tcp://localhost:5577")
-    assert (result.exit_code, "--documents takes a file" in result.stderr) == (2, True)
+@pytest.mark.parametrize("address", ["http://localhost:5577", "tcp://localhost", "tcp://localhost:port"])
+def test_2_documents_go_to_a_file_or_a_proxy(tmp_path: Path, address: str) -> None:
+    pytest.importorskip("zmq")
+    result = scan("-o", str(tmp_path / "runs"), "--documents", address)
+    assert (result.exit_code, "expected tcp://HOST:PORT" in result.stderr) == (2, True)
     assert not (tmp_path / "runs").exists()
 
 

@@ -52,7 +52,7 @@ def test_every_alternative_in_a_template_is_one(name: str) -> None:
     """The commented devices, put in the place of the ones that stand there."""
     text = (config.config_folder() / f"{name}.yaml").read_text("utf-8")
     joined = re.sub(r",\n  #  +", ", ", text)
-    kind = r"^  # (stage|shutter|sample_mover|beam_monitor): (\{.*?\})(?=\s|$)"
+    kind = r"^  # (stage|shutter|sample_mover|filter|beam_monitor): (\{.*?\})(?=\s|$)"
     offered = re.findall(kind, joined, re.MULTILINE)
     kinds = set()
     for key, flow in offered:
@@ -70,7 +70,7 @@ def test_every_alternative_in_a_template_is_one(name: str) -> None:
         assert getattr(loaded.devices, key).kind == mine["kind"]
         kinds.add(mine["kind"])
     assert kinds == {"pi_gcs", "zaber", "epics", "stage_output", "electrometer", "stage"} | (
-        {"ring_current"} if name == "instrument" else set()
+        {"ring_current", "manual"} if name == "instrument" else {"simulated"}
     )
 
 
@@ -80,7 +80,7 @@ def test_the_devices_of_the_page_on_epics_are_ones() -> None:
     tree = yaml.safe_load((config.config_folder() / "instrument.yaml").read_text("utf-8"))
     tree["devices"] |= yaml.safe_load(block)["devices"]
     loaded = Config.model_validate(tree).devices
-    assert {loaded.stage.kind, loaded.shutter.kind, loaded.beam_monitor.kind} == {"epics"}
+    assert {loaded.stage.kind, loaded.shutter.kind, loaded.filter.kind, loaded.beam_monitor.kind} == {"epics"}
     assert loaded.sample_mover.kind == "stage"
 
 

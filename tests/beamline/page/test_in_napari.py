@@ -80,8 +80,8 @@ def test_gaussians_are_points_in_the_same_place(tmp_path: Path, layers: dict[str
     write_volume(tmp_path / "v.h5", replace(record, model=model))
     show([tmp_path / "v.h5"], None)
     values, said = layers["Gaussians"]
-    assert values == [2.0]  # y, the second of z, y, x
-    np.testing.assert_allclose(said["size"], [0.4])
+    np.testing.assert_allclose(values * said["scale"][1] + said["translate"][1], [2.0])  # y, the second of z, y, x
+    np.testing.assert_allclose(said["size"] * said["scale"][2], [0.4])
 
 
 def test_without_napari_a_line_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -226,10 +226,10 @@ def test_the_system_is_asked_not_to_shut_down_where_it_can_be(tmp_path: Path, mo
 
 
 class _Behind:
-    """A soft IOC: a motor record, the variables of a shutter, whose blade follows, and the stop of another motor."""
+    """A soft IOC: a motor record, a shutter whose blade follows, and the stops of two other motors."""
 
     def __init__(self, record: MotorRecord, lost: bool) -> None:
-        self._record, self.values = record, {"open": 0.0, "close": 0.0, "blade": 1.0, "M.STOP": 0.0}
+        self._record, self.values = record, {"open": 0.0, "close": 0.0, "blade": 1.0, "M.STOP": 0.0, "F.STOP": 0.0}
         if lost:
             del self.values["blade"]
 
@@ -243,7 +243,7 @@ class _Behind:
     def write(self, suffix: str, value: float | str) -> None:
         if suffix not in self.values:
             self._record.write(suffix, value)
-        elif suffix == "M.STOP":
+        elif suffix.endswith(".STOP"):
             self.values[suffix] = float(value)
         else:
             self.values["blade"] = float(suffix == "open")
@@ -260,6 +260,7 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         f"devices.shutter={{kind: epics, open_pv: 'pva://{PREFIX}open', close_pv: 'pva://{PREFIX}close', "
         f"status_pv: 'pva://{PREFIX}blade', timeout_s: 0.5}}",
         f"devices.sample_mover={{kind: stage, in_deg: 0, out_deg: 10, stage: {{kind: epics, {motor}M'}}}}",
+        f"devices.filter={{kind: stage, places: {{none: 0}}, stage: {{kind: epics, {motor}F'}}}}",
         "scan.mode=step",
     ]
     config = load(config_folder() / "instrument.yaml", words, {})
@@ -275,8 +276,9 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         assert not stage.moving()
         assert stage.position() < 2.9  # it was on its way to 3
         stage.close()
-    assert (served.values.get("blade", 0.0), served.values["M.STOP"]) == (0.0, 1.0)
-    stopped, shutter, mover, disarmed = said
+    assert (served.values.get("blade", 0.0), served.values["M.STOP"], served.values["F.STOP"]) == (0.0, 1.0, 1.0)
+    stopped, shutter, mover, changer, disarmed = said
+    assert changer == "The filter was told to stop."
     assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")
     assert (shutter == "The shutter is closed.") is not lost
     assert ("LOOK AT THE INSTRUMENT" in shutter) is lost

@@ -13,7 +13,7 @@ import pytest
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, open_channel
-from drivers.epics.devices import PvShutter, PvSource, ShutterPvs
+from drivers.epics.devices import FilterPvs, PvFilter, PvShutter, PvSource, ShutterPvs
 from drivers.stages.epics.settings import EpicsSettings
 from drivers.stages.epics.stage import EpicsStage
 from tests.drivers.soft_ioc import PREFIX
@@ -61,6 +61,15 @@ def test_a_shutter_by_labels(ioc: ProcessVariable) -> None:
     shutter.close()
     assert not shutter.is_open()
     shutter.disconnect()
+
+
+def test_a_filter_by_labels(ioc: ProcessVariable) -> None:
+    url = f"{URL}blade"
+    changer = PvFilter(FilterPvs(url, url, {"none": "Open", "Al 1 mm": "Closed"}, timeout=30.0), SystemClock())
+    for place, label in (("Al 1 mm", "Closed"), ("none", "Open")):
+        changer.put(place)
+        assert changer.place() == place and ioc.read("blade")[0].label == label
+    changer.close()
 
 
 def test_a_motor_record_moves_until_its_ioc_dies(ioc: ProcessVariable) -> None:

@@ -1,0 +1,223 @@
+"""The camera as a detector of ophyd-async (StandardDetector), for `count`, step scans and fly scans of other plans.
+
+Its frames go into an NXtomo file of ours, one from stage to unstage. A frame that the detector triggers itself has the
+angle at which the stage stands. One by a pulse on a cable has none (NaN): only a whole scan of ours (`TomoScan`) knows
+which pulse exposed which frame.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+from ophyd_async.core import (
+    DetectorAcquireLogic,
+    DetectorDataLogic,
+    DetectorTriggerLogic,
+    StandardDetector,
+    StreamResourceDataProvider,
+    StreamResourceInfo,
+    StrictEnum,
+    soft_signal_r_and_setter,
+    soft_signal_rw,
+)
+
+from beamline.bluesky.documents import COLUMNS, file_url
+from beamline.config.load import Config
+from beamline.core.errors import InstrumentError
+from beamline.instrument.connect import ConnectedDevices, camera_settings
+from beamline.monitor.digest import digest
+from beamline.scan.preflight import scan_info
+from beamline.scan.run_folder import SCAN, create_run_folder
+from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.base.errors import DeviceTimeout
+from drivers.base.frame import Frame, FrameKind
+from drivers.base.protocols import CameraSettings, TriggerSource
+
+PATIENCE = 5.0
+"""s beyond the exposure after which a frame that the detector triggered is lost."""
+SLICE = 0.2  # s between looks at a request to stop
+
+
+class ShownFrames(StrictEnum):
+    """What frames show. Shutter and sample are brought where they need them."""
+
+    PROJECTION = "projection"
+    FLAT = "flat"
+    DARK = "dark"
+
+
+class _Frames(DetectorAcquireLogic):
+    """Frames from stage to unstage: set, armed, taken and written in a thread. `n`, `settings`: of the next ones."""
+
+    def __init__(self, config: Config, instrument: ConnectedDevices, runs: Path | None) -> None:
+        self._config, self._instrument = config, instrument
+        self._devices, self._clock = instrument.devices, instrument.clock
+        self._runs, self._stop, self._ending = runs or Path(config.storage.folder), Event(), asyncio.Lock()
+        self._writer: NXtomoWriter | None = None
+        self._task: asyncio.Task[None] | None = None
+        self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
+        self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
+
+    async def prepare(self, trigger: TriggerSource, n: int, exposure: float, apart: float = 0.0) -> None:
+        """Set the camera. `apart`: s between exposures. DeviceRefused: it does not take it."""
+        if n < 1:
+            raise ValueError(f"the camera is prepared for {n} frames; expected 1 or more")
+        wanted = camera_settings(self._config, exposure or self._config.scan.exposure_s, trigger)
+        self.settings = await asyncio.to_thread(self._devices.camera.configure, wanted)
+        self.n, self._apart = n, apart
+
+    async def new_file(self) -> tuple[Path, tuple[int, int]]:
+        """In a run folder of its own, and the shape of its frames."""
+        await self.ensure_stopped()
+        config, camera = self._config, self._devices.camera
+        folder = create_run_folder(self._runs, config.sample.name, self._clock.now())
+        info, bin_, shape = scan_info(config, self._instrument), config.storage.preview_bin, camera.timing.shape
+        info = replace(info, beam_unit=None)  # nobody reads the beam monitor meanwhile
+        self._writer = NXtomoWriter(folder / SCAN, info, shape, clock=self._clock, preview_bin=bin_)
+        self._set_rows(0)
+        return self._writer.path, shape
+
+    async def start_acquiring(self) -> None:
+        """Bring shutter and sample to their places, arm, and take frames in the background."""
+        kind, loop = FrameKind[(await self.kind.get_value()).name], asyncio.get_running_loop()
+        self._stop.clear()
+        await asyncio.to_thread(self._arm, kind)
+        self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
+
+    async def wait_for_idle(self) -> None:
+        """Until the last frame. Raises what ended them early."""
+        if self._task is not None:
+            await self._task
+
+    async def refuse_failure(self) -> None:
+        """Raise what ended the frames early, if anything did."""
+        if self._task is not None and self._task.done():
+            await self._task
+
+    async def ensure_stopped(self) -> None:
+        """Stop, disarm, close shutter and file, with the sample back. Twice is once."""
+        async with self._ending:
+            self._stop.set()
+            if self._task is not None:
+                await asyncio.wait([self._task])
+            await asyncio.to_thread(self._close, failed=bool(self._task and self._task.exception()))
+            self._task = None
+
+    def _close(self, failed: bool) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            try:
+                self._devices.shutter.close()
+                self._devices.sample.back()
+            finally:
+                writer.close("failed" if failed else "complete")
+
+    def _arm(self, kind: FrameKind) -> None:
+        devices = self._devices
+        if kind is FrameKind.DARK:
+            devices.shutter.close()
+        else:
+            devices.sample.out() if kind is FrameKind.FLAT else devices.sample.back()
+            devices.shutter.open()
+        devices.camera.arm(self.n)
+
+    def _take(self, kind: FrameKind, loop: asyncio.AbstractEventLoop) -> None:
+        devices, camera, writer = self._devices, self._devices.camera, self._writer
+        assert writer is not None
+        itself, exposure = self.settings.trigger is TriggerSource.SOFTWARE, self.settings.exposure
+        period, triggered = max(camera.timing.min_period, exposure + self._apart), -math.inf
+        try:
+            for i in range(self.n):
+                angle = math.nan
+                if itself:
+                    angle = math.nan if devices.stage.moving() else devices.stage.position()
+                    self._clock.sleep(triggered + period - self._clock.now())
+                    camera.software_trigger()
+                    triggered = self._clock.now()
+                while (found := self._next(itself)) is None:
+                    if self._stop.is_set():
+                        return
+                if found.framestamp != i:
+                    raise InstrumentError(
+                        f"{camera.name}: frame {found.framestamp} came, and {i} was expected: frames are lost. Take "
+                        "them again with more time between them. What was taken before is in the file."
+                    )
+                row = writer.rows
+                frame = Frame(np.array(found.counts), kind, row, row, i, angle, found.time, exposure)
+                writer.append(frame, digest(frame.counts, 2**camera.timing.bits - 1, self._config.storage.preview_bin))
+                loop.call_soon_threadsafe(self._set_rows, writer.committed)
+        finally:
+            camera.disarm()
+
+    def _next(self, itself: bool) -> Any:
+        """The next frame; None after a while without one, where pulses come from elsewhere."""
+        try:
+            return self._devices.camera.next_frame(self.settings.exposure + PATIENCE if itself else SLICE)
+        except DeviceTimeout:
+            if itself:
+                raise
+            return None
+
+
+class _Trigger(DetectorTriggerLogic):
+    def __init__(self, frames: _Frames, instrument: ConnectedDevices) -> None:
+        self._frames, self._camera = frames, instrument.devices.camera
+
+    def get_deadtime(self, config_values: Any) -> float:
+        return max(0.0, self._camera.timing.min_period - self._frames.settings.exposure)
+
+    async def prepare_internal(self, num: int, livetime: float, deadtime: float) -> None:
+        await self._frames.prepare(TriggerSource.SOFTWARE, num, livetime, deadtime)
+
+    async def prepare_edge(self, num: int, livetime: float) -> None:
+        await self._frames.prepare(TriggerSource.EXTERNAL, num, livetime)
+
+
+class _File(DetectorDataLogic):
+    def __init__(self, frames: _Frames) -> None:
+        self._frames = frames
+
+    async def prepare_unbounded(self, datakey_name: str) -> StreamResourceDataProvider:
+        path, shape = await self._frames.new_file()
+        resources = [
+            StreamResourceInfo(
+                data_key=datakey_name + ending, shape=shape if ending == "" else (), dtype_numpy=kind,
+                chunk_shape=(1, *shape) if ending == "" else (1,), source=f"splatline:{dataset}",
+                parameters={"dataset": dataset, "swmr": True},
+            )
+            for ending, (dataset, kind, _) in COLUMNS.items()
+        ]  # fmt: skip
+        return StreamResourceDataProvider(file_url(path), resources, "application/x-hdf5", self._frames.rows)
+
+
+class CameraDetector(StandardDetector):
+    """The configured camera. `kind` says what the next frames show; the shutter is closed at the end.
+
+    Args:
+        instrument: connected devices, which stay open.
+        runs: folder of the run folders; the configured one unless given.
+    """
+
+    def __init__(
+        self, config: Config, instrument: ConnectedDevices, runs: Path | None = None, name: str = "camera"
+    ) -> None:
+        frames = _Frames(config, instrument, runs)
+        self._frames, self.kind = frames, frames.kind
+        self.add_detector_logics(_Trigger(frames, instrument), frames, _File(frames))
+        self.add_config_signals(self.kind)
+        super().__init__(name)
+
+    async def _wait_for_index(self, *args: Any, **more: Any) -> AsyncIterator[Any]:
+        try:
+            async for update in super()._wait_for_index(*args, **more):
+                yield update
+        except TimeoutError:
+            await self._frames.refuse_failure()  # which tells more than that no frame came
+            raise

@@ -1,0 +1,151 @@
+"""Configuration of what stands at named places: the sample mover by a motor, and the filter."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from beamline.config.section import Section
+from beamline.config.stages import StageConfig
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
+from drivers.epics.channel import url_problem as pv_problem
+from drivers.epics.devices import FilterPvs, PvFilter
+from drivers.places import INSIDE, OUTSIDE, MotorPlaces, StageFilter, StageSampleMover
+
+
+def without(problem_of: Callable[[str], str]) -> AfterValidator:
+    """Refuses a text that has a problem."""
+
+    def checked(text: str) -> str:
+        if problem := problem_of(text):
+            raise ValueError(problem)
+        return text
+
+    return AfterValidator(checked)
+
+
+PvUrl = Annotated[str, without(pv_problem)]
+PvValue = float | str
+Seconds = Annotated[float, Field(gt=0, le=1e6)]
+Name = Annotated[str, Field(min_length=1, max_length=80)]
+
+
+class _Motor(Section):
+    """A motor of its own, any stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
+
+    speed_deg_s: Annotated[float, Field(gt=0)] | None = None
+    """null: the stage's max_speed_deg_s."""
+    stage: Annotated[StageConfig, Field(discriminator="kind")]
+
+    def _refuse_unreachable(self, places: Mapping[str, float]) -> None:
+        figures = self.stage.settings.figures
+        low, high, fastest = (math.degrees(rad) for rad in (figures.low, figures.high, figures.max_speed))
+        for name, place in places.items():
+            if not low - 1e-9 <= place <= high + 1e-9:
+                raise ValueError(f"{name} {place:g} is beyond the limits of its stage, {low:g} ... {high:g}")
+        if self.speed_deg_s is not None and self.speed_deg_s > fastest * (1 + 1e-9):
+            raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
+
+    def _places(self, degrees: Mapping[str, float], failed: str) -> MotorPlaces:
+        speed = self.stage.settings.figures.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
+        return MotorPlaces({name: math.radians(place) for name, place in degrees.items()}, speed, failed)
+
+    def _connected(self, name: str, places: MotorPlaces, clock: Clock, url: str | None) -> StageFilter:
+        try:
+            return StageFilter(self.stage.connect(clock, url), places, clock, name)
+        except DeviceError as cause:
+            raise cause.told_by(name, cause.problem) from cause
+
+
+class StageMover(_Motor):
+    """A motor that takes the sample out of the beam for flats, between two places."""
+
+    kind: Literal["stage"]
+    in_deg: float
+    """Where the sample is in the beam."""
+    out_deg: float
+    """Where flats are taken."""
+
+    @model_validator(mode="after")
+    def _places_can_be_reached(self) -> Self:
+        self._refuse_unreachable({"in_deg": self.in_deg, "out_deg": self.out_deg})
+        if self.in_deg == self.out_deg:
+            raise ValueError(f"in_deg and out_deg are both {self.in_deg:g}; flats would show the sample")
+        return self
+
+    def connect(self, clock: Clock, url: str | None = None) -> StageSampleMover:
+        """The mover, connected at its port or at `url`. Nothing moves.
+
+        Raises:
+            DeviceError: its stage does not answer, or does not fit.
+        """
+        places = self._places({INSIDE: self.in_deg, OUTSIDE: self.out_deg}, "the sample did not come")
+        return StageSampleMover(self._connected("sample mover", places, clock, url))
+
+
+class NoFilter(Section):
+    kind: Literal["none"] = "none"
+    places: ClassVar[Sequence[str]] = ()
+
+
+class NamedFilter(Section):
+    """A filter with nothing but names: simulated without an effect on the light, or changed by the operator."""
+
+    kind: Literal["simulated", "manual"]
+    places: Annotated[tuple[Name, ...], Field(min_length=1)]
+
+
+class MotorFilter(_Motor):
+    """Filters on a motor."""
+
+    kind: Literal["stage"]
+    places: Annotated[dict[Name, float], Field(min_length=1)]
+    """Name: deg."""
+
+    @model_validator(mode="after")
+    def _places_can_be_reached(self) -> Self:
+        self._refuse_unreachable(self.places)
+        _refuse_equal(self.places)
+        return self
+
+    def connect(self, clock: Clock, url: str | None = None) -> StageFilter:
+        """As that of `StageMover`."""
+        return self._connected("filter", self._places(self.places, "the filter did not come to"), clock, url)
+
+
+class EpicsFilter(Section):
+    """Filters behind EPICS process variables, each as pva://NAME or ca://NAME."""
+
+    kind: Literal["epics"]
+    pv: PvUrl
+    """Takes the value of a place: a number, a text or a label."""
+    status_pv: PvUrl | None = None
+    """Where the filter itself is read, with the same values; null: pv."""
+    places: Annotated[dict[Name, PvValue], Field(min_length=1)]
+    """Name: value."""
+    timeout_s: Seconds = 2.0
+    """For an answer of the IOC."""
+    travel_s: Seconds = 30.0
+    """The longest that the status may take to follow."""
+
+    @model_validator(mode="after")
+    def _one_value_a_place(self) -> Self:
+        _refuse_equal(self.places)
+        return self
+
+    def connect(self, clock: Clock) -> PvFilter:
+        """As that of `StageMover`."""
+        status = self.status_pv or self.pv
+        return PvFilter(FilterPvs(self.pv, status, self.places, self.timeout_s, self.travel_s), clock)
+
+
+FilterConfig = NoFilter | NamedFilter | MotorFilter | EpicsFilter
+
+
+def _refuse_equal(places: Mapping[str, float | str]) -> None:
+    if len(set(places.values())) < len(places):
+        raise ValueError("two places have one value, so that nobody could tell them apart")

@@ -1,0 +1,117 @@
+"""Zarr of other programs, versions 2 and 3 with any codec, by the format's own library where it is installed.
+
+Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; translations are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+
+_META = "zarr.json", ".zgroup", ".zarray"
+_MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
+
+Spacing = tuple[float, float, float]
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a Zarr, of whatever program."""
+    return any((path / name).is_file() for name in _META)
+
+
+@dataclass(frozen=True)
+class ZarrScale:
+    """An array [..., z, y, x] of a Zarr whose leading axes have one place each (`VolumeScale`)."""
+
+    path: Path
+    array: Any
+    coarser: tuple[ZarrScale, ...] = ()
+    whole_chunks = True
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return self.array.shape[-3:]
+
+    @property
+    def chunk(self) -> tuple[int, int, int]:
+        return self.array.chunks[-3:]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype(self.array.dtype)
+
+    def __getitem__(self, part: slice) -> NDArray[Any]:
+        return self._read(part)
+
+    def box(self, first: tuple[int, int, int], end: tuple[int, int, int]) -> NDArray[Any]:
+        """The voxels of a box."""
+        return self._read(*map(slice, first, end))
+
+    def _read(self, *parts: slice) -> NDArray[Any]:
+        lead = (0,) * (self.array.ndim - 3)
+        try:
+            return np.asarray(self.array[(*lead, *parts, *[slice(None)] * (3 - len(parts)))])
+        except Exception as error:  # whatever its codecs raise for a damaged chunk
+            raise DataError(f"{self.path} cannot be read ({type(error).__name__}: {error}).") from error
+
+
+def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacing | None]:
+    """The finest scale of an OME-Zarr with the coarser ones, or the array `dataset`; mm of a voxel, where it says.
+
+    Raises:
+        DataError: no library, not readable, no volume, or several channels or times.
+    """
+    try:
+        import zarr
+    except ImportError as error:
+        raise DataError(f"{path} is a Zarr of another program: to read it, pip install zarr.") from error
+    try:
+        root: Any = zarr.open(str(path), mode="r")
+        image = _image(root)
+        names = [each["path"] for each in image.get("datasets", [])] if dataset is None else [dataset]
+        arrays: list[Any] = [root] if hasattr(root, "chunks") else [root[name] for name in names]
+        spacing = _spacing(image, arrays[0].ndim, names[0]) if arrays and names else None
+    except Exception as error:  # readers of foreign files raise various errors if one is damaged
+        raise DataError(f"{path} cannot be read as a Zarr ({type(error).__name__}: {error}).") from error
+    if not arrays:
+        raise DataError(f"{path} is no image of OME-Zarr; name an array in it, in `view` as {path.name}::NAME.")
+    finest, *coarser = arrays
+    if finest.ndim < 3 or any(n != 1 for n in finest.shape[:-3]) or np.dtype(finest.dtype).kind not in "uifb":
+        raise DataError(
+            f"{path} holds {finest.dtype} of shape {finest.shape}; expected real numbers [z, y, x], of one time and "
+            "one channel. Copy one to a file of its own."
+        )
+    halved = tuple(ZarrScale(path, array) for array in coarser if _is_halved(finest.shape[-3:], array.shape[-3:]))
+    return ZarrScale(path, finest, halved), spacing
+
+
+def _image(root: Any) -> Mapping[str, Any]:
+    """The first image of an OME-Zarr; {} without."""
+    said = root.attrs.get("ome", root.attrs)
+    found = said.get("multiscales", [{}])
+    return found[0]
+
+
+def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
+    """None where a unit or the size is not stated."""
+    (mine,) = [each for each in image.get("datasets", []) if each["path"] == name] or [{}]
+    steps = [*mine.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]
+    scales = [np.asarray(step["scale"][axes - 3 :], float) for step in steps if step["type"] == "scale"]
+    units = [_MM.get(axis.get("unit", "")) for axis in image.get("axes", [])[axes - 3 :] if isinstance(axis, Mapping)]
+    if not scales or len(units) != 3 or None in units:
+        return None
+    z, y, x = (np.prod(scales, axis=0) * np.asarray(units, float)).tolist()
+    return z, y, x
+
+
+def _is_halved(finest: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Whether a power of two takes one shape to the other, along each axis, rounded either way."""
+    steps = [2 ** round(np.log2(n / m)) for n, m in zip(finest, shape, strict=True)]
+    return all(m in (n // by, -(-n // by)) for n, m, by in zip(finest, shape, steps, strict=True))

@@ -1,0 +1,90 @@
+"""A motor between named places: any stage as a filter, or as sample mover."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError
+from drivers.base.protocols import RotationStage
+
+POLL = 0.05  # s between looks at a motor that moves
+MARGIN = 10.0  # s beyond twice the time of a move after which it has failed
+INSIDE, OUTSIDE = "into the beam", "out of the beam"
+
+
+@dataclass(frozen=True)
+class MotorPlaces:
+    """Where a motor goes, by name, and its speed: rad, rad/s of the stage. `failed`: what an error says before the
+    name."""
+
+    places: Mapping[str, float]
+    speed: float
+    failed: str = "the filter did not come to"
+
+
+class StageFilter:
+    """Implements `drivers.base.protocols.Filter`.
+
+    Each call asks the stage where it is, since a person may have moved it, and moves unless it stands there.
+    """
+
+    def __init__(self, stage: RotationStage, places: MotorPlaces, clock: Clock, name: str = "filter") -> None:
+        self.name = name
+        self._stage, self._places, self._clock = stage, places, clock
+        self._check: Callable[[], None] = lambda: None
+
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again on the way; its exception stops the stage and ends the move."""
+        self._check = check
+
+    def place(self) -> str | None:
+        """Raises DeviceError."""
+        return next((name for name in self._places.places if self._is_at(name)), None)
+
+    def put(self, place: str) -> None:
+        """Raises DeviceError: it did not arrive."""
+        stage, speed, target = self._stage, self._places.speed, self._places.places[place]
+        try:
+            if self._is_at(place):
+                return
+            way = abs(stage.position() - target)
+            stage.start_move(target, speed)
+            deadline = self._clock.now() + 2 * (way / speed + speed / stage.limits.acceleration) + MARGIN
+            try:
+                while stage.moving() and self._clock.now() < deadline:
+                    self._check()
+                    self._clock.sleep(POLL)
+            except BaseException:
+                stage.abort()
+                raise
+            stage.wait(POLL)
+        except DeviceError as cause:
+            advice = cause.advice or "Look where it is before the next scan"
+            problem = f"{self._places.failed} {place}: {cause.device}: {cause.problem}"
+            raise cause.told_by(self.name, problem, advice=advice) from cause
+
+    def close(self) -> None:
+        """It stays where it is."""
+        self._stage.close()
+
+    def _is_at(self, place: str) -> bool:
+        stage = self._stage
+        there = stage.to_counts(stage.position()) == stage.to_counts(self._places.places[place])
+        return there and not stage.moving()
+
+
+class StageSampleMover:
+    """Implements `drivers.base.protocols.SampleMover` by a motor with the places INSIDE and OUTSIDE."""
+
+    def __init__(self, motor: StageFilter) -> None:
+        self.name, self.watch, self.close, self._motor = motor.name, motor.watch, motor.close, motor
+
+    def out(self) -> None:
+        """Raises DeviceError: the sample did not arrive."""
+        self._motor.put(OUTSIDE)
+
+    def back(self) -> None:
+        """Raises DeviceError: the sample did not arrive."""
+        self._motor.put(INSIDE)

@@ -1,0 +1,17 @@
+"""A proxy of 0MQ and a dispatcher behind it, a program of its own: prints a line for each document that arrives."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+
+from bluesky.callbacks.zmq import Proxy, RemoteDispatcher
+
+if __name__ == "__main__":
+    proxy = Proxy(sys.argv[1], sys.argv[2])
+    threading.Thread(target=proxy.start, daemon=True).start()
+    dispatcher = RemoteDispatcher(sys.argv[2])
+    dispatcher.subscribe(lambda name, document: print(json.dumps([name, document]), flush=True))
+    print("ready", flush=True)
+    dispatcher.start()
