@@ -15,6 +15,7 @@ from recon.post.clusters import clusters
 
 _BLOCK = 2**23  # voxels of a slab
 _LOOKED = 2**20  # voxels from which the level is found
+_RANGE = 0.5, 99.5  # percentiles at which they are cut, as for particles: a speck of metal is not the matter
 _APART = 5e-4  # of the largest contrast, by which each voxel is at least off the level
 _WORK = 3  # copies of a mesh while it is joined
 
@@ -61,6 +62,7 @@ def half_way(data: BySlices, n_slices: int) -> float:
     looked = range(thick // 2, n_slices, thick)
     slices = (np.asarray(data[z : z + 1], np.float32).ravel() for z in looked)
     sample = np.concatenate([some[:: max(1, some.size * len(looked) // _LOOKED)] for some in slices])
+    sample = np.clip(sample, *np.percentile(sample, _RANGE))
     dense = sample > clusters(sample, 2).threshold
     return float(np.median(sample[dense]) + np.median(sample[~dense])) / 2
 
@@ -74,8 +76,8 @@ def surface(
 ) -> Mesh:
     """The surface of the matter above a level (Lewiner et al. 2003), closed at the faces of the box.
 
-    Slabs share a slice. A vertex lies within an edge of the lattice, which names it: so slabs are joined without a
-    tolerance, and each edge of the mesh has two triangles.
+    Slabs share a slice. The edge of the lattice on which a vertex lies names it, so slabs are joined without a
+    tolerance. Each edge of the mesh has two triangles.
 
     Args:
         data: [z, y, x], read twice, a few slices at a time.
