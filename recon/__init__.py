@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from recon.splatting.splat import project, voxelize
     from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
+    from recon.voxels.emission import Emission, attenuation_factors, mlem
     from recon.voxels.methods.asd_pocs import AsdPocs
     from recon.voxels.methods.cgls import Cgls
     from recon.voxels.methods.fista_tv import FistaTv
@@ -55,6 +56,7 @@ __all__ = [
     "CorrectionSettings",
     "Counts",
     "DataUse",
+    "Emission",
     "Fbp",
     "FistaTv",
     "FitSettings",
@@ -78,9 +80,11 @@ __all__ = [
     "StreamingFit",
     "Volume",
     "WithoutRings",
+    "attenuation_factors",
     "axis_by_views",
     "correct",
     "find_axis",
+    "mlem",
     "project",
     "reconstruct",
     "remove_rings",
@@ -99,6 +103,7 @@ _LAZY = {
     "reconstruct": "recon.reconstruction",
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
+    **dict.fromkeys(("Emission", "attenuation_factors", "mlem"), "recon.voxels.emission"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),
