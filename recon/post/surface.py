@@ -62,7 +62,8 @@ def half_way(data: BySlices, n_slices: int) -> float:
     looked = range(thick // 2, n_slices, thick)
     slices = (np.asarray(data[z : z + 1], np.float32).ravel() for z in looked)
     sample = np.concatenate([some[:: max(1, some.size * len(looked) // _LOOKED)] for some in slices])
-    sample = np.clip(sample, *np.percentile(sample, _RANGE))
+    cut = np.clip(sample, *np.percentile(sample, _RANGE))
+    sample = cut if np.ptp(cut) else sample
     dense = sample > clusters(sample, 2).threshold
     return float(np.median(sample[dense]) + np.median(sample[~dense])) / 2
 

@@ -92,6 +92,16 @@ def test_a_full_box_is_closed_at_its_faces() -> None:
     assert mesh.euler == 2
 
 
+def test_neither_a_speck_of_metal_nor_a_small_body_in_empty_air_misleads_the_level() -> None:
+    data = np.zeros((20, 40, 40), np.float32)
+    data[:, 10:30, 10:30] = 1.0
+    data[9:11, 19:21, 19:21] = 50.0
+    assert half_way(data, 20) == 0.5
+    alone = np.zeros((20, 40, 40), np.float32)
+    alone[8:12, 18:22, 18:22] = 1.0
+    assert half_way(alone, 20) == 0.5
+
+
 def test_what_has_no_surface_or_too_much_is_refused() -> None:
     data = np.random.default_rng(0).normal(size=(8, 8, 8)).astype(np.float32)
     with pytest.raises(ValueError, match="no value lies above the level 9"):
