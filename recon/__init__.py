@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from recon.splatting.splat import project, voxelize
     from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
+    from recon.voxels.emission import Emission, attenuation_factors, mlem
     from recon.voxels.methods.asd_pocs import AsdPocs
     from recon.voxels.methods.cgls import Cgls
     from recon.voxels.methods.fista_tv import FistaTv
@@ -56,6 +57,7 @@ __all__ = [
     "CorrectionSettings",
     "Counts",
     "DataUse",
+    "Emission",
     "EnergyViews",
     "Fbp",
     "FistaTv",
@@ -81,10 +83,12 @@ __all__ = [
     "StreamingFit",
     "Volume",
     "WithoutRings",
+    "attenuation_factors",
     "axis_by_views",
     "correct",
     "find_axis",
     "fit_materials",
+    "mlem",
     "project",
     "reconstruct",
     "remove_rings",
@@ -104,6 +108,7 @@ _LAZY = {
     **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
+    **dict.fromkeys(("Emission", "attenuation_factors", "mlem"), "recon.voxels.emission"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),

@@ -74,6 +74,7 @@ _COMMANDS = {
     "ingest": _Entry("files", "Copy any scan into one HDF5 scan, frame by frame."),
     "export": _Entry("export", "Copy a volume to another format, with grey values if wanted."),
     "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
+    "surface": _Entry("surface", "Write the surface of a volume, or of its Gaussians, as a watertight mesh."),
     "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
     "completion": _Entry("completion", "Print the completion script of a shell.", files=False),
     "man": _Entry("man", "Print the manual page of a command.", files=False),

@@ -1,0 +1,70 @@
+"""The surface of a volume file, or of the Gaussians behind it, with the memory that this computer has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beamline.core.machine import free_memory
+from beamline.reconstruct.model import Model, read_model
+from beamline.storage.volumes.files import opened_volume
+from recon.base.arrays import F32
+from recon.base.volume import Grid
+from recon.post.surface import BySlices, Mesh, half_way, surface
+from recon.splatting.splat import voxelize
+from recon.splatting.surface import on_level
+
+_SHARE = 0.5  # of the free memory, for a mesh
+Count = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A mesh, the level that it follows, and the unit of its lengths."""
+
+    mesh: Mesh
+    level: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Voxelised:
+    """The voxels of a model, made where they are read."""
+
+    model: Model
+
+    def __getitem__(self, z: slice) -> F32:
+        grid = self.model.record.volume.grid
+        some = slice(z.start, min(z.stop, grid.shape[0]))
+        box = grid.part(some, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
+        return voxelize(self.model.gaussians, box).numpy()
+
+
+def surface_of_volume(path: Path, dataset: str | None, level: float | None, count: Count) -> Surface:
+    """The surface of a volume file of any format, read by slices. DataError, and ValueError as `surface`."""
+    with opened_volume(path, dataset) as record:
+        return _surface(record.volume.data, record.volume.grid, record.length_unit, level, count)
+
+
+def surface_of_gaussians(path: Path, level: float | None, count: Count) -> Surface:
+    """The surface of the model behind a volume, each vertex brought to the level along the density's gradient.
+
+    Raises:
+        DataError: the file holds no model. ValueError: as `surface`.
+    """
+    model = read_model(path)
+    grid = model.record.volume.grid
+    found = _surface(_Voxelised(model), grid, model.record.length_unit, level, count)
+    mesh, vertices = found.mesh, found.mesh.vertices
+    low, high = grid.edges
+    free = ((vertices > low + 1e-3 * grid.voxel_size) & (vertices < high - 1e-3 * grid.voxel_size)).all(axis=1)
+    vertices[free] = on_level(model.gaussians, vertices[free].astype(np.float64), found.level, grid.voxel_size)
+    return Surface(mesh, found.level, found.unit)
+
+
+def _surface(data: BySlices, grid: Grid, unit: str, level: float | None, count: Count) -> Surface:
+    level = half_way(data, grid.shape[0]) if level is None else level
+    return Surface(surface(data, grid, level, _SHARE * free_memory(), count), level, unit)
