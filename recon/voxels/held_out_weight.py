@@ -28,6 +28,8 @@ _AT_ONCE = 8  # sweeps of a round, or of a run of two
 _OCTAVES = 5  # from the first weight, at most: OS-SIRT-TV makes a checkerboard at 128 times
 _ROUNDS = 3  # of sweeps, at most
 _BREGMAN_TRIALS = 3
+CHOICE_SWEEPS = 4 * _SWEEPS
+"""Sweeps of trials for a weight, as a rule."""
 MOST_SWEEPS = _ROUNDS * _AT_ONCE
 """Sweeps of a finish, where views held out prefer them."""
 _CONE_OCTAVES = 10
@@ -100,8 +102,8 @@ def busiest_rows(data: F32, height: int) -> slice:
 
 
 def choice_sweeps(geometry: Geometry) -> float:
-    """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
-    return _in_all_rows(4 * _SWEEPS, geometry)
+    """What `choose_weight` costs, in sweeps over all rows; 0 where nothing is held out."""
+    return _in_all_rows(CHOICE_SWEEPS, geometry)
 
 
 def sweeps_choice_cost(geometry: Geometry) -> float:
