@@ -94,8 +94,11 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
     candidates = candidates_of(method)
     if candidates[0] is method:
         return _of_direct(method, extent, now)
-    tried = replace(extent, heights=[min(32, max(extent.heights))], decided=False)
-    return sum(run_seconds(one, tried, now) for one in candidates) + run_seconds(candidates[0], extent, now)
+    first = Extent(extent.geometry, [min(32, max(extent.heights))])
+    known = not extent.geometry.is_cone  # the weight that the first trial finds is that of the others
+    tried = [first, *(replace(first, decided=known) for _ in candidates[1:])]
+    trials = sum(run_seconds(one, part, now) for one, part in zip(candidates, tried, strict=True))
+    return trials + run_seconds(candidates[0], extent, now)
 
 
 def _of_iterations(method: Method, extent: Extent, now: Clock, sweeps: int, trials: int = CHOICE_SWEEPS) -> float:
@@ -213,7 +216,7 @@ def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[floa
     short, long = (min(took(steps) for _ in range(2)) for steps in _STEPS)
     mean = long / _STEPS[1]
     step = min(
-        max((long - short) / (_STEPS[1] - _STEPS[0]), mean / 4), mean
+        max((long - short) / (_STEPS[1] - _STEPS[0]), mean / 3), mean
     )  # on a busy machine the longer run may take less
     return _work(rows * cols**2, count), step
 

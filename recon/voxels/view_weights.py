@@ -201,8 +201,10 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
 
 
 def _by_chance(gaps: int, circle: float) -> float:
-    """The widest of so many random gaps in a circle; one of n exceeds a share x of it with a chance of at most
-    n (1 - x)^(n - 1): here 1 in 20."""
+    """The widest gap of so many random ones in a circle that chance explains, 19 times in 20.
+
+    One of n exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1).
+    """
     return circle * (1 - (0.05 / gaps) ** (1 / (gaps - 1)))
 
 
