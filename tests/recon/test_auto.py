@@ -93,7 +93,7 @@ def test_a_weight_by_the_noise_is_not_passed_on() -> None:
     """It follows from sums over a volume, and views of a cone have no other."""
     assert shared({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]], PREFERRED: [None], "sweeps": [8]}) == {}
     assert shared({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]]}) == {}
-    made = {"units": [(1, 1, 1), (2, 2, 2)], PREFERRED: [0.1], "sweeps": [8], "restart": [True]}
+    made: dict[str, list[Any]] = {"units": [(1, 1, 1), (2, 2, 2)], PREFERRED: [0.1], "sweeps": [8], "restart": [True]}
     assert shared(made) == {"units": [(1, 1, 1)], PREFERRED: [0.1]}
 
 
