@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, RunControl, candidates_of
@@ -16,29 +18,36 @@ from recon.base.volume import Grid
 from recon.fields.train import FieldMethod
 from recon.methods import with_settings
 from recon.reconstruction import reconstruct
+from recon.splatting.finish import SWEEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
+from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
 from recon.voxels.fbp import fbp_nanoseconds
+from recon.voxels.held_out_weight import CHOICE_SWEEPS
 from recon.voxels.iterative import IterativeMethod
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
 Decided = Mapping[str, Sequence[Any]]
 
-# Of small runs, at most: with fewer columns the time is not that of voxels and views. Two numbers of views tell what a
-# view costs.
-_SWEPT_ROWS, _SWEPT_COLS, _VIEWS = 32, 256, (72, 216)
+# Small runs have the scan's own views where these are few enough. Of many views, two numbers tell what a view costs.
+_SWEPT_ROWS, _SWEPT_COLS, _VIEWS = 32, 256, (108, 216)
 _SWEEPS = 4  # iterations that are timed
 _TRIED = 72, 192, 16  # views, columns and rows of trials of a weight
 _COMPILED = 24, 64, 16  # the same for a run that compiles
 _FEW_ROWS = 16  # of FBP and fits
-_FIT_COLS, _FIT_VIEWS = 128, 108
+_FIT_COLS, _FIT_VIEWS = 128, 108  # of a neural field
+_FITS, _FITTED_VIEWS = ((96, 16), (160, 48)), 24  # columns and rows of small fits
 _FBP_COLS, _FBP_VIEWS = 512, 180
-_STEPS = 12  # of a small fit
+_STEPS = 12, 32  # of small fits, whose views have all been seen after the first number
 _FIELD_STEPS = 3  # of a small fit of a neural field
+# Sweeps of a finish, and of all of its trials, where views held out choose them: either 8 and about 104, or 24 and 80.
+_FINISH = 2 * SWEEPS, 92
+
+Size = tuple[int, int, int]  # views, columns, rows
 
 
 @dataclass(frozen=True)
@@ -46,14 +55,23 @@ class Extent:
     """The size of a reconstruction.
 
     Attributes:
+        geometry: of the views; small runs are made of the same beam.
         heights: slices of each slab, with its halo.
         decided: another slab has already made the decisions that follow from the data.
     """
 
-    views: int
-    cols: int
+    geometry: Geometry
     heights: Sequence[int]
     decided: bool = False
+
+    @property
+    def views(self) -> int:
+        return self.geometry.n_views
+
+    @property
+    def cols(self) -> int:
+        """Columns of a slice, which are more than those of the detector where the axis stands off its middle."""
+        return Grid.matching(self.geometry).shape[2]
 
     @property
     def rows(self) -> int:
@@ -63,11 +81,12 @@ class Extent:
 def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
     """Seconds that the method takes, without reading and correction; `auto` is taken to choose its first candidate.
 
+    Small runs are made of the scan's own beam, with its lean, its exposures and as many rows, if they are few.
     Iterations cost views times voxels, plus voxels for their work on the volume alone. A weight of total variation is
     chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover.
     """
     if isinstance(method, IterativeMethod):
-        return _of_iterations(method, method.iterations, extent, now)
+        return _of_iterations(method, extent, now, method.iterations)
     if isinstance(method, FitMethod):
         return _of_fit(method, extent, now)
     if isinstance(method, FieldMethod):
@@ -75,58 +94,78 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
     candidates = candidates_of(method)
     if candidates[0] is method:
         return _of_direct(method, extent, now)
-    tried = Extent(extent.views, extent.cols, [32])
-    return sum(run_seconds(one, tried, now) for one in candidates) + run_seconds(candidates[0], extent, now)
+    first = Extent(extent.geometry, [min(32, max(extent.heights))])
+    known = not extent.geometry.is_cone  # the weight that the first trial finds is that of the others
+    tried = [first, *(replace(first, decided=known) for _ in candidates[1:])]
+    trials = sum(run_seconds(one, part, now) for one, part in zip(candidates, tried, strict=True))
+    return trials + run_seconds(candidates[0], extent, now)
 
 
-def _of_iterations(method: Method, iterations: int, extent: Extent, now: Clock) -> float:
-    _took(method, _COMPILED, 1, Decisions(), now)
-    tried = _TRIED[0], min(_TRIED[1], extent.cols), _TRIED[2]
-    deciding, decided = _took(method, tried, 1 + _SWEEPS, Decisions(), now)
-    following, _ = _took(method, tried, 1 + _SWEEPS, Decisions(0, decided), now)
-    cols, height = min(extent.cols, _SWEPT_COLS), min(max(extent.heights), _SWEPT_ROWS)
-    few, many = (_of_sweeps(method, (views, cols, height), decided, now) for views in _VIEWS)
-    at = (extent.views - _VIEWS[0]) / (_VIEWS[1] - _VIEWS[0])
-    sweep, start = (max(a + at * (b - a), 0.0) for a, b in zip(few, many, strict=True))
+def _of_iterations(method: Method, extent: Extent, now: Clock, sweeps: int, trials: int = CHOICE_SWEEPS) -> float:
+    """Seconds of so many iterations, and of so many sweeps of trials, where the method makes any."""
+    took = partial(_took, method, extent, now)
+    took(_COMPILED, 1, Decisions())
+    tried = min(_TRIED[0], extent.views), *_within(extent, *_TRIED[1:])
+    deciding, decided, asked = took(tried, 1 + _SWEEPS, Decisions())
+    following, *_ = took(tried, 1 + _SWEEPS, Decisions(0, decided))
+    cols, height = _within(extent, _SWEPT_COLS, _SWEPT_ROWS)
+
+    def of_sweeps(views: int) -> tuple[float, float]:
+        """Seconds of an iteration, and seconds before the first one."""
+        one, last = (took((views, cols, height), n, Decisions(0, decided))[0] for n in (1, 1 + _SWEEPS))
+        sweep = (last - one) / _SWEEPS
+        return sweep, one - sweep
+
+    few, many = _VIEWS
+    found = [of_sweeps(extent.views)] if extent.views <= many else [of_sweeps(views) for views in _VIEWS]
+    at = (extent.views - few) / (many - few)
+    sweep, start = (max(a + at * (b - a), 0.0) for a, b in zip(found[0], found[-1], strict=True))
+    # Trials see sixteen rows; how many there are depends on the data. A weight without trials is of all rows.
     rays = extent.views * extent.cols**2 / (tried[0] * tried[1] ** 2)
-    # Trials on sixteen rows; how many depends on the data.
-    once = 0.0 if extent.decided else rays * max(deciding - following, 0.0)
-    return (extent.cols / cols) ** 2 * extent.rows / height * (start + iterations * sweep) + once
-
-
-def _of_sweeps(method: Method, size: tuple[int, int, int], decided: Decided, now: Clock) -> tuple[float, float]:
-    """Seconds of an iteration, and seconds before the first one."""
-    one, last = (_took(method, size, n, Decisions(0, decided), now)[0] for n in (1, 1 + _SWEEPS))
-    sweep = (last - one) / _SWEEPS
-    return sweep, one - sweep
+    once = rays * max(deciding - following, 0.0) * (trials / asked if asked else extent.rows / tried[2])
+    whole = (extent.cols / cols) ** 2 * extent.rows / height
+    return whole * (start + sweeps * sweep) + (0.0 if extent.decided else once)
 
 
 def _took(
-    method: Method, size: tuple[int, int, int], iterations: int, decide: Decisions, now: Clock
-) -> tuple[float, Decided]:
-    """Seconds of so many iterations, and their decisions."""
-    geometry, data = _sample(*size)
-    one = with_settings(method, {"iterations": iterations})
+    method: Method, extent: Extent, now: Clock, size: Size, iterations: int, decide: Decisions
+) -> tuple[float, Decided, int]:
+    """Seconds of so many iterations, their decisions, and the sweeps of trials among them."""
+    geometry, data = _sample(extent, *size)
+    one, asked = with_settings(method, {"iterations": iterations}), 0
+
+    def count() -> bool:
+        nonlocal asked
+        asked += 1
+        return False
+
     begin = now()
-    reconstruct(data, geometry, one, control=RunControl(decide=decide))
-    return now() - begin, decide.made
+    reconstruct(data, geometry, one, control=RunControl(decide=decide, stop_trials=count))
+    return now() - begin, decide.made, asked
 
 
 def _of_direct(method: Method, extent: Extent, now: Clock) -> float:
-    cols, views = min(extent.cols, _FBP_COLS), min(extent.views, _FBP_VIEWS)
-    geometry, data = _sample(views, cols)
+    views, (cols, rows) = min(extent.views, _FBP_VIEWS), _within(extent, _FBP_COLS, _FEW_ROWS)
+    geometry, data = _sample(extent, views, cols, rows)
     times = []
     for _ in range(3):
         begin = now()
         reconstruct(data, geometry, method)
         times.append(now() - begin)
-    share = min(times) / fbp_nanoseconds(views, cols, _FEW_ROWS)
-    return share * sum(fbp_nanoseconds(extent.views, extent.cols, height) for height in extent.heights)
+    cost = _cone_nanoseconds if extent.geometry.is_cone or not extent.geometry.is_straight else fbp_nanoseconds
+    share = min(times) / cost(views, cols, rows)
+    return share * sum(cost(extent.views, extent.cols, height) for height in extent.heights)
+
+
+def _cone_nanoseconds(views: int, cols: int, slices: int) -> float:
+    """In units of a voxel and view: each is taken from where its ray meets the detector."""
+    return float(views * cols**2 * slices)
 
 
 def _of_field(method: FieldMethod, extent: Extent, now: Clock) -> float:
     """A step costs as many samples as its rays have, and slices of the volume two fifths of that a voxel."""
-    geometry, data = _sample(_FIT_VIEWS, _FIT_COLS)
+    cols, rows = _within(extent, _FIT_COLS, _FEW_ROWS)
+    geometry, data = _sample(extent, _FIT_VIEWS, cols, rows)
     tried = with_settings(method, {"seconds": None, "early_stop": False})
 
     def took(steps: int) -> float:
@@ -136,15 +175,37 @@ def _of_field(method: FieldMethod, extent: Extent, now: Clock) -> float:
 
     took(1)
     short, long = took(2), took(2 + _FIELD_STEPS)
-    step = max(long - short, long / 4) / _FIELD_STEPS * method.samples_of(extent.cols) / method.samples_of(_FIT_COLS)
+    step = max(long - short, long / 4) / _FIELD_STEPS * method.samples_of(extent.cols) / method.samples_of(cols)
     steps, beside = method.steps * step * len(extent.heights), extent.rows * extent.cols**2
     steps = steps if method.seconds is None else min(steps, method.seconds)
-    return steps + short * beside / (_FEW_ROWS * _FIT_COLS**2)
+    return steps + short * beside / (rows * cols**2)
 
 
 def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:
-    geometry, data = _sample(_FIT_VIEWS, _FIT_COLS)
-    count = default_count(Grid.matching(geometry))
+    """Steps cost a fixed time and one by their work, which small fits of two sizes tell apart."""
+    tried = [_step_of_fit(extent, now, *size) for size in _FITS]
+    (few, less), (many, more) = tried[0], tried[-1]
+    slope = max(more - less, 0.0) / (many - few) if many > few else less / few
+    given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
+    seconds = 0.0
+    for height in extent.heights:
+        voxels = height * extent.cols**2
+        count = _count(height, extent.cols) if given is None else given * height / extent.rows
+        seconds += max(less + slope * (_work(voxels, count) - few), 0.0)
+    grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
+    steps = method.seconds if method.seconds is not None else (method.planned_steps or 0) * seconds * grown
+    finish = 0.0
+    if method.finish != 0:
+        sweeps, trials = _FINISH if method.finish is None else (method.finish, CHOICE_SWEEPS)
+        finish = _of_iterations(FistaTv(), extent, now, sweeps, trials)
+    return steps + finish + _of_direct(Fbp(), extent, now)
+
+
+def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[float, float]:
+    """The work of a step of a small fit, and its seconds."""
+    cols, rows = _within(extent, cols, rows)
+    geometry, data = _sample(extent, min(extent.views, _FITTED_VIEWS), cols, rows)
+    count = _count(rows, cols)
 
     def took(steps: int) -> float:
         begin = now()
@@ -152,27 +213,64 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:
         return now() - begin
 
     took(2)
-    short, long = (min(took(steps) for _ in range(2)) for steps in (_STEPS, 2 * _STEPS))
-    mean = long / (2 * _STEPS)
-    step = min(max((long - short) / _STEPS, mean / 4), mean)  # on a busy machine the longer run may take less
-    voxels = _FEW_ROWS * _FIT_COLS**2
-    given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
-    fitted = 0.0
-    for height in extent.heights:
-        grid = Grid((height, extent.cols, extent.cols))
-        of_slab = default_count(grid) if given is None else given * height / extent.rows
-        fitted += ((height * extent.cols**2) / voxels) ** (2 / 3) * (of_slab / count) ** (1 / 3)
-    steps = method.seconds if method.seconds is not None else (method.planned_steps or 0) * step * fitted
-    sweeps = 8 if method.finish is None else method.finish
-    finish = _of_iterations(FistaTv(), sweeps, extent, now) if sweeps else 0.0
-    return steps + finish + _of_direct(Fbp(), extent, now)
+    short, long = (min(took(steps) for _ in range(2)) for steps in _STEPS)
+    mean = long / _STEPS[1]
+    step = min(
+        max((long - short) / (_STEPS[1] - _STEPS[0]), mean / 3), mean
+    )  # on a busy machine the longer run may take less
+    return _work(rows * cols**2, count), step
 
 
-def _sample(views: int, cols: int, rows: int = _FEW_ROWS) -> tuple[Geometry, F32]:
-    """Views of a disc with a hole, with some noise."""
-    geometry = Geometry.parallel(np.arange(views) * np.pi / views, (rows, cols))
+def _count(rows: int, cols: int) -> int:
+    return default_count(Grid((rows, cols, cols)))
+
+
+def _work(voxels: float, gaussians: float) -> float:
+    """In proportion to the pixels that Gaussians cover, whose widths are their distances."""
+    return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
+
+
+def _within(extent: Extent, cols: int, rows: int) -> tuple[int, int]:
+    """Columns and rows of a small run, of as many voxels as given, and no more of either than the scan has.
+
+    Of few rows, as of a fan, it has more columns: a single slice has kernels and threads of its own.
+    """
+    height = min(extent.geometry.detector_shape[0], rows)
+    return min(extent.cols, round(cols * math.sqrt(rows / height))), height
+
+
+def _sample(extent: Extent, views: int, cols: int, rows: int) -> tuple[Geometry, F32]:
+    """Views of a disc with a hole, with some noise, through the beam of the scan."""
+    geometry = _fewer(extent.geometry, views, cols, rows)
     grid = Grid.matching(geometry)
+    width = cols * grid.voxel_size
     _, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
-    disc = (np.hypot(x, y) < 0.4 * cols) & ~(np.hypot(x - 0.1 * cols, y) < 0.1 * cols)
-    data = Projector(geometry, grid).forward((disc / cols).astype(np.float32))
+    disc = (np.hypot(x, y) < 0.4 * width) & ~(np.hypot(x - 0.1 * width, y) < 0.1 * width)
+    data = Projector(geometry, grid).forward((disc / width).astype(np.float32))
     return geometry, data + np.random.default_rng(0).normal(0, 0.02, data.shape).astype(np.float32)
+
+
+def _fewer(geometry: Geometry, views: int, cols: int, rows: int) -> Geometry:
+    """The same beam with so many views, columns and rows: as wide a fan, and as many pixels of motion in an exposure.
+
+    Displacements along the rotation axis are left out: slices are counted instead.
+    """
+    n, (all_rows, all_cols) = geometry.n_views, geometry.detector_shape
+    factor, at, order = all_cols / cols, np.linspace(0, n - 1, views), np.argsort(geometry.angles)
+
+    def some(values: F64) -> F64:
+        return np.interp(at, np.arange(n), values[order])
+
+    return replace(
+        geometry,
+        angles=some(geometry.angles),
+        detector_shape=(rows, cols),
+        pixel_pitch=geometry.pixel_pitch * factor,
+        axis_col=(geometry.axis_col + 0.5) / factor - 0.5,
+        axis_row=(rows - 1) / 2 + (geometry.axis_row - (all_rows - 1) / 2) / factor,
+        shifts=np.column_stack((some(geometry.shifts[:, 0]) / factor, np.zeros(views))),
+        roll=some(geometry.roll),
+        tilt=some(geometry.tilt),
+        width=replace(geometry.width, arc=geometry.width.arc * factor),
+        skew=geometry.skew * factor,
+    )

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from recon.assess.lost_mass import compare
 from recon.base.arrays import F32, F64
 from recon.base.binning import bin_views
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
@@ -22,11 +24,13 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.held_out_weight import (
     LEAST_VIEWS,
     ONE_IN,
+    PREFERRED,
     busiest_rows,
     middle_of_cone,
     slab_of,
     split_views,
 )
+from recon.voxels.iterative import UNITS
 from recon.voxels.projector import Projector
 from recon.voxels.unexplained import LIMIT, unexplained
 
@@ -83,7 +87,8 @@ def predicts_best(
 ) -> tuple[int | None, str]:
     """Which of the methods predicts unseen views best (one of eight is held out), with all residuals in words.
 
-    None where `control` ends the trials before two are done; one that it cuts short is not judged.
+    A weight of total variation that one trial finds by views held out is that of the next ones. None where `control`
+    ends the trials before two are done; one that it cuts short is not judged.
 
     Args:
         methods: by preference.
@@ -98,6 +103,7 @@ def predicts_best(
     trial, judge, some = (of_views(part, views) for views in (seen, unseen, seen[:: ONE_IN // 2]))
     found: list[tuple[Score, F32]] = []
     refused, begin = [], control.now()
+    common: dict[str, Sequence[Any]] = {}
 
     def stopped() -> bool:
         return control.should_stop is not None and control.should_stop()
@@ -108,13 +114,15 @@ def predicts_best(
         method = methods[at]
         device = part.device if method.traits.device else "cpu"
         try:
-            run = RunControl(control.should_stop, _of_trial(control, method.name), now=control.now)
+            decide = Decisions(part.seed, common)
+            run = RunControl(control.should_stop, _of_trial(control, method.name), now=control.now, decide=decide)
             volume = method.run(replace(trial, device=device), run).volume
         except ValueError as error:
             refused.append(f"{method.name}: {error}")
             return
         if stopped():
             return
+        common.update(shared(decide.made))
         own = float(_residuals(volume, some).mean())
         hides = partial(_hides, volume, trial)
         score = Score(at, method, _residuals(volume, judge), own, hides=hides)
@@ -146,6 +154,17 @@ def predicts_best(
     ]
     late = [methods[at].name for at in regular[len(found) + len(refused) :]] if stopped() else []
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
+
+
+def shared(made: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
+    """Decisions of a trial that hold for other methods on the same views: the weight of total variation that views held
+    out prefer, with its units. Empty where no such weight was found.
+
+    It is not that of more views: from 92 in place of 105 views it is 6 % lighter, which costs 0.1 to 0.4 dB.
+    """
+    if None in made.get(PREFERRED, [None]):
+        return {}
+    return {name: made[name][:1] for name in (UNITS, PREFERRED)}
 
 
 def _of_trial(control: RunControl, name: str) -> Callable[[Progress], None] | None:

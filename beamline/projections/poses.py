@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.text import count
-from beamline.projections.selection import Selection, cone_of, pixel_size, rows_of
+from beamline.projections.selection import Selection, choose_views, cone_of, geometry_of, pixel_size, rows_of
 from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.poses import stated_poses
 from beamline.projections.steps.resampling import TiltAndLens
-from beamline.projections.steps.step import StepDone
+from beamline.projections.steps.step import RayStep, StepDone
 from beamline.storage.pose_table import PoseTable
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
@@ -61,6 +61,31 @@ class ScanPoses:
             tilt=geometry.tilt + self.tilt[view_ids],
         )
         return about(posed, self.pivot)
+
+
+def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
+    """The views that the selection names, as scan and options state them, before any frame is read.
+
+    An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
+
+    Raises:
+        ConfigError: the selection does not fit the scan.
+        DataError: the poses do not fit the scan.
+    """
+    frames = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    poses = poses_of(source, selection, frames)
+    if poses is not None:
+        frames = frames[poses.known(frames)]
+    frames = frames[choose_views(source, frames, selection)]
+    stated = source.axis_col if selection.axis_col is None else selection.axis_col
+    axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
+    geometry = geometry_of(source, selection, axis_col, source.angles[frames])
+    if poses is not None:
+        geometry = poses.corrected(geometry, frames)
+    for step in selection.in_order:
+        if isinstance(step, RayStep):
+            geometry, _ = step.rays(source, selection, geometry)
+    return geometry
 
 
 def pivot_of(source: ScanSource, selection: Selection) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from beamline.core.errors import DataError
 from beamline.core.text import count, size
-from beamline.projections.selection import cone_of
+from beamline.projections.poses import stated_geometry
 from beamline.reconstruct.error_bars import refuse_impossible
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.slabs import memory_of, needs_of, refuse_slabs, refuse_smallest, refuse_whole, surely_weighted
@@ -62,33 +62,37 @@ class Estimate:
 
 
 def estimate(options: ReconOptions, clock: Clock) -> Estimate:
-    """Estimate for a finished scan of a parallel beam; for a partial volume, of the missing slabs.
+    """Estimate for a finished scan; for a partial volume, of the missing slabs.
 
     Raises:
         DataError: it does not fit into the memory or on the disk, with the option that would make it fit. Also for a
-            cone, and for a partial volume with another number of slices.
+            partial volume with another number of slices.
         ConfigError: the selection does not fit the scan, or an option needs more memory than there is. Also
             for a method without error bars, where they are wanted.
     """
     if options.uncertainty:
         refuse_impossible(options)
     with options.source.open() as source:
-        if cone_of(source, options.selection) is not None:
-            raise DataError(f"{source.path}: --dry-run is for a parallel beam; this is a cone.")
         options = options.around_region(source)
+        geometry = stated_geometry(source, options.selection)
         allowed, needs = memory_of(options), needs_of(source, options)
-        rows = needs.rows
-        slabs = left = slabs_of(rows, rows, 0)
+        shape = Grid.matching(geometry).shape
+        slabs = left = slabs_of(shape[0], shape[0], 0)
         fits = needs.at_once <= allowed and options.partial is None
+        if not fits and geometry.is_cone:
+            raise DataError(
+                f"{source.path}: {options.method.name} would take {size(needs.at_once)}, {size(allowed)} of memory may "
+                "be used, and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
+            )
         if not fits:
             refuse_whole(source, options, needs, allowed)
             needs = replace(needs, weighted=surely_weighted(source, options))
             refuse_smallest(source, needs, allowed, options.selection.binning)
-            slabs = left = slabs_of(rows, needs.height(allowed), needs.method.traits.halo)
+            slabs = left = slabs_of(shape[0], needs.height(allowed), needs.method.traits.halo)
         if options.partial is not None:
             slabs, left = slabs_of_partial(options.partial)
-            if slabs[-1].own.stop != rows:
-                raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {rows}.")
+            if slabs[-1].own.stop != shape[0]:
+                raise DataError(f"{options.partial} is of {slabs[-1].own.stop} slices, this volume has {shape[0]}.")
             refuse_slabs(options.partial, slabs, needs, allowed)
     output, meanwhile = (needs.volume, 0) if fits else options.disk_needs(needs.volume)
     scratch = 0 if fits else needs.line_integrals + meanwhile
@@ -98,15 +102,14 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
             f"{options.target.output.parent} has {size(free)}, and {size(scratch + output)} are needed. Write "
             f"with -o to another disk, or give --bin {2 * options.selection.binning}."
         )
-    shape = Grid.matching(needs.geometry).shape
     heights = [slab.slices.stop - slab.slices.start for slab in left]
-    extent = Extent(needs.geometry.n_views, shape[2], heights, decided=options.partial is not None)
+    extent = Extent(geometry, heights, decided=options.partial is not None)
     seconds = run_seconds(needs.method, extent, clock.now) if left else 0.0
     seconds *= 1 + options.uncertainty  # error bars take at most as long as the volume
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in left)
     height = slabs[0].own.stop
     return Estimate(
-        options.method.name, needs.geometry.n_views, shape, needs.at_once, allowed,
+        options.method.name, geometry.n_views, shape, needs.at_once, allowed,
         needs.at_once if fits else max(needs.slab(height), needs.least), len(left), done, scratch, output, free,
         seconds,
     )  # fmt: skip

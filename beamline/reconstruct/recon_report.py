@@ -36,6 +36,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.voxels.fbp import Filter
 from recon.voxels.unexplained import LIMIT, Unexplained
+from recon.voxels.view_weights import Wedge, unseen_wedges
 
 
 @dataclass(frozen=True)
@@ -331,6 +332,8 @@ def _pictures(
             figures.profile_and_values(shown, unit),
         ),
     ]
+    if unseen := unseen_wedges(geometry):
+        pictures.append(Picture("Missing wedge", _of_wedges(unseen), figures.wedges(made.volume, unseen, unit)))
     if len(shown) > 1:
         pictures.append(
             Picture(
@@ -404,6 +407,19 @@ def _pictures(
             )
         )
     return pictures
+
+
+def _of_wedges(unseen: Sequence[Wedge]) -> str:
+    """Size and direction of the wedges, and what they do to the volume."""
+    along = [(math.degrees(wedge.first) + 90) % 180 for wedge in unseen]  # a view's rays run across its columns
+    said = " and ".join(
+        f"{first:.0f} to {first + math.degrees(wedge.size):.0f}°" for first, wedge in zip(along, unseen, strict=True)
+    )
+    size = math.degrees(sum(wedge.size for wedge in unseen))
+    return (
+        f"{size:.0f}° of rays are in no view, those at {said} from x towards y (orange): edges along them are blurred, "
+        "and small things are drawn out across them."
+    )
 
 
 def _grew(made: ReconOutcome) -> bool:

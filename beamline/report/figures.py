@@ -12,12 +12,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.patches import Wedge as Sector
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.voxels.view_weights import Wedge
 
 GreyWindow = tuple[float, float]
 DPI = 110
@@ -220,6 +222,23 @@ def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str) -> bytes:
     shown = axes.imshow(image, cmap="magma", extent=extent, interpolation="nearest")
     axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title="Highest density where views show nothing")
     figure.colorbar(shown, ax=axes, label=f"attenuation (1/{unit})", pad=0.02)
+    return png(figure)
+
+
+def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
+    """A slice through the bright voxels, with the directions of rays that no view shows as sectors about the axis."""
+    at, grid = bright_centre(volume.data)[0], volume.grid
+    figure, axes = _figure((6.4, 5.4))
+    edges = planes(grid)[0][2:]
+    show_grey(axes, volume.data[at], grey_window([volume.data[at]]), (*edges[0], *edges[1]))
+    radius = 0.48 * grid.shape[2] * grid.voxel_size
+    for wedge in unseen:
+        first, last = (math.degrees(angle) + 90 for angle in (wedge.first, wedge.first + wedge.size))
+        for turn in (0, 180):  # a ray runs both ways
+            sector = Sector((0, 0), radius, first + turn, last + turn, facecolor=("tab:orange", 0.08))
+            sector.set(edgecolor="tab:orange", linewidth=1.2)
+            axes.add_patch(sector)
+    axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Rays that no view shows, slice {at}")
     return png(figure)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
 
+PREFERRED = "preferred"
+"""Name of the decision on the weight that views held out prefer."""
+
 ONE_IN = 8  # views held out
 LEAST_VIEWS = 2 * ONE_IN
 
@@ -28,6 +32,8 @@ _AT_ONCE = 8  # sweeps of a round, or of a run of two
 _OCTAVES = 5  # from the first weight, at most: OS-SIRT-TV makes a checkerboard at 128 times
 _ROUNDS = 3  # of sweeps, at most
 _BREGMAN_TRIALS = 3
+CHOICE_SWEEPS = 4 * _SWEEPS
+"""Sweeps of trials for a weight, as a rule."""
 MOST_SWEEPS = _ROUNDS * _AT_ONCE
 """Sweeps of a finish, where views held out prefer them."""
 _CONE_OCTAVES = 10
@@ -101,7 +107,7 @@ def busiest_rows(data: F32, height: int) -> slice:
 
 def choice_sweeps(geometry: Geometry) -> float:
     """What `choose_weight` costs, in sweeps over all rows: four trials as a rule; 0 where nothing is held out."""
-    return _in_all_rows(4 * _SWEEPS, geometry)
+    return _in_all_rows(CHOICE_SWEEPS, geometry)
 
 
 def sweeps_choice_cost(geometry: Geometry) -> float:
@@ -123,14 +129,21 @@ def choose_weight(
 ) -> NoiseBalance | float:
     """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`.
 
-    `of_cones`: views of a cone are held out, too.
+    `of_cones`: views of a cone are held out, too. What `preferred_weight` finds is a decision of its own, PREFERRED,
+    which holds for other methods on the same views.
     """
 
+    @cache
+    def balance() -> NoiseBalance:
+        return NoiseBalance.of(problem, start, modelled, unmodelled)
+
     def chosen() -> list[float]:
-        balance = NoiseBalance.of(problem, start, modelled, unmodelled)
-        judged = heaviest_weight if of_cones and problem.projector.geometry.is_cone else preferred_weight
-        found = judged(problem, balance.first) if unmodelled is None else None
-        return [balance.first, balance.noise] if found is None else [found]
+        found = None
+        if of_cones and problem.projector.geometry.is_cone:
+            found = heaviest_weight(problem, balance().first)
+        elif unmodelled is None:
+            found = problem.decide(PREFERRED, lambda: preferred_weight(problem, balance().first))
+        return [balance().first, balance().noise] if found is None else [found]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0], unmodelled is not None) if noise else first
@@ -277,6 +290,7 @@ class _Trial:
                 rng=np.random.default_rng(0),
                 go_on=lambda *_: problem.trial_goes_on(),
                 decide=Decisions(),
+                curvature={},
             )
 
         seen, unseen = split_views(views)

@@ -26,6 +26,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.voxel_problem import VoxelProblem
 
+UNITS = "units"  # name of the decision on them
 _SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait for each other more than they work
 
 
@@ -78,7 +79,7 @@ def solve(
     data, rays = _checked(projector, projections, weight)
     lines = _start(projector, start)
     decide = decide or Decisions()
-    units = _Units(*decide("units", lambda: _Units.of(projector, data, rays)))
+    units = _Units(*decide(UNITS, lambda: _Units.of(projector, data, rays)))
     inside = units.enter(projector, data, rays, lines)
 
     def go_on(iteration: int, residual: float) -> bool:

@@ -44,7 +44,9 @@ def ordered_fista(
     count = subsets_of(projector.geometry, subsets)
     parts = interleaved(projector, count)
     projectors = [projector.subset(views) if count > 1 else projector for views in parts]
-    step = 1 / _curvature(problem, projectors, parts)
+    if count not in problem.curvature:
+        problem.curvature[count] = _curvature(problem, projectors, parts)
+    step = 1 / problem.curvature[count]
     prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, tv_steps)
     gradient, ahead, scale = np.empty_like(x), Momentum(x, problem.decide), problem.scale
     for k in range(sweeps):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,9 +46,7 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
         return np.full(theta.size, np.pi / theta.size)
     gaps = np.diff(starts, append=starts[0] + np.pi)
     typical = float(np.median(gaps))
-    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
-    by_chance = np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
-    gaps = np.where(gaps > max(_GAP_LIMIT * typical, by_chance), typical, gaps)
+    gaps = np.where(gaps > max(_GAP_LIMIT * typical, _by_chance(gaps.size, math.pi)), typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)
     weights[order] = (cells / np.bincount(group))[group]
@@ -171,6 +170,44 @@ def missing_arc(geometry: Geometry) -> float:
     return max(0.0, np.pi + 2 * float(np.abs(_fan_angles(geometry)).max()) - float(cells.sum()))
 
 
+class Wedge(NamedTuple):
+    """Directions of rays that views do not show: those of views at angles from `first` on, over `size` (radians)."""
+
+    first: float
+    size: float
+
+
+def unseen_wedges(geometry: Geometry) -> list[Wedge]:
+    """Rays that no view shows, as angles of the views that are missing, modulo π; none where views suffice.
+
+    Of a parallel beam, and of a cone whose views leave several gaps, these are rays through the rotation axis. Of a
+    short scan of a cone the wedge is `missing_arc`: rays at the rim of the field are missing before those at the axis.
+    """
+    lacking = missing_arc(geometry) if geometry.is_cone else math.inf
+    if lacking == 0 or (geometry.is_off_middle and covers_the_circle(geometry.angles)):
+        return []
+    if math.isfinite(lacking):
+        order, _, cells = _arc(geometry.angles)
+        middle = geometry.angles[order[0]] + (float(cells.sum()) - float(cells[0]) + math.pi) / 2
+        return [Wedge(float(np.mod(middle - lacking / 2, np.pi)), min(lacking, math.pi))]
+    theta = np.unique(np.mod(geometry.angles, np.pi))
+    gaps = np.diff(theta, append=theta[0] + np.pi)
+    typical = float(np.median(gaps))
+    if math.pi - float(angular_weights(geometry.angles).sum()) < typical / 2:
+        return []
+    limit = max(_GAP_LIMIT * typical, _by_chance(gaps.size, math.pi))
+    wide = np.flatnonzero(gaps > limit)
+    return [Wedge(float(np.mod(theta[at] + typical / 2, np.pi)), float(gaps[at] - typical)) for at in wide]
+
+
+def _by_chance(gaps: int, circle: float) -> float:
+    """The widest gap of so many random ones in a circle that chance explains, 19 times in 20.
+
+    One of n exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1).
+    """
+    return circle * (1 - (0.05 / gaps) ** (1 / (gaps - 1)))
+
+
 def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
     """The order of views from behind the widest gap on, their angles from half a step before the first, their cells."""
     theta = np.mod(angles, 2 * np.pi)
@@ -227,7 +264,5 @@ def _gaps(theta: F64) -> tuple[NDArray[np.intp], F64]:
 
 def _leave_an_arc(gaps: F64) -> bool:
     widest, typical = float(gaps.max()), float(np.median(gaps))
-    # One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): here 1 in 20.
-    by_chance = 2 * np.pi * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
     arc = widest > np.pi / 4 and widest > 3 * typical
-    return arc or widest >= np.pi or widest > max(_GAP_LIMIT * typical, by_chance)
+    return arc or widest >= np.pi or widest > max(_GAP_LIMIT * typical, _by_chance(gaps.size, 2 * math.pi))

@@ -14,6 +14,7 @@ from beamline.monitor.digest import digest
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.air import Air
+from beamline.reconstruct import estimate
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
@@ -22,7 +23,9 @@ from recon.axis_by_views import axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
+from recon.run_time import Extent
 from recon.voxels.fdk import fdk
+from tests.beamline.cli.small_scan import beamline
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
 BALL, CENTRE, MU = 0.2, (0.12, -0.05, 0.06), 1.5  # mm, (x, y, z), 1/mm
@@ -144,3 +147,16 @@ def test_what_a_cone_needs_is_asked_for(tmp_path: Path) -> None:
         _write(path, info, views=4)
         with open_scan(path) as source, pytest.raises(error, match=words):
             prepare_projections(source, PLAIN, _never)
+
+
+def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = list[Extent]()
+    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or 7.0)
+    found = beamline("recon", str(scan), "-m", "sirt", "-o", str(tmp_path / "out.h5"), "--dry-run")
+    assert found.exit_code == 0 and "40 x 48 x 48 voxels by sirt, from 90 views" in found.stdout, found.output
+    geometry = seen[0].geometry
+    assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
+    small = beamline("recon", str(scan), "-o", str(tmp_path / "out.h5"), "--dry-run", "--memory", "1M")
+    assert small.exit_code == 5 and "a cone is not made in slabs" in small.stderr

@@ -16,9 +16,13 @@ from recon.base.decisions import Decisions
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Volume
 from recon.splatting.r2 import R2
+from recon.trials import shared
+from recon.voxels import held_out_weight
 from recon.voxels.direct import Fbp
+from recon.voxels.held_out_weight import PREFERRED, preferred_weight
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import VoxelProblem
 
 F32 = NDArray[np.float32]
 VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (40, 32))
@@ -66,6 +70,31 @@ def test_another_slab_takes_the_method_that_the_first_one_chose(data: F32) -> No
     recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=first))
     control = recon.RunControl(decide=Decisions(0, first.made))
     assert recon.reconstruct(0.5 * data, VIEWS, auto, control=control).settings["factor"] == 1.0  # alone it is 0.5
+
+
+def test_the_weight_that_one_trial_finds_is_that_of_all_trials(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two methods are tried, and one of them reconstructs the whole, whose weight is sought anew: two searches."""
+    found = list[float | None]()
+
+    def counted(problem: VoxelProblem, first: float) -> float | None:
+        found.append(preferred_weight(problem, first))
+        return found[-1]
+
+    monkeypatch.setattr(held_out_weight, "preferred_weight", counted)
+    decide, auto = Decisions(), Auto((FistaTv(iterations=4), FistaTv(iterations=5)))
+    recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide))
+    assert len(found) == 2 and None not in found
+    assert decide.made[PREFERRED] == found[1:] and decide.made["weight"] == [found[1:]]
+    recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=Decisions(0, decide.made)))  # another slab
+    assert len(found) == 2
+
+
+def test_a_weight_by_the_noise_is_not_passed_on() -> None:
+    """It follows from sums over a volume, and views of a cone have no other."""
+    assert shared({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]], PREFERRED: [None], "sweeps": [8]}) == {}
+    assert shared({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]]}) == {}
+    made: dict[str, list[Any]] = {"units": [(1, 1, 1), (2, 2, 2)], PREFERRED: [0.1], "sweeps": [8], "restart": [True]}
+    assert shared(made) == {"units": [(1, 1, 1)], PREFERRED: [0.1]}
 
 
 def test_a_blurred_volume_is_not_preferred_to_a_sharp_one(data: F32, truth: F32) -> None:

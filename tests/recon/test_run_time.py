@@ -3,29 +3,39 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 import recon
 from recon import run_time
 from recon.auto import Auto
-from recon.base.decisions import Decisions
+from recon.base.geometry import Geometry
+from recon.base.ray_width import RayWidth
+from recon.base.volume import Grid
 from recon.run_time import Extent, run_seconds
 
 
+def extent(views: int, cols: int, heights: Sequence[int], decided: bool = False) -> Extent:
+    """Of a parallel beam."""
+    return Extent(Geometry.parallel(np.arange(views) * np.pi / views, (sum(heights), cols)), heights, decided)
+
+
 def test_fbp_takes_twice_as_long_for_two_slabs_and_a_choice_as_long_as_its_parts() -> None:
-    one, two = Extent(90, 64, [32]), Extent(90, 64, [32, 32])
-    seconds = [run_seconds(recon.Fbp(), extent, itertools.count().__next__) for extent in (one, two)]
+    one, two = extent(90, 64, [32]), extent(90, 64, [32, 32])
+    seconds = [run_seconds(recon.Fbp(), each, itertools.count().__next__) for each in (one, two)]
     assert seconds[1] == pytest.approx(2 * seconds[0])
     assert run_seconds(Auto((recon.Fbp(),)), two, itertools.count().__next__) == pytest.approx(3 * seconds[0])
 
 
 def test_iterations_cost_by_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where each run takes a second, whatever it does, an iteration costs nothing: what is left is one run."""
-    monkeypatch.setattr(run_time, "_took", lambda *_: (1.0, {}))
+    monkeypatch.setattr(run_time, "_took", lambda *_: (1.0, {}, 0))
     few, many = (
-        run_seconds(recon.Sirt(iterations=n), Extent(108, 64, [16]), itertools.count().__next__) for n in (3, 300)
+        run_seconds(recon.Sirt(iterations=n), extent(108, 64, [16]), itertools.count().__next__) for n in (3, 300)
     )
     assert few == many == pytest.approx(1.0)
 
@@ -33,15 +43,15 @@ def test_iterations_cost_by_their_number(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_iterations_cost_by_voxels_and_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a law of so much a voxel, a voxel and view, and for trials a voxel of a slice and view."""
 
-    def took(_: Any, size: tuple[int, int, int], iterations: int, decide: Decisions, *__: Any) -> tuple[float, Any]:
-        views, cols, rows = size
-        trials = 0 if decide._followed else 50 * views * cols**2
-        return 1e-6 * (rows * cols**2 * (10 + iterations * (5 + views)) + trials), {"weight": [1.0]}
+    def took(*arguments: Any) -> tuple[float, Any, int]:
+        *_, (views, cols, rows), iterations, decide = arguments
+        trials = 0 if decide._followed else 32 * views * cols**2
+        return 1e-6 * (rows * cols**2 * (10 + iterations * (5 + views)) + trials), {"weight": [1.0]}, 32
 
     monkeypatch.setattr(run_time, "_took", took)
     for views, cols, rows in ((90, 100, 8), (1800, 2048, 64)):
-        found = run_seconds(recon.OsSirtTv(iterations=40), Extent(views, cols, [rows]), itertools.count().__next__)
-        assert found == pytest.approx(1e-6 * cols**2 * (rows * (10 + 40 * (5 + views)) + 50 * views))
+        found = run_seconds(recon.OsSirtTv(iterations=40), extent(views, cols, [rows]), itertools.count().__next__)
+        assert found == pytest.approx(1e-6 * cols**2 * (rows * (10 + 40 * (5 + views)) + 64 * views))
 
 
 def test_a_neural_field_costs_by_its_steps_and_slabs_and_ends_by_its_seconds() -> None:
@@ -49,7 +59,7 @@ def test_a_neural_field_costs_by_its_steps_and_slabs_and_ends_by_its_seconds() -
 
     def seconds(heights: list[int], **settings: Any) -> float:
         method = recon.NAF(rays=8, samples=4, levels=1, **settings)
-        return run_seconds(method, Extent(108, 128, heights), itertools.count().__next__)
+        return run_seconds(method, extent(108, 128, heights), itertools.count().__next__)
 
     volume = 1.0  # of sixteen rows
     assert seconds([16], steps=1200) == pytest.approx(100 + volume)
@@ -58,14 +68,14 @@ def test_a_neural_field_costs_by_its_steps_and_slabs_and_ends_by_its_seconds() -
 
 
 def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where deciding takes 4 s of a small run, whatever its size."""
+    """Where deciding takes 4 s of a small run, whatever its size, for as many sweeps of trials as a rule."""
 
-    def took(*arguments: Any) -> tuple[float, dict[str, list[float]]]:
-        return (1.0 if arguments[3]._followed else 5.0), {"weight": [1.0]}
+    def took(*arguments: Any) -> tuple[float, dict[str, list[float]], int]:
+        return (1.0 if arguments[-1]._followed else 5.0), {"weight": [1.0]}, 64
 
     monkeypatch.setattr(run_time, "_took", took)
     rest, whole = (
-        run_seconds(recon.FistaTv(), Extent(72, 64, [16], decided=decided), itertools.count().__next__)
+        run_seconds(recon.FistaTv(), extent(72, 64, [16], decided), itertools.count().__next__)
         for decided in (True, False)
     )
     assert (rest, whole) == (1.0, 5.0)
@@ -73,9 +83,25 @@ def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("runs", [(1, 100, 1, 1, 1), (1, 9, 9, 1, 1), (1, 1, 1, 100, 2)])
 def test_no_fit_takes_less_than_nothing_on_a_busy_machine(monkeypatch: pytest.MonkeyPatch, runs: list[float]) -> None:
-    """Seconds of a first small run, two short ones and two of twice the steps."""
+    """Seconds of a first small run, two short ones and two long ones; the same for fits of another size."""
     monkeypatch.setattr(run_time, "reconstruct", lambda *_, **__: None)
     monkeypatch.setattr(run_time, "_of_direct", lambda *_: 0.0)
-    clock = iter(itertools.accumulate(seconds for run in runs for seconds in (0, run)))
+    clock = iter(itertools.accumulate(seconds for run in 2 * runs for seconds in (0, run)))
     fit = recon.R2(steps=1000, finish=0)
-    assert run_seconds(fit, Extent(108, 128, [16]), clock.__next__) > 1000 * runs[-1] / 100
+    assert run_seconds(fit, extent(108, 128, [16]), clock.__next__) > 1000 * runs[-1] / 100
+
+
+def test_small_runs_are_of_the_scan_s_own_beam() -> None:
+    """As wide a fan, as many pixels of motion in an exposure, the axis at the same share, one row of a fan."""
+    views = Geometry.cone(np.linspace(0, 2 * np.pi, 300), (64, 400), 0.1, 50, 150, axis_col=210.0, axis_row=20.0)
+    views = replace(views, shifts=np.tile((2.0, 30.0), (300, 1))).seen_with(RayWidth(arc=0.01))
+    few = run_time._fewer(views, 50, 100, 16)
+    assert few.is_cone and few.n_views == 50 and few.detector_shape == (16, 100)
+    assert few.reach == pytest.approx(views.reach) and few.sdd == views.sdd
+    assert np.ptp(few.angles) == pytest.approx(np.ptp(views.angles))
+    motion = [one.width.arc * one.reach / one.sample_pitch for one in (views, few)]
+    assert motion[0] == pytest.approx(motion[1])
+    assert Grid.matching(few).shape == (16, 100, 100)
+    fan = Geometry.fan(views.angles, 400, 0.1, 50, 150)
+    assert run_time._within(Extent(fan, [1]), 128, 16) == (400, 1)
+    assert run_time._fewer(fan, 50, 300, 1).axis_row == 0

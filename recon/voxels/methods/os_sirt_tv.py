@@ -25,6 +25,9 @@ _SETTLED = 3 / 8  # of the sweeps: with 3 of 40, a cement in a cone of 50 views 
 class OsSirtTv:
     """A sweep of ordered-subset SIRT, then a proximal step of TV. Memory: 6 volumes, 3 x the projections.
 
+    It is for views of very few photons (10 to 30 a pixel: up to 2 dB ahead), and with `momentum` for a quick volume.
+    Of a cone its weight follows the noise: 2.3 dB behind FISTA-TV on a thorax, whose weight views held out choose.
+
     Attributes:
         tv_weight: threshold of that step in density units; None: by views held out or by the noise, see
             `choose_weight`.

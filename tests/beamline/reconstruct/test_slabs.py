@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from beamline.reconstruct import estimate
 from beamline.reconstruct.slabs import Needs
 from beamline.storage.writers.recon_file import read_reconstruction
+from recon.run_time import Extent
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from tests.beamline.cli.small_scan import beamline, left
@@ -180,6 +182,21 @@ def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) ->
     assert left(tmp_path) == {"scan.h5"}
 
 
+@pytest.mark.usefixtures("tall")
+def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Views of 200 rows; the later half stands 100 rows higher."""
+    Path("poses.csv").write_text("view,shift_row_px\n" + "".join(f"{n},{100 * (n >= 30)}\n" for n in range(60)))
+    seen = list[Extent]()
+    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or 7.0)
+    dry = ("recon", "scan.h5", "-m", "sirt", "--dry-run", "-o", "out.h5")
+    stepped = beamline(*dry, "--poses", "poses.csv")
+    assert "300 x 48 x 48 voxels" in stepped.stdout and seen[-1].heights == [300], stepped.output
+    assert beamline(*dry, "--exposure-arc", "4:2").exit_code == 0
+    assert seen[-1].geometry.width.arc == pytest.approx(np.radians(4)) and seen[-1].geometry.skew != 0
+
+
 def test_a_slab_of_air_is_left_to_voxels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gaussians are placed in matter; the views of a slab without any may even be below zero on average."""
     monkeypatch.chdir(tmp_path)
@@ -192,3 +209,17 @@ def test_a_slab_of_air_is_left_to_voxels(tmp_path: Path, monkeypatch: pytest.Mon
     assert result.exit_code == 0 and "by fista-tv" in result.stderr, result.output
     volume = read_reconstruction(Path("out.h5")).volume.data
     assert np.abs(volume[70:]).max() < 0.02 * volume.max()
+
+
+@pytest.mark.parametrize(
+    ("to", "wedge"), [(120.0, "60° of rays are in no view, those at 28 to 88° from x"), (180.0, "")]
+)
+def test_a_report_shows_the_wedge_that_no_view_sees(
+    to: float, wedge: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scan = TwoCylinders(angles=np.radians(np.arange(0, to, 4.0)), shape=(8, 48), axis_col=23.7)
+    write_exchange(Path("scan.h5"), scan, {"data": scan.counts(), "data_white": np.full((2, 8, 48), 20100, np.uint16)})
+    assert beamline("recon", "scan.h5", "-m", "fbp", "-o", "out.h5").exit_code == 0
+    page = next(Path().glob("*.html")).read_text()
+    assert ("Missing wedge" in page) == bool(wedge) and wedge in page

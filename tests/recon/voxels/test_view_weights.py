@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
+from recon import reconstruct
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.fbp import fbp
-from recon.voxels.view_weights import angular_weights, circle_weights, cone_weights, missing_arc, ray_weights
+from recon.voxels.view_weights import (
+    angular_weights,
+    circle_weights,
+    cone_weights,
+    missing_arc,
+    ray_weights,
+    unseen_wedges,
+)
 from tests.recon.voxels.test_fbp import disc_views, half_turn
 
 
@@ -188,3 +197,43 @@ def test_what_a_short_scan_lacks_is_said_in_degrees(arc: float, lacking: float) 
             cone_weights(geometry)
     gaps = Geometry.fan([0, 0.1, 0.2, 0.3, 0.4, 2.0, 2.1, 2.2, 2.3, 4.0], 41, 1.0, 150.0, 300.0)
     assert missing_arc(gaps) == np.inf
+
+
+def test_the_wedge_is_what_no_view_sees() -> None:
+    """Of a parallel beam between views; of a fan what a short scan lacks, in the middle of the rays of the axis."""
+    (wedge,) = unseen_wedges(Geometry.parallel(np.radians(np.arange(10, 130, 1.5)), (4, 64)))
+    assert np.degrees([wedge.first, wedge.size]) == pytest.approx([129.25, 60.0])
+    fan = Geometry.fan(np.radians(np.arange(20, 170, 1.5)), 64, 1.0, 100, 150)
+    (wedge,) = unseen_wedges(fan)
+    assert wedge.size == pytest.approx(missing_arc(fan))
+    assert np.degrees(wedge.first + wedge.size / 2) == pytest.approx((19.25 + 169.25 + 180) / 2)
+    two = np.concatenate((np.arange(0, 60, 1.5), np.arange(90, 150, 1.5)))
+    assert np.degrees([each.size for each in unseen_wedges(Geometry.parallel(np.radians(two), (4, 64)))]) == (
+        pytest.approx([30, 30])
+    )
+
+
+@pytest.mark.parametrize("turn", [np.pi, 2 * np.pi])
+def test_views_all_around_leave_no_wedge(turn: float) -> None:
+    even, golden = np.linspace(0, turn, 60, endpoint=False), np.arange(60) * np.pi * 0.618034
+    for angles in (even, golden, np.random.default_rng(0).uniform(0, turn, 60)):
+        assert unseen_wedges(Geometry.parallel(angles, (4, 64))) == []
+    assert unseen_wedges(Geometry.fan(np.linspace(0, 2 * np.pi, 60, endpoint=False), 64, 1.0, 100, 150)) == []
+
+
+def test_edges_along_the_wedge_are_blurred() -> None:
+    """The rim of a disc by FBP, where it runs along rays that no view shows, and where it runs across them."""
+    views = Geometry.parallel(np.radians(np.arange(10, 130, 1.0)), (1, 96))
+    u = np.arange(96) - 47.5
+    disc = np.tile(2 * np.sqrt(np.clip(30**2 - u**2, 0, None)), (views.n_views, 1, 1)).astype(np.float32)
+    image = reconstruct(disc, views, "fbp").volume.data[0]
+    (wedge,) = unseen_wedges(views)
+
+    def step(angle: float) -> float:
+        """From outside to inside of the rim at this angle, whose normal points there."""
+        at = [47.5 + np.sin(angle) * np.array([26, 34]), 47.5 + np.cos(angle) * np.array([26, 34])]
+        inside, outside = map_coordinates(image, at, order=1)
+        return float(inside - outside)
+
+    middle = wedge.first + wedge.size / 2  # the direction of columns of the missing views: across their rays
+    assert step(middle) < 0.5 * step(middle + np.pi / 2)
