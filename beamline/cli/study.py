@@ -96,14 +96,14 @@ def study(
     """
     from beamline.study.run import StudyOptions, run_study
     from beamline.study.table import text
-    from beamline.tradeoff.opened import ScanOptions
+    from beamline.tradeoff.opened import ComparedScan
 
     methods = tuple(dict.fromkeys(methods))
     settings = row_settings(methods, values)
     source, selection = chosen(file, seed, values)
     folder = output or Path(f"{file.stem}_{which}")
     options = StudyOptions(
-        scan=ScanOptions(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
+        scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
         study=STUDIES[which],
         methods=methods,
         settings=settings,

@@ -84,14 +84,14 @@ def tradeoff(
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
-    from beamline.tradeoff.opened import ScanOptions
+    from beamline.tradeoff.opened import ComparedScan
     from beamline.tradeoff.report import text
     from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 
     source, selection = chosen(file, seed, values)
     folder = output or Path(f"{file.stem}_tradeoff")
     options = TradeoffOptions(
-        scan=ScanOptions(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
+        scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
         methods=methods or names_compared(),
         depth="quick" if quick else "full",
         max_seconds=max_seconds,

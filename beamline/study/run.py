@@ -23,7 +23,7 @@ from beamline.study.studies import Study, StudyRow, ViewSet, averaged
 from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data, write_array
 from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import Opened, ScanOptions, opened, until_stopped
+from beamline.tradeoff.opened import ComparedScan, Opened, opened, until_stopped
 from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
 from drivers.base.clock import Clock
 from recon.assess import metrics
@@ -49,7 +49,7 @@ class StudyOptions:
         draws: how often random views are drawn.
     """
 
-    scan: ScanOptions
+    scan: ComparedScan
     study: Study
     methods: Sequence[str]
     settings: Mapping[str, Mapping[str, Plain]] = field(default_factory=dict)

@@ -21,7 +21,7 @@ from recon.base.volume import Grid
 
 
 @dataclass(frozen=True)
-class ScanOptions:
+class ComparedScan:
     """The scan of a trade-off or a study.
 
     Attributes:
@@ -54,8 +54,8 @@ class Opened:
     light: Light | None
 
 
-def opened(options: ScanOptions, warn: Warn) -> Opened:
-    """Read and correct the views; what is refused is refused before that.
+def opened(options: ComparedScan, warn: Warn) -> Opened:
+    """Read and correct the views. What is refused is refused first.
 
     Raises:
         ConfigError, DataError: nothing was written.
@@ -71,8 +71,8 @@ def opened(options: ScanOptions, warn: Warn) -> Opened:
     return Opened(facts | ({} if light is None else {"light": "; ".join(light.said())}), prepared, grid, truth, light)
 
 
-class Table(Protocol):
-    """Rows of which some are done; its field `stopped` says that Ctrl-C ended them."""
+class GrowingTable(Protocol):
+    """A table of rows with a field `stopped`."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
@@ -80,7 +80,7 @@ class Table(Protocol):
     def n_done(self) -> int: ...
 
 
-T = TypeVar("T", bound=Table)
+T = TypeVar("T", bound=GrowingTable)
 
 
 def until_stopped(table: T, grown: Iterable[T], folder: Path, write: Callable[[Path, T], None]) -> T:

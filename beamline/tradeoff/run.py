@@ -19,7 +19,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import ScanOptions, opened, until_stopped
+from beamline.tradeoff.opened import ComparedScan, opened, until_stopped
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
@@ -42,7 +42,7 @@ class TradeoffOptions:
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
     """
 
-    scan: ScanOptions
+    scan: ComparedScan
     methods: Sequence[str]
     depth: Depth = "quick"
     max_seconds: float | None = None

@@ -20,7 +20,7 @@ from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff import run as tradeoff
-from beamline.tradeoff.opened import ScanOptions
+from beamline.tradeoff.opened import ComparedScan
 from beamline.tradeoff.report import text
 from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from beamline.tradeoff.table import TIME
@@ -39,8 +39,8 @@ TABLES = {"tradeoff.json", "tradeoff.csv", "tradeoff.html"}
 def _options(tmp_path: Path, **changes: Any) -> TradeoffOptions:
     if not (tmp_path / "scan.h5").exists():
         write_exchange(tmp_path / "scan.h5", SCAN)
-    scan = ScanOptions(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out")
-    of_scan = {field.name: changes.pop(field.name) for field in fields(ScanOptions) if field.name in changes}
+    scan = ComparedScan(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out")
+    of_scan = {field.name: changes.pop(field.name) for field in fields(ComparedScan) if field.name in changes}
     options = TradeoffOptions(replace(scan, **of_scan), ("r2", "fbp"), command="beamline tradeoff scan.h5")
     return replace(options, **changes)
 
