@@ -169,7 +169,8 @@ def to_csv(table: TrialTable) -> str:
 def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
     """Write the page, and the pictures that have data; `slices` are of each baseline and of the truth."""
     pictures = []
-    for cost in (TIME, MEMORY, table.dose):
+    doses = [table.dose] if len({outcome.trial.views for outcome in table.compared}) > 1 else []
+    for cost in (TIME, MEMORY, *doses):
         if table.front(cost):
             caption = (
                 f"{table.quality_name} of every trial against its {cost.words}. The line is the best quality "
