@@ -10,7 +10,7 @@ import click
 
 from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, json_option
-from beamline.cli.scan_options import scan_options
+from beamline.cli.scan_options import light_asked, light_options, scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError
 from beamline.core.events import Done, RuleBroken
@@ -22,6 +22,7 @@ from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
     from beamline.projections.returned import ReturnedView
+    from beamline.projections.scan_statistics import LightAsked
     from beamline.storage.readers.open import SourceOptions
 
 _PATH = click.Path(path_type=Path)
@@ -32,10 +33,7 @@ _PATH = click.Path(path_type=Path)
 @scan_options
 @click.option("--statistics", is_flag=True, help="Of a scan: range, percentiles, mean, saturated pixels, as stored.")
 @click.option("-o", "--output", metavar="PNG", type=_PATH, help="With --statistics: the histograms, as a picture.")
-@click.option(
-    "--photons-per-count", type=POSITIVE, help="With --statistics: of photons at the sample; gives the light."
-)
-@click.option("--dose-in", metavar="MATERIAL", help="With it: the absorbed dose in a material or formula.")
+@light_options
 @click.option("--truth", metavar="FILE", help="Of a volume: PSNR and SSIM against this one (FILE or FILE:first:end).")
 @click.option("--masks", metavar="FILE", type=_PATH, help="Of a volume: SNR and CNR by labels, 1 dense and 2 empty.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON event to stdout.")
@@ -60,11 +58,9 @@ def info(
     from beamline.storage.flag_legend import counted
     from beamline.storage.readers.open import SourceOptions
 
-    light = photons_per_count, dose_in
-    if (output is not None or photons_per_count is not None) and not statistics:
+    light = light_asked(photons_per_count, dose_in)
+    if (output is not None or light is not None) and not statistics:
         raise click.UsageError("-o and --photons-per-count go with --statistics.")
-    if dose_in is not None and photons_per_count is None:
-        raise click.UsageError("--dose-in goes with --photons-per-count.")
     if statistics and (truth or masks):
         raise click.UsageError("--statistics is of a scan, --truth and --masks are of a volume: give one of them.")
     if statistics:
@@ -102,9 +98,7 @@ def _returned(scan: SourceOptions) -> list[ReturnedView]:
         return returned_views(source)
 
 
-def _print_statistics(
-    scan: SourceOptions, output: Path | None, light: tuple[float | None, str | None], as_json: bool
-) -> None:
+def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAsked | None, as_json: bool) -> None:
     from beamline.core.files import write_whole
     from beamline.projections.scan_statistics import histograms, light_of, statistics_of, table
     from beamline.storage.readers.open import open_scan
@@ -114,8 +108,10 @@ def _print_statistics(
         if output is not None:
             refuse_existing(output)
         with open_scan(scan) as source:
+            if light is not None:
+                light.refuse(source)
             found = statistics_of(source, counting("statistics", sink, clock))
-            dose = [] if light[0] is None else light_of(source, found, light[0], light[1])
+            dose = [] if light is None else light_of(source, found, light).said()
         rows = table(found)
         if output is not None:
             write_whole(output, histograms(found))

@@ -13,6 +13,7 @@ from click.core import ParameterSource
 
 from beamline.cli.option_groups import METHOD, OUTPUT, RESOURCES, heading
 from beamline.cli.options import POSITIVE, parsed, together
+from beamline.core.errors import DataError
 from recon.assess.plans import PRESETS
 from recon.assess.time_model import parse_budget
 from recon.base.choices import AUTO, DEFAULT_STEPS, KERNEL, SHORT_STEPS, Loss, Start
@@ -175,6 +176,8 @@ def takers(option: str) -> tuple[str, ...]:
 def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None:
     """Raises UsageError for options that exclude each other, or are of another method.
 
+    DataError if the file of --resume is missing.
+
     Args:
         ctx: of a command with `method_options`; only options that its user gave count.
         method: its name, as in `method_with`.
@@ -194,6 +197,8 @@ def refuse_contradictions(ctx: click.Context, method: str, follow: bool) -> None
             raise click.UsageError(f"{_option(plan)} is for a finished scan; with --follow give --seconds.")
     for name in given:
         if method not in (owners := takers(name)):
+            if name == "resume" and not ctx.params[name].exists():
+                raise DataError(f"--resume {ctx.params[name]} is not there. Nothing was touched.")
             raise click.UsageError(f"{_option(name)} is of {', '.join(owners)}; it does not go with --method {method}.")
     endless = [name for name in given if follow and name in _FINISHED]
     if endless:

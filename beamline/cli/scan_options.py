@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import parsed, together
+from beamline.cli.options import POSITIVE, parsed, together
+
+if TYPE_CHECKING:
+    from beamline.projections.scan_statistics import LightAsked
 
 _PATH = click.Path(path_type=Path)
 
@@ -42,3 +46,20 @@ scan_options = together(
     ),
 )
 """The fields of SourceOptions: --quantity, --angles, --angle-rows, --darks, --flats, --data-path ..."""
+
+light_options = together(
+    click.option("--photons-per-count", type=POSITIVE, help="X-ray photons at the sample that make a count."),
+    click.option("--dose-in", metavar="MATERIAL", help="With it: the absorbed dose in a material or formula."),
+)
+"""What `light_asked` takes."""
+
+
+def light_asked(photons_per_count: float | None, dose_in: str | None) -> LightAsked | None:
+    """None if nobody asked for the light. Raises UsageError for a dose without photons."""
+    from beamline.projections.scan_statistics import LightAsked  # here: help does not need it
+
+    if photons_per_count is None:
+        if dose_in is not None:
+            raise click.UsageError("--dose-in goes with --photons-per-count.")
+        return None
+    return LightAsked(photons_per_count, dose_in)

@@ -11,6 +11,7 @@ from beamline.cli.method_options import row_options, row_settings
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, Grouped, heading
 from beamline.cli.options import SEED, json_option
 from beamline.cli.recipe import repeating
+from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
@@ -42,6 +43,7 @@ from recon.methods import BASELINE, DEFAULT, names
     "--truth", metavar="FILE[:A:B]", help="Volume to compare with, too (.npz, .npy, HDF5); A:B are its slices to use."
 )
 @row_options
+@light_options
 @selection_options
 @heading(METHOD)
 @click.option(
@@ -73,6 +75,8 @@ def study(
     file: Path,
     methods: tuple[str, ...],
     truth: str | None,
+    photons_per_count: float | None,
+    dose_in: str | None,
     ramp: Filter,
     draws: int,
     seed: int,
@@ -92,30 +96,27 @@ def study(
     """
     from beamline.study.run import StudyOptions, run_study
     from beamline.study.table import text
+    from beamline.tradeoff.opened import ComparedScan
 
     methods = tuple(dict.fromkeys(methods))
     settings = row_settings(methods, values)
     source, selection = chosen(file, seed, values)
+    folder = output or Path(f"{file.stem}_{which}")
     options = StudyOptions(
-        source=source,
-        selection=selection,
+        scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
         study=STUDIES[which],
-        folder=output or Path(f"{file.stem}_{which}"),
         methods=methods,
         settings=settings,
         filter=ramp,
-        truth=truth,
         draws=draws,
         seed=seed,
-        command=repeating(click.get_current_context(), file, output or Path(f"{file.stem}_{which}")),
+        command=repeating(click.get_current_context(), file, folder),
     )
     with events_shown(as_json) as sink:
         table = run_study(options, sink, SystemClock())
     if not as_json:
         click.echo(text(table))
-        click.echo(f"\n{'report':<10}{options.folder / 'report.html'}")
+        click.echo(f"\n{'report':<10}{folder / 'report.html'}")
     if table.stopped:
         rows = sum(cell.row.groups is not None for cell in table.cells)
-        raise ScanStopped(
-            f"The study was stopped after {len(table.done)} of {rows} rows; {options.folder} holds those."
-        )
+        raise ScanStopped(f"The study was stopped after {len(table.done)} of {rows} rows; {folder} holds those.")

@@ -10,6 +10,7 @@ import click
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import POSITIVE, SEED, json_option, parsed
 from beamline.cli.recipe import repeating
+from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import events_shown
 from beamline.core.errors import ScanStopped
@@ -37,6 +38,7 @@ def listed(value: str) -> tuple[str, ...]:
     metavar="FILE[:A:B]",
     help="Volume to compare with (.npz, .npy, HDF5); A:B are its slices to use. Default: compare by views held out.",
 )
+@light_options
 @selection_options
 @heading(METHOD)
 @click.option(
@@ -66,6 +68,8 @@ def listed(value: str) -> tuple[str, ...]:
 def tradeoff(
     file: Path,
     truth: str | None,
+    photons_per_count: float | None,
+    dose_in: str | None,
     methods: tuple[str, ...] | None,
     quick: bool,
     max_seconds: float | None,
@@ -80,26 +84,25 @@ def tradeoff(
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
+    from beamline.tradeoff.opened import ComparedScan
     from beamline.tradeoff.report import text
     from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 
     source, selection = chosen(file, seed, values)
+    folder = output or Path(f"{file.stem}_tradeoff")
     options = TradeoffOptions(
-        source=source,
-        selection=selection,
-        folder=output or Path(f"{file.stem}_tradeoff"),
+        scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
         methods=methods or names_compared(),
         depth="quick" if quick else "full",
         max_seconds=max_seconds,
-        truth=truth,
         seed=seed,
-        command=repeating(click.get_current_context(), file, output or Path(f"{file.stem}_tradeoff")),
+        command=repeating(click.get_current_context(), file, folder),
     )
     with events_shown(as_json) as sink:
         table = run_tradeoff(options, sink, SystemClock())
     if not as_json:
         click.echo(text(table))
-        click.echo(f"\n{'report':<10}{options.folder / 'tradeoff.html'}")
+        click.echo(f"\n{'report':<10}{folder / 'tradeoff.html'}")
     if table.stopped:
         counts = f"{table.n_done} of {len(table.outcomes)}"
-        raise ScanStopped(f"The trade-off was stopped after {counts} trials; {options.folder} holds them.")
+        raise ScanStopped(f"The trade-off was stopped after {counts} trials; {folder} holds them.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,10 +48,14 @@ class KindStatistics:
     pixels: NDArray[np.int64]
 
 
-def statistics_of(source: ScanSource, progress: Callable[[int, int], None]) -> list[KindStatistics]:
-    """Of darks, flats and views, as far as there are any. `progress`: frames read, of how many."""
+def statistics_of(
+    source: ScanSource,
+    progress: Callable[[int, int], None],
+    kinds: Sequence[FrameKind] = (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION),
+) -> list[KindStatistics]:
+    """Of these kinds, as far as there are any. `progress`: frames read, of how many."""
     chosen = {}
-    for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
+    for kind in kinds:
         rows = np.flatnonzero(source.image_key == kind)
         if rows.size:
             chosen[kind] = rows[np.unique(np.linspace(0, rows.size - 1, FRAMES).round().astype(int))], rows.size
@@ -108,38 +112,113 @@ def _of_kind(
     )  # fmt: skip
 
 
-def light_of(
-    source: ScanSource, found: list[KindStatistics], photons_per_count: float, material: str | None
-) -> list[str]:
-    """Sentences: photons a pixel, and the dose of all views where pixel size and energy are known.
+@dataclass(frozen=True)
+class LightAsked:
+    """What the user knows of the light.
 
-    Args:
-        photons_per_count: photons at the sample; the user knows the detector.
-
-    Raises:
-        ConfigError: there are no flats, or pixel size or energy are missing.
+    Attributes:
+        photons_per_count: X-ray photons at the sample that make one count.
+        material: a name or formula to state the dose in; None: photons alone.
     """
-    by_kind = {each.kind: each for each in found}
-    flats = by_kind.get(FrameKind.FLAT)
-    if flats is None or FrameKind.DARK not in by_kind:
-        raise ConfigError(f"{source.path} has no darks and flats, which tell the light.")
-    photons, views = (flats.mean - by_kind[FrameKind.DARK].mean) * photons_per_count, by_kind[FrameKind.PROJECTION].of
-    seconds = (float(np.nanmean(source.exposures[source.image_key == kind])) for kind in (0, 1))
-    scaled = photons * next(seconds) / next(seconds)
-    scaled = scaled if np.isfinite(scaled) else photons
-    said = [f"{scaled:.4g} photons a pixel and view in the open beam, {scaled * views:.4g} in {views} views"]
-    if material is not None:
+
+    photons_per_count: float
+    material: str | None = None
+
+    def refuse(self, source: ScanSource) -> None:
+        """Before any frame is read.
+
+        Raises:
+            ConfigError: there are no darks and flats, or the scan does not state what a dose needs.
+        """
+        if not {FrameKind.DARK, FrameKind.FLAT} <= set(source.image_key):
+            raise ConfigError(f"{source.path} has no darks and flats, which tell the light.")
+        if self.material is not None:
+            self.gray(source, 0.0)
+
+    def gray(self, source: ScanSource, photons: float) -> float:
+        """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `refuse`."""
         if source.cone is not None:
             raise ConfigError(f"{source.path} is of a cone; --dose-in is for a parallel beam of one energy.")
         if source.pixel_size_mm is None or source.energy_kev is None:
             missing = "pixel size" if source.pixel_size_mm is None else "energy"
             raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
+        assert self.material is not None
         try:
-            gray = absorbed_dose(material, source.energy_kev, scaled * views / source.pixel_size_mm**2)
+            return absorbed_dose(self.material, source.energy_kev, photons / source.pixel_size_mm**2)
         except ValueError as error:
-            raise ConfigError(f"--dose-in {material}: {error}.") from error
-        said.append(f"{gray:.4g} Gy absorbed in {material} at {source.energy_kev:g} keV, at its surface, by all views")
-    return said
+            raise ConfigError(f"--dose-in {self.material}: {error}.") from error
+
+
+@dataclass(frozen=True)
+class Light:
+    """What a view of a scan costs the sample.
+
+    Attributes:
+        views: of the scan.
+        photons: a pixel and view, in the open beam at the sample.
+        gray: absorbed at the surface of the sample by a view; None: not asked for.
+        material: and energy, in words.
+    """
+
+    views: int
+    photons: float
+    gray: float | None = None
+    material: str = ""
+
+    @property
+    def of_a_frame(self) -> float:
+        """Gray, else photons a pixel."""
+        return self.photons if self.gray is None else self.gray
+
+    def of(self, frames: int) -> dict[str, float]:
+        """What so many frames cost, by name."""
+        return {"photons": self.photons * frames} | ({} if self.gray is None else {"gray": self.gray * frames})
+
+    def said(self) -> list[str]:
+        """Sentences on all views."""
+        each = f"{self.photons:.4g} photons a pixel and view in the open beam"
+        out = [f"{each}, {self.photons * self.views:.4g} in {self.views} views"]
+        if self.gray is not None:
+            out.append(f"{self.gray * self.views:.4g} Gy absorbed in {self.material}, at its surface, by all views")
+        return out
+
+
+def dose_axis(light: Light | None) -> str:
+    """What a picture says of the dose: of `Light.of_a_frame` times frames, or of frames."""
+    if light is None:
+        return "dose: frames that were exposed"
+    return "photons a pixel in the open beam" if light.gray is None else f"dose in {light.material} (Gy)"
+
+
+def light_of(source: ScanSource, found: list[KindStatistics], asked: LightAsked) -> Light:
+    """From the flats and darks among the statistics `found`.
+
+    Raises:
+        ConfigError: as `LightAsked.refuse`.
+    """
+    asked.refuse(source)
+    mean = {each.kind: each.mean for each in found}
+    photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
+    seconds = (source.exposures[source.image_key == kind] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
+    known = [each[np.isfinite(each)] for each in seconds]
+    if all(each.size for each in known):  # else of one exposure time
+        photons *= float(known[0].mean() / known[1].mean())
+    views = int(np.count_nonzero(source.image_key == FrameKind.PROJECTION))
+    if asked.material is None:
+        return Light(views, photons)
+    return Light(views, photons, asked.gray(source, photons), f"{asked.material} at {source.energy_kev:g} keV")
+
+
+def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
+    """Reads darks and flats; None if nobody asked.
+
+    Raises:
+        ConfigError: as `LightAsked.refuse`, before any frame is read.
+    """
+    if asked is None:
+        return None
+    asked.refuse(source)
+    return light_of(source, statistics_of(source, lambda n, of: None, (FrameKind.DARK, FrameKind.FLAT)), asked)
 
 
 def table(found: list[KindStatistics]) -> list[tuple[str, ...]]:

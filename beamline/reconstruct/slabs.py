@@ -59,6 +59,7 @@ class Needs:
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
         steps: bytes that the steps of the correction take.
+        longest: name of the step that takes the most alone.
         bars: error bars are made, too.
     """
 
@@ -67,6 +68,7 @@ class Needs:
     raw: int
     weighted: bool
     steps: StepMemory = _NO_STEPS
+    longest: str = ""
     bars: bool = False
 
     @classmethod
@@ -132,7 +134,18 @@ class Needs:
     @property
     def least(self) -> int:
         """The least memory that suffices."""
-        return max(self.slab(_ROWS), self.view + self.steps.correcting, self._alone, self.figures)
+        return max(self.parts.values())
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """What `least` is the largest of, in words."""
+        views = f"{self.geometry.n_views} views of {self.geometry.detector_shape[1]} columns"
+        return {
+            f"{self.method.name} of the smallest slab of {views}{' with weights' * self.weighted}": self.slab(_ROWS),
+            "the correction of a view": self.view + self.steps.correcting,
+            f"the step {self.longest}": self._alone,
+            "the measurement of the volume": self.figures,
+        }
 
     def height(self, memory: int) -> int:
         """Slices of the largest slabs for which the memory suffices, evenly; `least` must."""
@@ -166,8 +179,14 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
         axis = (axis - (selection.binning - 1) / 2) / selection.binning
     needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
     part = ScanPart(source, selection, needs.geometry)
-    steps = StepMemory.of_all(step.memory(part) for step in selection.in_order)
-    return replace(needs, method=options.method_for(needs.geometry), steps=steps, bars=options.uncertainty)
+    stated = {step.name: step.memory(part) for step in selection.in_order}
+    return replace(
+        needs,
+        method=options.method_for(needs.geometry),
+        steps=StepMemory.of_all(stated.values()),
+        longest=max(stated, key=lambda name: stated[name].alone),
+        bars=options.uncertainty,
+    )
 
 
 def spill_of(
@@ -242,10 +261,9 @@ def refuse_smallest(source: ScanSource, needs: Needs, memory: int, binning: int)
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
     raise DataError(
-        f"{source.path}: {needs.method.name} of the smallest slab of {needs.geometry.n_views} views of "
-        f"{needs.geometry.detector_shape[1]} columns{' with weights' if needs.weighted else ''} takes "
-        f"{size(needs.least)} of memory, {size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if "
-        f"there is as much, or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} takes {size(needs.least)} of memory, "
+        f"{size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if there is as much, "
+        f"or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
     )
 
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
+from beamline.projections.scan_statistics import dose_axis
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
 from beamline.report.slice_sheet import SliceSheet
@@ -48,9 +49,10 @@ def against_cost(table: StudyTable) -> bytes:
     for method in dict.fromkeys(cell.method for cell in table.done):
         cells = [c for c in table.done if c.method == method and math.isfinite(c.figures[name])]
         values = [cell.figures[name] for cell in cells]
-        for axes, cost in ((by_dose, [c.row.frames for c in cells]), (by_time, [c.cpu_seconds for c in cells])):
+        doses = [c.row.frames * (1 if table.light is None else table.light.of_a_frame) for c in cells]
+        for axes, cost in ((by_dose, doses), (by_time, [c.cpu_seconds for c in cells])):
             axes.plot(cost, values, "o", ms=4, color=colour_of(method), label=method)
-    by_dose.set(xlabel="dose: frames that were exposed", ylabel=f"{HEADINGS[name]} (dB)", xscale="log")
+    by_dose.set(xlabel=dose_axis(table.light), ylabel=f"{HEADINGS[name]} (dB)", xscale="log")
     by_time.set(xlabel="processor time (s)", xscale="log")
     for axes in (by_dose, by_time):
         axes.grid(alpha=0.3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,27 +13,24 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, StudyStarted, TrialDone, TrialReached
-from beamline.core.files import refuse_existing, result_folder
+from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
-from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import fit_truth, read_truth, regions
-from beamline.reconstruct.recon_report import facts_of
+from beamline.reconstruct.measure import regions
 from beamline.report.slice_sheet import SliceSheet
-from beamline.storage.readers.open import SourceOptions
 from beamline.study.figures import write_page
 from beamline.study.studies import Study, StudyRow, ViewSet, averaged
 from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data, write_array
 from beamline.tradeoff.launch import compile_kernels, run_trial
+from beamline.tradeoff.opened import ComparedScan, Opened, opened, until_stopped
 from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
 from drivers.base.clock import Clock
 from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Plain
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Volume
 from recon.methods import BASELINE
 from recon.voxels.fbp import Filter
 
@@ -46,23 +42,18 @@ class StudyOptions:
     """The scan and the study.
 
     Attributes:
-        selection: the study chooses from its views.
-        folder: for the results; must not exist.
+        scan: the study chooses from its views.
         methods: names in `recon.methods`.
         settings: of these methods, by name; methods left out have their own.
         filter: of the FBP of all views that rows are compared with.
-        truth: FILE or FILE:first:end to compare with, too.
         draws: how often random views are drawn.
     """
 
-    source: SourceOptions
-    selection: Selection
+    scan: ComparedScan
     study: Study
-    folder: Path
     methods: Sequence[str]
     settings: Mapping[str, Mapping[str, Plain]] = field(default_factory=dict)
     filter: Filter = "shepp-logan"
-    truth: str | None = None
     draws: int = 3
     seed: int = 0
     command: str = ""
@@ -102,69 +93,52 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
         ConfigError, DataError: nothing was written, or the table of the rows that were done.
         KeyboardInterrupt: before the first row was done; nothing was written.
     """
-    folder, started = options.folder, clock.now()
-    refuse_existing(folder)
-    wanted = None if options.truth is None else read_truth(options.truth)
+    folder, started, path = options.scan.folder, clock.now(), options.scan.source.path
     warn = Warnings(sink, clock)
-    with options.source.open() as source:
-        facts = facts_of(source)
-        prepared = prepare_projections(source, options.selection, warn)
-    geometry, grid = prepared.geometry, Grid.matching(prepared.geometry)
-    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning).data
-    shape = " × ".join(map(str, grid.shape))
-    table = _planned(options, geometry, {**facts.table, "volume": shape}, truth is not None)
+    scan = opened(options.scan, warn)
+    table = _planned(options, scan)
     todo = [cell for cell in table.cells if cell.row.groups is not None]
     if not todo:
         raise DataError(
-            f"{options.source.path}: {geometry.n_views} views are too few for any row of {options.study.name}: "
+            f"{path}: {scan.prepared.geometry.n_views} views are too few for any row of {options.study.name}: "
             f"{table.cells[-1].said}. Take a scan with more views."
         )
     left_out = len(table.cells) - len(todo)
-    sink(StudyStarted(options.source.path, len(todo), left_out, options.study.name, time=clock.now()))
+    sink(StudyStarted(path, len(todo), left_out, options.study.name, time=clock.now()))
     for cell in table.cells:
         if cell.row.groups is None and cell.method == options.methods[0]:
             warn(f"{cell.row.label} is left out: {cell.message}")
     slices = SliceSheet()
     with result_folder(folder) as work:
-        try:
-            write_array(work / "views.npy", prepared.projections.data)
-            if (rays := prepared.rays_there()) is not None:
-                write_array(work / "rays.npy", rays)
-            del prepared, rays  # from here on the views are in the file alone
-            rig = _Rig(work, geometry, options.seed, options.settings)
-            whole = StudyRow(REFERENCE, np.arange(geometry.n_views)[:, None])
-            reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
-            if reference is None:
-                raise DataError(
-                    f"{options.source.path}: the FBP of all views, to compare with, failed: {outcome.message}"
-                )
-            mask = regions(Volume(reference if truth is None else truth, grid), options.seed)
-            slices.add(REFERENCE, reference)
-            if truth is not None:
-                slices.add("truth", truth)
-            rig.compile(options.methods)
-            judge = _Judge(reference, truth, mask)
+        write_array(work / "views.npy", scan.prepared.projections.data)
+        if (rays := scan.prepared.rays_there()) is not None:
+            write_array(work / "rays.npy", rays)
+        rig = _Rig(work, scan.prepared.geometry, options.seed, options.settings)
+        grid, truth = scan.grid, scan.truth
+        del scan, rays  # from here on the views are in the file alone
+        whole = StudyRow(REFERENCE, np.arange(rig.geometry.n_views)[:, None])
+        reference, outcome = rig.reconstructed(whole, BASELINE, {"filter": options.filter})
+        if reference is None:
+            raise DataError(f"{path}: the FBP of all views, to compare with, failed: {outcome.message}")
+        judge = _Judge(reference, truth, regions(Volume(reference if truth is None else truth, grid), options.seed))
+        slices.add(REFERENCE, reference)
+        if truth is not None:
+            slices.add("truth", truth)
+        rig.compile(options.methods)
 
-            def stamped(event: Event) -> None:
-                sink(replace(event, time=clock.now()))
+        def stamped(event: Event) -> None:
+            sink(replace(event, time=clock.now()))
 
-            for grown in _each(table, rig, judge, slices, stamped, now):
-                table = grown
-                write_table(folder, table)
-        except KeyboardInterrupt:
-            if not table.done:
-                shutil.rmtree(folder, ignore_errors=True)
-                raise
-            table = replace(table, stopped=True)
-    write_table(folder, table)
+        table = until_stopped(table, _each(table, rig, judge, slices, stamped, now), folder, write_table)
     write_page(folder, table, slices)
-    summary = {"output": folder, "rows": len(todo), "done": len(table.done), "stopped": table.stopped}
+    summary = {"output": folder, "rows": len(todo), "done": table.n_done, "stopped": table.stopped}
     sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
 
 
-def _planned(options: StudyOptions, geometry: Geometry, facts: Mapping[str, str], truth: bool) -> StudyTable:
+def _planned(options: StudyOptions, scan: Opened) -> StudyTable:
     """The table before any row is done."""
+    geometry, truth = scan.prepared.geometry, scan.truth is not None
     turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2
     places = np.concatenate((geometry.shifts, turns), axis=1)
     rows = options.study.rows(ViewSet(geometry.angles, geometry.period, options.seed, options.draws, places))
@@ -183,10 +157,11 @@ def _planned(options: StudyOptions, geometry: Geometry, facts: Mapping[str, str]
     return StudyTable(
         options.study,
         tuple(Cell(row, method, message=row.reason) for row in rows for method in options.methods),
-        {**facts, "views to choose from": str(geometry.n_views)},
+        {**scan.facts, "views to choose from": str(geometry.n_views)},
         machine(),
         options.command,
         notes,
+        light=scan.light,
     )
 
 

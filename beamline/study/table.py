@@ -16,6 +16,7 @@ import numpy as np
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
 from beamline.core.version import version
+from beamline.projections.scan_statistics import Light
 from beamline.study.studies import Study, StudyRow
 from beamline.tradeoff.report import finite
 from beamline.tradeoff.trials import Status
@@ -67,6 +68,7 @@ class StudyTable:
         scan: facts for people, by name.
         notes: sentences on what the figures mean.
         stopped: it was interrupted before all rows were done.
+        light: of a frame; None: the dose is counted in frames.
     """
 
     study: Study
@@ -76,6 +78,7 @@ class StudyTable:
     command: str
     notes: Sequence[str] = ()
     stopped: bool = False
+    light: Light | None = None
 
     def with_cell(self, index: int, cell: Cell) -> StudyTable:
         return replace(self, cells=(*self.cells[:index], cell, *self.cells[index + 1 :]))
@@ -83,6 +86,10 @@ class StudyTable:
     @property
     def done(self) -> tuple[Cell, ...]:
         return tuple(cell for cell in self.cells if cell.status == "done")
+
+    @property
+    def n_done(self) -> int:
+        return len(self.done)
 
     @property
     def names(self) -> list[str]:
@@ -140,21 +147,21 @@ def write_table(folder: Path, table: StudyTable) -> None:
         "machine": dict(table.machine),
         "scan": dict(table.scan),
         "notes": list(table.notes),
-        "rows": [_record(cell) for cell in table.cells],
+        "rows": [_record(cell, table.light) for cell in table.cells],
     }
     record_text = json.dumps(finite(record), indent=1, ensure_ascii=False, allow_nan=False)
     write_whole(folder / "study.json", record_text, replace=True)
     out = io.StringIO()
-    writer = csv.DictWriter(out, list(_record(table.cells[0])), lineterminator="\n")
+    writer = csv.DictWriter(out, list(_record(table.cells[0], table.light)), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(finite(_record(cell)) for cell in table.cells)
+    writer.writerows(finite(_record(cell, table.light)) for cell in table.cells)
     write_whole(folder / "study.csv", out.getvalue(), replace=True)
 
 
-def _record(cell: Cell) -> dict[str, str | float | None]:
+def _record(cell: Cell, light: Light | None) -> dict[str, str | float | None]:
     return {
         "row": cell.row.label, "method": cell.method, "views": cell.row.n_views, "window": cell.row.window,
-        "frames": cell.row.frames,
+        "frames": cell.row.frames, **({} if light is None else light.of(cell.row.frames)),
         "status": cell.status, "seconds": cell.seconds, "cpu_seconds": cell.cpu_seconds,
         **{name: cell.figures.get(name) for name in HEADINGS},
         "message": cell.message,

@@ -154,11 +154,13 @@ def to_csv(table: TrialTable) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     costs = ("seconds", "cpu_seconds", "peak_bytes", "gaussians_end")
-    writer.writerow([*_FIELDS, *settings, "status", *costs, *names, "quality_db", "message"])
+    doses = [] if table.light is None else list(table.light.of(1))
+    writer.writerow([*_FIELDS, *settings, "status", *costs, *doses, *names, "quality_db", "message"])
     for outcome in table.outcomes:
         values = [getattr(outcome.trial, name) for name in _FIELDS]
         values += [outcome.trial.settings.get(name) for name in settings]
         values += [outcome.status, outcome.seconds, outcome.cpu_seconds, outcome.peak_bytes, outcome.gaussians]
+        values += [] if table.light is None else table.light.of(outcome.trial.views).values()
         values += [outcome.metrics.get(name) for name in names]
         writer.writerow([finite(v) for v in (*values, outcome.quality(table.by), outcome.message)])
     return out.getvalue()
@@ -167,7 +169,8 @@ def to_csv(table: TrialTable) -> str:
 def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
     """Write the page, and the pictures that have data; `slices` are of each baseline and of the truth."""
     pictures = []
-    for cost in (TIME, MEMORY):
+    doses = [table.dose] if len({outcome.trial.views for outcome in table.compared}) > 1 else []
+    for cost in (TIME, MEMORY, *doses):
         if table.front(cost):
             caption = (
                 f"{table.quality_name} of every trial against its {cost.words}. The line is the best quality "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,19 +11,15 @@ from typing import Any
 import numpy as np
 
 from beamline.core.events import Done, Sink, StateEntered, TradeoffStarted, TrialReached
-from beamline.core.files import refuse_existing, result_folder
+from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
 from beamline.projections.held_out import hold_out
-from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import fit_truth, read_truth
-from beamline.reconstruct.recon_report import facts_of
 from beamline.report.slice_sheet import SliceSheet
-from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
+from beamline.tradeoff.opened import ComparedScan, opened, until_stopped
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
@@ -43,19 +38,14 @@ class TradeoffOptions:
     """The scan and the trials to compare.
 
     Attributes:
-        folder: for the results; must not exist.
         methods: names in `recon.methods`.
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
-        truth: FILE or FILE:first:end to compare with.
     """
 
-    source: SourceOptions
-    selection: Selection
-    folder: Path
+    scan: ComparedScan
     methods: Sequence[str]
     depth: Depth = "quick"
     max_seconds: float | None = None
-    truth: str | None = None
     seed: int = 0
     command: str = ""
 
@@ -72,48 +62,33 @@ def run_tradeoff(
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    folder, started = options.folder, clock.now()
-    refuse_existing(folder)
-    wanted = None if options.truth is None else read_truth(options.truth)
-    warn = Warnings(sink, clock)
-    with options.source.open() as source:
-        facts = facts_of(source)
-        prepared = prepare_projections(source, options.selection, warn)
-    grid = Grid.matching(prepared.geometry)
-    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning).data
-    data = split(prepared, truth)
+    folder, started = options.scan.folder, clock.now()
+    scan = opened(options.scan, Warnings(sink, clock))
+    data = split(scan.prepared, scan.truth)
     trials = plan(
         options.methods,
         data.geometry.n_views,
-        default_count(Grid.of_field(data.geometry, grid.voxel_size)),
+        default_count(Grid.of_field(data.geometry, scan.grid.voxel_size)),
         options.depth,
     )
     table = TrialTable(
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
-        by="psnr" if truth is not None else "residual_held_out",
-        length_unit=prepared.length_unit,
+        by="psnr" if scan.truth is not None else "residual_held_out",
+        length_unit=scan.prepared.length_unit,
         machine=machine(),
-        scan={**facts.table, "views used": str(data.geometry.n_views), "volume": " × ".join(map(str, grid.shape))},
+        scan={**scan.facts, "views used": str(data.geometry.n_views)},
         command=options.command,
+        light=scan.light,
     )
-    sink(TradeoffStarted(options.source.path, len(trials), table.by, time=clock.now()))
+    sink(TradeoffStarted(options.scan.source.path, len(trials), table.by, time=clock.now()))
     slices = SliceSheet()
-    if truth is not None:
-        slices.add("truth", truth)
+    if scan.truth is not None:
+        slices.add("truth", scan.truth)
     with result_folder(folder) as work:
-        try:
-            data.save(work / "data.npz")
-            sink(StateEntered("compiling", "Compiling kernels that are not in the cache", time=clock.now()))
-            compile_kernels(trials, work)
-            for grown in _each(table, work, slices, options, sink, clock, now):
-                table = grown
-                write_table(folder, table)
-        except KeyboardInterrupt:
-            if table.n_done == 0:
-                shutil.rmtree(folder, ignore_errors=True)
-                raise
-            table = replace(table, stopped=True)
-    write_table(folder, table)
+        data.save(work / "data.npz")
+        sink(StateEntered("compiling", "Compiling kernels that are not in the cache", time=clock.now()))
+        compile_kernels(trials, work)
+        table = until_stopped(table, _each(table, work, slices, options, sink, clock, now), folder, write_table)
     write_figures(folder, table, slices)
     summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
     sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))

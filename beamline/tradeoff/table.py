@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.events import TrialDone
+from beamline.projections.scan_statistics import Light, dose_axis
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
 
@@ -50,6 +51,7 @@ class TrialTable:
         length_unit: of the resolution, "mm" or "px".
         scan: facts for people, by name.
         stopped: it was interrupted before all trials were done.
+        light: of a frame; None: the dose is counted in frames.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -59,6 +61,7 @@ class TrialTable:
     scan: Mapping[str, str]
     command: str
     stopped: bool = False
+    light: Light | None = None
 
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         return replace(self, outcomes=(*self.outcomes[:index], outcome, *self.outcomes[index + 1 :]))
@@ -66,6 +69,12 @@ class TrialTable:
     @property
     def n_done(self) -> int:
         return sum(outcome.status == "done" for outcome in self.outcomes)
+
+    @property
+    def dose(self) -> TrialCost:
+        """Each view is a frame of the scan."""
+        each = 1.0 if self.light is None else self.light.of_a_frame
+        return TrialCost("dose", "dose", dose_axis(self.light), each, lambda outcome: float(outcome.trial.views))
 
     @property
     def compared(self) -> tuple[Outcome, ...]:

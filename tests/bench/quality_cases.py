@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
@@ -33,7 +36,12 @@ F32 = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Views and what they should become; PSNR is taken with `peak`, on values clipped at 0."""
+    """Views and what they should become; PSNR is taken with `peak`, on values clipped at 0.
+
+    Attributes:
+        weights: of the rays; None: all alike.
+        unseen: views that judge in place of a truth, their geometry, and whether a ray [view, row, col] counts.
+    """
 
     name: str
     projections: F32
@@ -41,14 +49,19 @@ class Case:
     grid: Grid
     truth: F32
     peak: float
+    weights: F32 | None = None
+    unseen: tuple[F32, Geometry, NDArray[np.bool_]] | None = None
 
 
-def seen_by_simulator(fine: F32, geometry: Geometry) -> F32:
-    """Line integrals [view, row, col] by the simulator's projector, 2 x 2 rays a pixel: no method uses it."""
-    sample = Voxels.of(fine, 2 / len(fine))
+def seen_by_simulator(fine: F32, geometry: Geometry, voxel: float | None = None) -> F32:
+    """Line integrals [view, row, col] by the simulator's projector, 2 x 2 rays a pixel: no method uses it.
+
+    `voxel`: the edge of one of `fine`; None: of a cube of edge 2.
+    """
+    sample = Voxels.of(fine, voxel or 2 / len(fine))
     rows, cols = geometry.detector_shape
-    pitch = geometry.pixel_pitch * geometry.sod / geometry.sdd / 2  # at the sample
-    detector = Detector.centred((2 * rows, 2 * cols), pitch, geometry.sod)
+    axis = 2 * geometry.axis_col + 0.5, 2 * geometry.axis_row + 0.5
+    detector = Detector((2 * rows, 2 * cols), geometry.sample_pitch / 2, *axis, geometry.sod)
     views = [sample.line_integrals(float(a), detector).reshape(rows, 2, cols, 2) for a in geometry.angles]
     return np.stack([view.mean(axis=(1, 3)) for view in views]).astype(np.float32)
 
@@ -60,12 +73,12 @@ def seen_by_engine(fine: F32, geometry: Geometry) -> F32:
 
 def cone(folder: Path, name: str, views: int, size: int, seen: Callable[[F32, Geometry], F32] = seen_by_engine) -> Case:
     """An object of the protocol on size³ voxels and (2 size)² pixels, seen as 256³ voxels."""
-    fine = _padded(OBJECTS[name](folder), 256)
+    fine = padded(OBJECTS[name](folder), 256)
     factor = 256 // size
     truth = fine.reshape(size, factor, size, factor, size, factor).mean(axis=(1, 3, 5), dtype=np.float32)
     angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
     geometry = Geometry.cone(angles, (2 * size, 2 * size), 4 / (2 * size), 5.0, 7.0)
-    return Case(name, _noisy(seen(fine, geometry)), geometry, Grid((size, size, size), 2 / size), truth, 1.0)
+    return Case(name, noisy(seen(fine, geometry)), geometry, Grid((size, size, size), 2 / size), truth, 1.0)
 
 
 def walnut(folder: Path, views: int) -> Case:
@@ -76,8 +89,32 @@ def walnut(folder: Path, views: int) -> Case:
         chosen = np.linspace(0, 240, views, endpoint=False).astype(int)
         data = np.asarray(found[0][:][chosen], np.float32)
     geometry = Geometry.parallel(np.deg2rad(0.75 * chosen), (96, 256), 0.15217249972911476, 127.5)
-    truth = np.maximum(_first(folder / "walnut_fdk_256.npz")[70:166], 0)
+    truth = np.maximum(first_of(folder / "walnut_fdk_256.npz")[70:166], 0)
     return Case("walnut slab", data, geometry, Grid.matching(geometry), truth, float(truth.max()))
+
+
+def walnut_halved(folder: Path, views: int) -> Case:
+    """Pixels and voxels of `walnut` twice as large, 32 of its 48 slices."""
+    fine = walnut(folder, views)
+    data = fine.projections.reshape(views, 48, 2, 128, 2).mean(axis=(2, 4))[:, 8:40]
+    truth = fine.truth.reshape(48, 2, 128, 2, 128, 2).mean(axis=(1, 3, 5))[8:40]
+    geometry = Geometry.parallel(fine.geometry.angles, (32, 128), 2 * fine.geometry.pixel_pitch)
+    return Case("walnut", np.ascontiguousarray(data), geometry, Grid.matching(geometry), truth, float(truth.max()))
+
+
+def diamond(folder: Path, views: int) -> Case:
+    """32 rows of Diamond 24737, at most 76 of its 91 views; the other 15 judge."""
+    with SourceOptions(folder / "diamond_24737_parallel_91x135x160.h5").open() as source:
+        prepared = prepare_projections(source, Selection(rows=(65, 97), axis_col=85.75), lambda _: None)
+    data, rays = np.asarray(prepared.projections.data), prepared.rays_there()
+    rays = np.ones_like(data) if rays is None else np.broadcast_to(rays, data.shape)
+    judges = np.arange(3, 91, 6)
+    others = np.setdiff1d(np.arange(91), judges)
+    chosen = others[np.linspace(0, others.size - 1, views).round().astype(int)]
+    geometry = prepared.geometry.select(chosen)
+    grid = Grid.matching(geometry)
+    unseen = data[judges], prepared.geometry.select(judges), rays[judges] > 0
+    return Case("diamond", data[chosen], geometry, grid, np.zeros(grid.shape, np.float32), 1.0, rays[chosen], unseen)
 
 
 def slab(folder: Path, name: str, views: int, photons: float = 5000) -> Case:
@@ -112,7 +149,7 @@ def dense_battery(views: int, side: int = 256, photons: float = 2e4, particles: 
     return Case("battery", data.astype(np.float32), geometry, Grid.matching(geometry), truth, float(truth.max()))
 
 
-def _first(path: Path) -> F32:
+def first_of(path: Path) -> F32:
     with np.load(path, allow_pickle=False) as file:
         return np.asarray(file[next(iter(file))], np.float32)
 
@@ -132,7 +169,7 @@ def _unit(volume: F32, high: float) -> F32:
 
 
 OBJECTS: dict[str, Callable[[Path], F32]] = {
-    "teapot": lambda folder: _unit(_first(folder / "scivis_teapot_256.npz"), 255.0),
+    "teapot": lambda folder: _unit(first_of(folder / "scivis_teapot_256.npz"), 255.0),
     "shell": lambda folder: (lambda v: _unit(v, float(v.max())))(
         tifffile.imread(folder / "qim3d_shell_225x128x128.tif")
     ),
@@ -166,21 +203,21 @@ def _in_the_field(y: F32, x: F32) -> NDArray[np.bool_]:
 _FINE = (80, 256, 256)
 _MIDDLE = slice(88, 168)
 SLABS: dict[str, Callable[[Path], F32]] = {
-    "teapot": lambda folder: _padded(OBJECTS["teapot"](folder), 256)[_MIDDLE],
-    "shell": lambda folder: _padded(OBJECTS["shell"](folder), 256)[_MIDDLE],
-    "thorax": lambda folder: _padded(OBJECTS["thorax"](folder), 256)[_MIDDLE],
-    "kernel": lambda folder: np.maximum(_first(folder / "walnut_fdk_256.npz"), 0)[_MIDDLE, 60:188, 60:188],
+    "teapot": lambda folder: padded(OBJECTS["teapot"](folder), 256)[_MIDDLE],
+    "shell": lambda folder: padded(OBJECTS["shell"](folder), 256)[_MIDDLE],
+    "thorax": lambda folder: padded(OBJECTS["thorax"](folder), 256)[_MIDDLE],
+    "kernel": lambda folder: np.maximum(first_of(folder / "walnut_fdk_256.npz"), 0)[_MIDDLE, 60:188, 60:188],
     "grains": _grains,
     "foam": _foam,
 }  # fmt: skip
 
 
-def _padded(volume: F32, side: int) -> F32:
+def padded(volume: F32, side: int) -> F32:
     low = [(side - n) // 2 for n in volume.shape]
     return np.pad(volume, [(a, side - n - a) for a, n in zip(low, volume.shape, strict=True)])
 
 
-def _noisy(clean: F32, photons: float = 1e5, sigma: float = 10.0) -> F32:
+def noisy(clean: F32, photons: float = 1e5, sigma: float = 10.0) -> F32:
     rng = np.random.default_rng(0)
     top = float(clean.max())
     counts = rng.poisson(photons * np.exp(-clean / top)) + rng.normal(0, sigma, clean.shape)

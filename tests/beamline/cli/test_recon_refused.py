@@ -79,6 +79,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "loss misspelt": ({}, ["-m", "r2", "--loss", "l3"], 2, "l3"),
     "no such device": ({}, ["-m", "r2", "--device", "abacus"], 2, "--device abacus"),
     "no checkpoint": ({}, ["-m", "r2", "--resume", "none.h5"], 5, "none.h5 is not there"),
+    "no slabs": ({}, ["-m", "fista-tv", "--resume", "none.h5"], 5, "--resume none.h5 is not there"),
     "not a checkpoint": ({}, ["-m", "r2", "--resume", "scan.npy"], 5, "not a readable checkpoint"),
     "a checkpoint in the way": ({}, ["-m", "r2", "--checkpoint", "scan.npy"], 5, "never overwritten"),
     "the scan as checkpoint": ({}, ["-m", "r2", "--checkpoint", "scan.h5"], 2, "FILE and --checkpoint are the same"),

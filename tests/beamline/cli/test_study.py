@@ -56,7 +56,8 @@ def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: 
     write_exchange(folder / "many.h5", SCAN)
     truth = SCAN.truth(Grid((4, 40, 40)))
     np.save(folder / "truth.npy", truth)
-    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "--truth", "truth.npy", "-m", "fbp")
+    light = "--photons-per-count", "0.5"
+    result = _beamline("fixed-views", "many.h5", "--axis", "20.7", "--truth", "truth.npy", "-m", "fbp", *light)
     assert result.exit_code == 0, result.output
     rows = _rows(folder / "many_fixed-views")
     assert [(row["views"], row["status"]) for row in rows] == [
@@ -81,6 +82,8 @@ def test_rows_are_compared_with_the_fbp_of_all_views_and_with_the_truth(folder: 
     assert left == {"study.csv", "study.json", "report.html", "figures.png", "cost.png", "slices_fbp.png"}
     assert [row["frames"] for row in rows[2:]] == ["90", "45"]
     page = parsed_page((folder / "many_fixed-views" / "report.html").read_text(encoding="utf-8"))
+    assert float(rows[2]["photons"]) == pytest.approx(2 * float(rows[3]["photons"]))
+    assert any("photons a pixel and view" in text for text in page.text)
     assert f"{peak:.2f}" in page.text and any("asks for 360 views" in text for text in page.text)
 
 

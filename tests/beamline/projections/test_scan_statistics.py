@@ -1,5 +1,6 @@
 """Statistics of a raw scan are those of numpy over the same frames."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -8,7 +9,15 @@ import pytest
 
 from beamline.core.errors import ConfigError
 from beamline.projections import scan_statistics
-from beamline.projections.scan_statistics import PERCENT, histograms, light_of, statistics_of, table
+from beamline.projections.scan_statistics import (
+    PERCENT,
+    LightAsked,
+    histograms,
+    light_in,
+    light_of,
+    statistics_of,
+    table,
+)
 from beamline.storage.readers.open import SourceOptions, open_scan
 from drivers.base.frame import FrameKind
 from recon.prep.matter import absorbed_dose
@@ -66,20 +75,30 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
     with open_scan(path) as source:
         found = statistics_of(source, lambda n, of: None)
         photons = (found[1].mean - found[0].mean) * 0.25
-        light, dose = light_of(source, found, 0.25, "water")
-        with pytest.raises(ConfigError, match="neither a material"):
-            light_of(source, found, 0.25, "Xx")
-        with pytest.raises(ConfigError, match="no darks and flats"):
-            light_of(source, found[2:], 0.25, None)
+        light, dose = light_of(source, found, LightAsked(0.25, "water")).said()
+        assert light_in(source, LightAsked(0.25, "water")).said() == [light, dose]
     views = SCAN.angles.size
     assert light == f"{photons:.4g} photons a pixel and view in the open beam, {photons * views:.4g} in {views} views"
     expected = absorbed_dose("water", 20.0, photons * views / 0.002**2)
     assert dose.startswith(f"{expected:.4g} Gy absorbed in water at 20 keV")
 
 
-def test_a_dose_names_what_the_scan_does_not_state(tmp_path: Path) -> None:
-    path = write_flagged(tmp_path / "scan.h5", frames_of(SCAN), {}, pixel_size_mm=0.002, energy_kev=None)
-    with open_scan(path) as source:
-        found = statistics_of(source, lambda n, of: None)
-        with pytest.raises(ConfigError, match="does not state its energy"):
-            light_of(source, found, 0.25, "water")
+@pytest.mark.parametrize(
+    ("energy_kev", "material", "kinds", "said"),
+    [
+        (None, "water", (0, 1, 2), "does not state its energy"),
+        (20.0, "Xx", (0, 1, 2), "neither a material"),
+        (20.0, None, (0,), "no darks and flats"),
+    ],
+)
+def test_what_a_dose_lacks_is_said_before_any_frame_is_read(
+    tmp_path: Path, energy_kev: float | None, material: str | None, kinds: tuple[int, ...], said: str
+) -> None:
+    frames = [replace(f, index=n) for n, f in enumerate(f for f in frames_of(SCAN) if f.kind in kinds)]
+    path = write_flagged(tmp_path / "scan.h5", frames, {}, pixel_size_mm=0.002, energy_kev=energy_kev)
+    asked = LightAsked(0.25, material)
+    with open_scan(path) as source, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(source, "read", lambda rows: pytest.fail(f"rows {rows} were read"))
+        for refused in (lambda: asked.refuse(source), lambda: light_in(source, asked)):
+            with pytest.raises(ConfigError, match=said):
+                refused()

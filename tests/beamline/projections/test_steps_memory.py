@@ -155,3 +155,5 @@ def test_the_budget_counts_the_largest_step_that_is_alone_in_memory(tmp_path: Pa
     assert found.steps == StepMemory.of_all(stated)
     large = replace(found, steps=StepMemory(alone=10**9))
     assert large.least == 10**9 > found.least and large.at_once - found.at_once > 9e8
+    longest = steps[int(np.argmax([each.alone for each in stated]))]
+    assert max(large.parts, key=large.parts.__getitem__) == f"the step {longest.name}"

@@ -7,7 +7,7 @@ import errno
 import json
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +16,32 @@ import pytest
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
+from beamline.projections.scan_statistics import LightAsked
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from beamline.tradeoff import run as tradeoff
+from beamline.tradeoff.opened import ComparedScan
 from beamline.tradeoff.report import text
 from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from beamline.tradeoff.table import TIME
 from beamline.tradeoff.trials import Outcome, Trial
 from drivers.base.clock import SystemClock
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
-FIGURES = {"quality_seconds.png", "quality_memory.png"}
+FIGURES = {"quality_seconds.png", "quality_memory.png", "quality_dose.png"}
 TABLES = {"tradeoff.json", "tradeoff.csv", "tradeoff.html"}
 
 
 def _options(tmp_path: Path, **changes: Any) -> TradeoffOptions:
     if not (tmp_path / "scan.h5").exists():
         write_exchange(tmp_path / "scan.h5", SCAN)
-    options = TradeoffOptions(
-        SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out", ("r2", "fbp"),
-        command="beamline tradeoff scan.h5",
-    )  # fmt: skip
+    scan = ComparedScan(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out")
+    of_scan = {field.name: changes.pop(field.name) for field in fields(ComparedScan) if field.name in changes}
+    options = TradeoffOptions(replace(scan, **of_scan), ("r2", "fbp"), command="beamline tradeoff scan.h5")
     return replace(options, **changes)
 
 
@@ -88,7 +90,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
         assert float(row["seconds"]) == outcome.seconds
         assert float(row["quality_db"]) == pytest.approx(20 * math.log10(1000 * outcome.seconds))
     page = (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 5
     assert all(outcome.trial.label in page for outcome in table.compared)
     assert [e.event for e in events if e.event != "progress"] == [
         "tradeoff_started", "state", *["trial"] * len(rows), "done"
@@ -96,6 +98,18 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
     progress = [e.data for e in events if e.event == "progress"]
     assert [p["n"] for p in progress] == list(range(len(rows)))
     assert progress[0]["eta_s"] is None and progress[-1]["eta_s"] >= 0
+
+
+def test_each_trial_has_the_photons_of_its_views(tmp_path: Path, made_up: object) -> None:
+    options = _options(tmp_path, light=LightAsked(2.0))
+    table = run_tradeoff(options, lambda e: None, SystemClock())
+    with options.scan.source.open() as source:
+        counts = source.read(range(len(source.image_key))).astype(float)
+        flats, darks = (counts[source.image_key == kind].mean() for kind in (FrameKind.FLAT, FrameKind.DARK))
+    photons = 2 * (flats - darks)
+    assert "in 30 views" in table.scan["light"] and table.dose.axis == "photons a pixel in the open beam"
+    for row, outcome in zip(_rows(tmp_path / "out"), table.outcomes, strict=True):
+        assert float(row["photons"]) == pytest.approx(photons * outcome.trial.views)
 
 
 def test_the_table_marks_the_front_and_says_what_the_next_decibel_costs(tmp_path: Path, made_up: object) -> None:
@@ -244,6 +258,7 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
         ({"folder": Path()}, DataError, "never overwritten"),
         ({"folder": Path("no/such/folder")}, DataError, "does not exist"),
         ({"truth": "missing.npz"}, ConfigError, "missing.npz"),
+        ({"light": LightAsked(1.0, "water")}, ConfigError, "--dose-in needs"),
         ({"selection": Selection(views="first:1")}, ConfigError, "at least 2"),
     ],
 )

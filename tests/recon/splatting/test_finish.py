@@ -166,6 +166,19 @@ def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generato
     assert psnr(truth, found) > psnr(truth, fitted) + 3
 
 
+def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
+    views = Geometry.cone(np.linspace(0, 2 * math.pi, 30, endpoint=False), (16, 40), 1.0, 24.0, 33.6)
+    tall, grid = Grid((35, 24, 24), 1.0), Grid((11, 24, 24), 1.0)
+    z, y, x = np.meshgrid(*tall.coordinates(), indexing="ij")
+    body = 0.04 * ((np.hypot(x, y) < 8) & (np.hypot(x - 3, y) > 2)) * (1 + 0.3 * np.sin(z))
+    data = Projector(views, tall).forward(body.astype(np.float32))
+    data += np.random.default_rng(0).normal(0, 0.003, data.shape).astype(np.float32)
+    fitted, found = (reconstruct(data, views, R2(finish=n), grid=grid).volume.data for n in (0, None))
+    raw = reconstruct(data, views, FistaTv(), grid=grid).volume.data
+    truth = body[12:23]
+    assert psnr(truth, found) > psnr(truth, fitted) > psnr(truth, raw) + 10
+
+
 def test_where_voxels_cannot_explain_the_views_the_fit_is_not_spoiled() -> None:
     # Voxels of three pixels: a blob of four pixels is no sum of them.
     grid = Grid((4, 14, 14), 3.0)
