@@ -1,0 +1,94 @@
+"""Materials from several energies beside one volume an energy, on grains of known charge.
+
+pytest -m bench -s tests/bench/test_materials.py    (needs xraylib; a minute)
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import recon
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from simulators.light.palette import known
+from tests.bench.quality_cases import seen_by_simulator
+
+pytestmark = pytest.mark.bench
+SIDE, ROWS, PITCH = 96, 8, 1.1e-3  # mm
+SIX = (8.320, 8.336, 8.345, 8.3485, 8.352, 8.380)
+CASES = [  # energies, views of each, photons
+    ((8.320, 8.3485, 8.352), 30, 2000),
+    ((8.320, 8.345, 8.3485, 8.380), 30, 5000),
+    (SIX, 15, 5000),
+    (SIX, 15, 20_000),
+    (tuple(np.linspace(8.33, 8.37, 12)), 8, 5000),
+]
+WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1)
+
+
+def grains() -> F32:
+    """Fresh and charged oxide and electrolyte, [material, z, y, x] with two voxels a pixel; charge rises outwards."""
+    rng, side, rows = np.random.default_rng(1), 2 * SIDE, 2 * ROWS
+    y, x = (np.mgrid[:side, :side] - (side - 1) / 2) / 2
+    z = (np.arange(rows)[:, None, None] - (rows - 1) / 2) / 2
+    grain, charge = np.zeros((rows, side, side)), np.zeros((rows, side, side))
+    for _ in range(40):
+        at_x, at_y, at_z = rng.uniform(-30, 30), rng.uniform(-30, 30), rng.uniform(-6, 6)
+        radius = rng.uniform(3.5, 7)
+        far = np.sqrt((x - at_x) ** 2 + (y - at_y) ** 2 + (z - at_z) ** 2)
+        own = (far < radius) & (grain == 0)
+        grain[own] = 1
+        charge[own] = np.clip(rng.uniform(0.1, 0.6) + rng.uniform(0, 0.4) * far[own] / radius, 0, 1)
+    liquid = (np.hypot(x, y) < 42) * (1 - grain)
+    return np.stack([grain * (1 - charge), grain * charge, liquid]).astype(np.float32)
+
+
+@pytest.mark.parametrize(("energies", "each", "photons"), CASES)
+def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
+    fine, n = grains(), len(energies) * each
+    angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(energies)
+    geometry = Geometry.parallel(angles, (ROWS, SIDE), PITCH)
+    oxide, liquid = known("NMC811"), known("electrolyte")
+    assert oxide is not None
+    assert liquid is not None
+    materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid
+    sections = np.stack([material.attenuation(energies) for material in materials], 1)
+    lines = [seen_by_simulator(volume, geometry, PITCH / 2) for volume in fine]
+    depth = sum(line * sections[energy, m][:, None, None] for m, line in enumerate(lines))
+    counts = np.random.default_rng(2).poisson(photons * np.exp(-depth)).clip(1)
+    views = recon.EnergyViews((-np.log(counts / photons)).astype(np.float32), geometry, energy, sections)
+
+    truth = fine.reshape(3, ROWS, 2, SIDE, 2, SIDE, 2).mean((2, 4, 6))
+    oxides = truth[:2].sum(0)
+    matter, charge = oxides > 0.9, truth[1] / np.maximum(oxides, 0.1)
+
+    def error(densities: F32) -> float:
+        found = np.clip(densities[1] / np.maximum(densities[:2].sum(0), 0.05), 0, 1)
+        return float(np.sqrt(np.mean((found - charge)[matter] ** 2)))
+
+    def separately(weight: float) -> F32:
+        own = [np.flatnonzero(energy == e) for e in range(len(energies))]
+        method = recon.FistaTv(tv_weight=weight)
+        volumes = [
+            recon.reconstruct(views.projections[at], geometry.select(at), method=method).volume.data for at in own
+        ]
+        return np.einsum("me,ezyx->mzyx", np.linalg.pinv(sections), np.stack(volumes)).astype(np.float32)
+
+    began = time.process_time()
+    joint = error(recon.fit_materials(views).densities)
+    took = time.process_time() - began
+    apart = {weight: error(separately(weight)) for weight in WEIGHTS}
+    best = min(apart, key=lambda weight: apart[weight])
+    began = time.process_time()
+    separately(best)
+    alone = time.process_time() - began
+    guess = float(charge[matter].std())
+    print(
+        f"\n{len(energies)} energies of {each} views, {photons} photons: joint {joint:.3f} ({took:.1f} CPU s), "
+        f"apart {apart[best]:.3f} at {best} ({alone:.1f} CPU s), ratio {joint / apart[best]:.2f}, guess {guess:.3f}"
+    )
+    assert joint < apart[best]
