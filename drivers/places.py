@@ -1,4 +1,4 @@
-"""A motor between named places: any stage as a filter, or as sample mover."""
+"""A stage that goes to named places: as a filter, or as sample mover."""
 
 from __future__ import annotations
 
@@ -15,22 +15,27 @@ INSIDE, OUTSIDE = "into the beam", "out of the beam"
 
 
 @dataclass(frozen=True)
-class MotorPlaces:
-    """Where a motor goes, by name, and its speed: rad, rad/s of the stage. `failed`: what an error says before the
-    name."""
+class StagePlaces:
+    """Where a stage goes, by name.
+
+    Attributes:
+        places: rad of the stage.
+        speed: rad/s.
+        failed: how an error begins; the name of the place ends its sentence.
+    """
 
     places: Mapping[str, float]
     speed: float
     failed: str = "the filter did not come to"
 
 
-class StageFilter:
-    """Implements `drivers.base.protocols.Filter`.
+class PlacedStage:
+    """A stage that goes to named places. Implements `drivers.base.protocols.Filter` and `Watchable`.
 
     Each call asks the stage where it is, since a person may have moved it, and moves unless it stands there.
     """
 
-    def __init__(self, stage: RotationStage, places: MotorPlaces, clock: Clock, name: str = "filter") -> None:
+    def __init__(self, stage: RotationStage, places: StagePlaces, clock: Clock, name: str = "filter") -> None:
         self.name = name
         self._stage, self._places, self._clock = stage, places, clock
         self._check: Callable[[], None] = lambda: None
@@ -76,9 +81,9 @@ class StageFilter:
 
 
 class StageSampleMover:
-    """Implements `drivers.base.protocols.SampleMover` by a motor with the places INSIDE and OUTSIDE."""
+    """Implements `drivers.base.protocols.SampleMover` by a stage with the places INSIDE and OUTSIDE."""
 
-    def __init__(self, motor: StageFilter) -> None:
+    def __init__(self, motor: PlacedStage) -> None:
         self.name, self.watch, self.close, self._motor = motor.name, motor.watch, motor.close, motor
 
     def out(self) -> None:

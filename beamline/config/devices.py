@@ -8,7 +8,7 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_va
 
 from beamline.config.places import (
     FilterConfig,
-    MotorFilter,
+    MotorSection,
     NoFilter,
     PvUrl,
     PvValue,
@@ -259,7 +259,7 @@ BeamMonitorConfig = NoBeamMonitor | ElectrometerConfig | RingCurrentConfig | Epi
 
 
 def _simulated(device: Simple | StageMover | FilterConfig) -> bool:
-    return device.stage.simulated if isinstance(device, StageMover | MotorFilter) else device.kind == "simulated"
+    return device.stage.simulated if isinstance(device, MotorSection) else device.kind == "simulated"
 
 
 class DeviceSection(Section):
@@ -300,7 +300,7 @@ class DeviceSection(Section):
     def _port_is_free(self) -> Self:
         taken = {self.stage.port: "devices.stage"}
         for name, device in (("sample_mover", self.sample_mover), ("filter", self.filter)):
-            if not isinstance(device, StageMover | MotorFilter) or device.stage.simulated:
+            if not isinstance(device, MotorSection) or device.stage.simulated:
                 continue
             if (port := device.stage.port) in taken:
                 raise ValueError(

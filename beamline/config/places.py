@@ -14,7 +14,7 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.epics.channel import url_problem as pv_problem
 from drivers.epics.devices import FilterPvs, PvFilter
-from drivers.places import INSIDE, OUTSIDE, MotorPlaces, StageFilter, StageSampleMover
+from drivers.places import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
@@ -34,7 +34,7 @@ Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Name = Annotated[str, Field(min_length=1, max_length=80)]
 
 
-class _Motor(Section):
+class MotorSection(Section):
     """A motor of its own, any stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
 
     speed_deg_s: Annotated[float, Field(gt=0)] | None = None
@@ -50,18 +50,18 @@ class _Motor(Section):
         if self.speed_deg_s is not None and self.speed_deg_s > fastest * (1 + 1e-9):
             raise ValueError(f"speed_deg_s {self.speed_deg_s:g} is above max_speed_deg_s of its stage")
 
-    def _places(self, degrees: Mapping[str, float], failed: str) -> MotorPlaces:
+    def _places(self, degrees: Mapping[str, float], failed: str) -> StagePlaces:
         speed = self.stage.settings.figures.max_speed if self.speed_deg_s is None else math.radians(self.speed_deg_s)
-        return MotorPlaces({name: math.radians(place) for name, place in degrees.items()}, speed, failed)
+        return StagePlaces({name: math.radians(place) for name, place in degrees.items()}, speed, failed)
 
-    def _connected(self, name: str, places: MotorPlaces, clock: Clock, url: str | None) -> StageFilter:
+    def _connected(self, name: str, places: StagePlaces, clock: Clock, url: str | None) -> PlacedStage:
         try:
-            return StageFilter(self.stage.connect(clock, url), places, clock, name)
+            return PlacedStage(self.stage.connect(clock, url), places, clock, name)
         except DeviceError as cause:
             raise cause.told_by(name, cause.problem) from cause
 
 
-class StageMover(_Motor):
+class StageMover(MotorSection):
     """A motor that takes the sample out of the beam for flats, between two places."""
 
     kind: Literal["stage"]
@@ -99,7 +99,7 @@ class NamedFilter(Section):
     places: Annotated[tuple[Name, ...], Field(min_length=1)]
 
 
-class MotorFilter(_Motor):
+class MotorFilter(MotorSection):
     """Filters on a motor."""
 
     kind: Literal["stage"]
@@ -112,7 +112,7 @@ class MotorFilter(_Motor):
         _refuse_equal(self.places)
         return self
 
-    def connect(self, clock: Clock, url: str | None = None) -> StageFilter:
+    def connect(self, clock: Clock, url: str | None = None) -> PlacedStage:
         """As that of `StageMover`."""
         return self._connected("filter", self._places(self.places, "the filter did not come to"), clock, url)
 

@@ -30,11 +30,11 @@ from drivers.base.protocols import (
     Shutter,
     StageLimits,
     TriggerSource,
+    Watchable,
 )
-from drivers.epics.devices import PvFilter, PvShutter
+from drivers.epics.devices import PvShutter
 from drivers.frame_memory import FrameMemory
 from drivers.manual import Ask, ManualFilter, ManualSampleMover, ManualShutter
-from drivers.places import StageFilter, StageSampleMover
 from drivers.shutter import OutputShutter
 from drivers.stages.travel import Travel
 
@@ -52,7 +52,7 @@ class ConnectedDevices:
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None if none is configured.
         frame_memory: of the camera's frames; None for a simulated camera.
-        watch_moves: takes what is called again and again while sample or filter moves; its exception ends the move.
+        watch_moves: takes what is called again and again while sample or filter moves; its exception ends the wait.
     """
 
     devices: Devices
@@ -108,7 +108,7 @@ def connect(
 
         def watch(check: Callable[[], None]) -> None:
             for device in (devices.sample, devices.filter):
-                if isinstance(device, StageSampleMover | StageFilter | PvFilter):
+                if isinstance(device, Watchable):
                     device.watch(check)
 
         return ConnectedDevices(devices, clock, simulated, opened.pop_all().close, monitor, memory, watch)

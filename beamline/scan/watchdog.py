@@ -26,7 +26,7 @@ import psutil
 
 from beamline.config.devices import EpicsShutter, Simple
 from beamline.config.load import Config, load
-from beamline.config.places import MotorFilter, StageMover
+from beamline.config.places import MotorSection
 from beamline.core.events import Sink, Warned
 from beamline.core.process import ChildProcess
 from beamline.core.stop import PauseRequest, StopRequest
@@ -156,7 +156,7 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
     if apart:
         done.append(_insist(lambda: PvShutter(apart.pvs, clock).close(), clock, say, "The shutter is closed."))
     for name, device in (("sample mover", config.devices.sample_mover), ("filter", config.devices.filter)):
-        if isinstance(device, StageMover | MotorFilter):
+        if isinstance(device, MotorSection):
             halt = partial(device.stage.halt, clock)
             done.append(_insist(halt, clock, say, f"The {name} was told to stop."))
     done.append(_insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}."))

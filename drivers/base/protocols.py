@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,6 +234,14 @@ class Filter(Protocol):
 
     def place(self) -> str | None:
         """Where it stands; None: at none of its places, or not known. Raises DeviceError."""
+
+
+@runtime_checkable
+class Watchable(Protocol):
+    """A device that moves while its caller waits, such as a sample mover or a filter on a motor."""
+
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again while it moves; its exception ends the wait."""
 
 
 @dataclass(frozen=True)

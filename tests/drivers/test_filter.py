@@ -14,7 +14,7 @@ from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import Filter
 from drivers.epics.devices import FilterPvs, PvFilter
 from drivers.manual import ManualFilter
-from drivers.places import MotorPlaces, StageFilter
+from drivers.places import PlacedStage, StagePlaces
 from drivers.stages.epics.settings import EpicsSettings
 from drivers.stages.epics.stage import EpicsStage
 from simulators.devices.trigger_line import TriggerLine
@@ -59,8 +59,8 @@ def _on_a_motor(opened: ExitStack, patch: pytest.MonkeyPatch) -> Rig:
 
     patch.setattr(stage, "start_move", counted)
     degrees = {"none": 10.0, "Al 1 mm": 30.0, "Cu": 50.0}
-    places = MotorPlaces({name: math.radians(each) for name, each in degrees.items()}, math.radians(10))
-    moved = StageFilter(stage, places, clock)
+    places = StagePlaces({name: math.radians(each) for name, each in degrees.items()}, math.radians(10))
+    moved = PlacedStage(stage, places, clock)
     opened.callback(moved.close)
     return Rig(moved, lambda: len(starts), lambda: record.state.update({".SPMG": 0.0}))
 
@@ -135,7 +135,7 @@ def test_an_abort_ends_the_move(kind: str, monkeypatch: pytest.MonkeyPatch) -> N
         def abort() -> None:
             raise KeyboardInterrupt
 
-        assert isinstance(rig.filter, StageFilter | PvFilter)
+        assert isinstance(rig.filter, PlacedStage | PvFilter)
         rig.filter.watch(abort)
         with pytest.raises(KeyboardInterrupt):
             rig.filter.put("Cu")

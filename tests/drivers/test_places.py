@@ -9,7 +9,7 @@ import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import SampleMover
-from drivers.places import INSIDE, OUTSIDE, MotorPlaces, StageFilter, StageSampleMover
+from drivers.places import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
 from drivers.stages.epics.settings import EpicsSettings
 from drivers.stages.epics.stage import EpicsStage
 from simulators.devices.trigger_line import TriggerLine
@@ -19,7 +19,7 @@ from tests.drivers.soft_ioc import TickingClock, record_of
 from tests.drivers.stages.epics.test_conformance import USUAL
 from tests.drivers.stages.flat_settings import flat
 
-PLACES = MotorPlaces({INSIDE: math.radians(1), OUTSIDE: math.radians(41)}, math.radians(10), "the sample did not come")
+PLACES = StagePlaces({INSIDE: math.radians(1), OUTSIDE: math.radians(41)}, math.radians(10), "the sample did not come")
 
 
 class Rig:
@@ -28,7 +28,7 @@ class Rig:
         self.record: MotorRecord = record_of(self.clock, TriggerLine(self.clock), **build)
         stage = EpicsStage(register(f"epics-{uuid4().hex}", self.record), flat(EpicsSettings, **USUAL), self.clock)
         self.checks, self.aborts_after = 0, 10**9
-        mover = StageSampleMover(StageFilter(stage, PLACES, self.clock, "sample mover"))
+        mover = StageSampleMover(PlacedStage(stage, PLACES, self.clock, "sample mover"))
         mover.watch(self._check)
         self.mover: SampleMover = mover
 

@@ -17,7 +17,7 @@ from beamline.scan.run import run_scan
 from beamline.scan.tune import tune
 from beamline.storage.rules.nexus import nexus_findings
 from drivers.base.errors import DeviceError
-from drivers.places import StageFilter
+from drivers.places import PlacedStage
 from tests.beamline import ran
 from tests.beamline.ball_scan import COMMON, shipped, small
 from tests.beamline.fakes import FakeInstrument
@@ -81,7 +81,7 @@ def test_a_motor_brings_it_there_for_a_scan_and_for_tune(tmp_path: Path) -> None
     settings = small(places, "scan.filter=Cu", *SHORT)
     for act in (lambda: run_scan(settings, tmp_path, instrument=on), lambda: tune(settings, on, StopRequest(), print)):
         with devices.connect(settings) as on:
-            assert isinstance(on.devices.filter, StageFilter) and on.devices.filter.place() == "none"
+            assert isinstance(on.devices.filter, PlacedStage) and on.devices.filter.place() == "none"
             act()
             assert on.devices.filter.place() == "Cu"
             assert math.degrees(on.devices.filter._stage.position()) == pytest.approx(12, abs=1e-3)
