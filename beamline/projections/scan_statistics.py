@@ -133,20 +133,20 @@ class LightAsked:
         if not {FrameKind.DARK, FrameKind.FLAT} <= set(source.image_key):
             raise ConfigError(f"{source.path} has no darks and flats, which tell the light.")
         if self.material is not None:
-            self.gray(source, 0.0)
+            _gray(self.material, source, 0.0)
 
-    def gray(self, source: ScanSource, photons: float) -> float:
-        """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `refuse`."""
-        if source.cone is not None:
-            raise ConfigError(f"{source.path} is of a cone; --dose-in is for a parallel beam of one energy.")
-        if source.pixel_size_mm is None or source.energy_kev is None:
-            missing = "pixel size" if source.pixel_size_mm is None else "energy"
-            raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
-        assert self.material is not None
-        try:
-            return absorbed_dose(self.material, source.energy_kev, photons / source.pixel_size_mm**2)
-        except ValueError as error:
-            raise ConfigError(f"--dose-in {self.material}: {error}.") from error
+
+def _gray(material: str, source: ScanSource, photons: float) -> float:
+    """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `LightAsked.refuse`."""
+    if source.cone is not None:
+        raise ConfigError(f"{source.path} is of a cone; --dose-in is for a parallel beam of one energy.")
+    if source.pixel_size_mm is None or source.energy_kev is None:
+        missing = "pixel size" if source.pixel_size_mm is None else "energy"
+        raise ConfigError(f"--dose-in needs pixel size and energy; {source.path} does not state its {missing}.")
+    try:
+        return absorbed_dose(material, source.energy_kev, photons / source.pixel_size_mm**2)
+    except ValueError as error:
+        raise ConfigError(f"--dose-in {material}: {error}.") from error
 
 
 @dataclass(frozen=True)
@@ -157,18 +157,13 @@ class Light:
         views: of the scan.
         photons: a pixel and view, in the open beam at the sample.
         gray: absorbed at the surface of the sample by a view; None: not asked for.
-        material: and energy, in words.
+        material: that absorbs it, and the energy, in words.
     """
 
     views: int
     photons: float
     gray: float | None = None
     material: str = ""
-
-    @property
-    def of_a_frame(self) -> float:
-        """Gray, else photons a pixel."""
-        return self.photons if self.gray is None else self.gray
 
     def of(self, frames: int) -> dict[str, float]:
         """What so many frames cost, by name."""
@@ -183,11 +178,13 @@ class Light:
         return out
 
 
-def dose_axis(light: Light | None) -> str:
-    """What a picture says of the dose: of `Light.of_a_frame` times frames, or of frames."""
+def dose_scale(light: Light | None) -> tuple[float, str]:
+    """What a frame adds to the dose that a picture shows, and the label of that axis: gray, photons or frames."""
     if light is None:
-        return "dose: frames that were exposed"
-    return "photons a pixel in the open beam" if light.gray is None else f"dose in {light.material} (Gy)"
+        return 1.0, "dose: frames that were exposed"
+    if light.gray is None:
+        return light.photons, "photons a pixel in the open beam"
+    return light.gray, f"dose in {light.material} (Gy)"
 
 
 def light_of(source: ScanSource, found: list[KindStatistics], asked: LightAsked) -> Light:
@@ -206,7 +203,9 @@ def light_of(source: ScanSource, found: list[KindStatistics], asked: LightAsked)
     views = int(np.count_nonzero(source.image_key == FrameKind.PROJECTION))
     if asked.material is None:
         return Light(views, photons)
-    return Light(views, photons, asked.gray(source, photons), f"{asked.material} at {source.energy_kev:g} keV")
+    return Light(
+        views, photons, _gray(asked.material, source, photons), f"{asked.material} at {source.energy_kev:g} keV"
+    )
 
 
 def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
-from beamline.projections.scan_statistics import dose_axis
+from beamline.projections.scan_statistics import dose_scale
 from beamline.report.figures import DPI, WIDTH, png
 from beamline.report.html import Picture, render
 from beamline.report.slice_sheet import SliceSheet
@@ -46,13 +46,14 @@ def against_cost(table: StudyTable) -> bytes:
     name = "psnr_truth" if "psnr_truth" in table.names else table.names[0]
     figure = Figure(figsize=(WIDTH, 3.6), dpi=DPI, layout="constrained")
     by_dose, by_time = figure.subplots(1, 2, sharey=True)
+    a_frame, dose = dose_scale(table.light)
     for method in dict.fromkeys(cell.method for cell in table.done):
         cells = [c for c in table.done if c.method == method and math.isfinite(c.figures[name])]
         values = [cell.figures[name] for cell in cells]
-        doses = [c.row.frames * (1 if table.light is None else table.light.of_a_frame) for c in cells]
+        doses = [c.row.frames * a_frame for c in cells]
         for axes, cost in ((by_dose, doses), (by_time, [c.cpu_seconds for c in cells])):
             axes.plot(cost, values, "o", ms=4, color=colour_of(method), label=method)
-    by_dose.set(xlabel=dose_axis(table.light), ylabel=f"{HEADINGS[name]} (dB)", xscale="log")
+    by_dose.set(xlabel=dose, ylabel=f"{HEADINGS[name]} (dB)", xscale="log")
     by_time.set(xlabel="processor time (s)", xscale="log")
     for axes in (by_dose, by_time):
         axes.grid(alpha=0.3)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from beamline.core.events import TrialDone
-from beamline.projections.scan_statistics import Light, dose_axis
+from beamline.projections.scan_statistics import Light, dose_scale
 from beamline.tradeoff import pareto
 from beamline.tradeoff.trials import Outcome
 
@@ -72,9 +72,9 @@ class TrialTable:
 
     @property
     def dose(self) -> TrialCost:
-        """Each view is a frame of the scan."""
-        each = 1.0 if self.light is None else self.light.of_a_frame
-        return TrialCost("dose", "dose", dose_axis(self.light), each, lambda outcome: float(outcome.trial.views))
+        """Of the views of a trial, each of which is a frame of the scan."""
+        a_frame, axis = dose_scale(self.light)
+        return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.views))
 
     @property
     def compared(self) -> tuple[Outcome, ...]:
