@@ -411,10 +411,7 @@ def _pictures(
 
 def _of_wedges(unseen: Sequence[Wedge]) -> str:
     """Size and direction of the wedges, and what they do to the volume."""
-    along = [(math.degrees(wedge.first) + 90) % 180 for wedge in unseen]  # a view's rays run across its columns
-    said = " and ".join(
-        f"{first:.0f} to {first + math.degrees(wedge.size):.0f}°" for first, wedge in zip(along, unseen, strict=True)
-    )
+    said = " and ".join("{:.0f} to {:.0f}°".format(*wedge.rays) for wedge in unseen)
     size = math.degrees(sum(wedge.size for wedge in unseen))
     return (
         f"{size:.0f}° of rays are in no view, those at {said} from x towards y (orange): edges along them are blurred, "

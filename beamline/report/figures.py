@@ -233,7 +233,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     show_grey(axes, volume.data[at], grey_window([volume.data[at]]), (*edges[0], *edges[1]))
     radius = 0.48 * grid.shape[2] * grid.voxel_size
     for wedge in unseen:
-        first, last = (math.degrees(angle) + 90 for angle in (wedge.first, wedge.first + wedge.size))
+        first, last = wedge.rays
         for turn in (0, 180):  # a ray runs both ways
             sector = Sector((0, 0), radius, first + turn, last + turn, facecolor=("tab:orange", 0.08))
             sector.set(edgecolor="tab:orange", linewidth=1.2)

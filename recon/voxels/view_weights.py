@@ -171,10 +171,16 @@ def missing_arc(geometry: Geometry) -> float:
 
 
 class Wedge(NamedTuple):
-    """Directions of rays that views do not show: those of views at angles from `first` on, over `size` (radians)."""
+    """Rays that no view shows: those of views that are missing from the angle `first` on, over `size` (radians)."""
 
     first: float
     size: float
+
+    @property
+    def rays(self) -> tuple[float, float]:
+        """Directions of the first and the last ray, degrees from x towards y: a view's rays run across its columns."""
+        first = (math.degrees(self.first) + 90) % 180
+        return first, first + math.degrees(self.size)
 
 
 def unseen_wedges(geometry: Geometry) -> list[Wedge]:

@@ -203,6 +203,7 @@ def test_the_wedge_is_what_no_view_sees() -> None:
     """Of a parallel beam between views; of a fan what a short scan lacks, in the middle of the rays of the axis."""
     (wedge,) = unseen_wedges(Geometry.parallel(np.radians(np.arange(10, 130, 1.5)), (4, 64)))
     assert np.degrees([wedge.first, wedge.size]) == pytest.approx([129.25, 60.0])
+    assert wedge.rays == pytest.approx((39.25, 99.25))
     fan = Geometry.fan(np.radians(np.arange(20, 170, 1.5)), 64, 1.0, 100, 150)
     (wedge,) = unseen_wedges(fan)
     assert wedge.size == pytest.approx(missing_arc(fan))
