@@ -122,7 +122,7 @@ def predicts_best(
             return
         if stopped():
             return
-        common.update(shared(decide.made))
+        common.update(shared_decisions(decide.made))
         own = float(_residuals(volume, some).mean())
         hides = partial(_hides, volume, trial)
         score = Score(at, method, _residuals(volume, judge), own, hides=hides)
@@ -156,7 +156,7 @@ def predicts_best(
     return best.at, "; ".join(listed + [f"{name} not tried in time" for name in late])
 
 
-def shared(made: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
+def shared_decisions(made: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
     """Decisions of a trial that hold for other methods on the same views: the weight of total variation that views held
     out prefer, with its units. Empty where no such weight was found.
 

@@ -59,7 +59,7 @@ class Needs:
         geometry: of the views, binned; before any is read, one that is alike.
         raw: of the pixels as they are read.
         steps: bytes that the steps of the correction take.
-        longest: name of the step that takes the most alone.
+        largest_step: name of the one that takes the most alone.
         bars: error bars are made, too.
     """
 
@@ -68,7 +68,7 @@ class Needs:
     raw: int
     weighted: bool
     steps: StepMemory = _NO_STEPS
-    longest: str = ""
+    largest_step: str = ""
     bars: bool = False
 
     @classmethod
@@ -138,12 +138,12 @@ class Needs:
 
     @property
     def parts(self) -> dict[str, int]:
-        """What `least` is the largest of, in words."""
+        """Bytes of each part that must fit alone, by what an error calls it."""
         views = f"{self.geometry.n_views} views of {self.geometry.detector_shape[1]} columns"
         return {
             f"{self.method.name} of the smallest slab of {views}{' with weights' * self.weighted}": self.slab(_ROWS),
             "the correction of a view": self.view + self.steps.correcting,
-            f"the step {self.longest}": self._alone,
+            f"the step {self.largest_step}": self._alone,
             "the measurement of the volume": self.figures,
         }
 
@@ -184,7 +184,7 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
         needs,
         method=options.method_for(needs.geometry),
         steps=StepMemory.of_all(stated.values()),
-        longest=max(stated, key=lambda name: stated[name].alone),
+        largest_step=max(stated, key=lambda name: stated[name].alone),
         bars=options.uncertainty,
     )
 

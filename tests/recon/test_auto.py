@@ -16,7 +16,7 @@ from recon.base.decisions import Decisions
 from recon.base.method import MethodResult, ReconProblem, RunControl, Traits
 from recon.base.volume import Volume
 from recon.splatting.r2 import R2
-from recon.trials import shared
+from recon.trials import shared_decisions
 from recon.voxels import held_out_weight
 from recon.voxels.direct import Fbp
 from recon.voxels.held_out_weight import PREFERRED, preferred_weight
@@ -91,10 +91,10 @@ def test_the_weight_that_one_trial_finds_is_that_of_all_trials(data: F32, monkey
 
 def test_a_weight_by_the_noise_is_not_passed_on() -> None:
     """It follows from sums over a volume, and views of a cone have no other."""
-    assert shared({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]], PREFERRED: [None], "sweeps": [8]}) == {}
-    assert shared({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]]}) == {}
+    assert shared_decisions({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]], PREFERRED: [None], "sweeps": [8]}) == {}
+    assert shared_decisions({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]]}) == {}
     made: dict[str, list[Any]] = {"units": [(1, 1, 1), (2, 2, 2)], PREFERRED: [0.1], "sweeps": [8], "restart": [True]}
-    assert shared(made) == {"units": [(1, 1, 1)], PREFERRED: [0.1]}
+    assert shared_decisions(made) == {"units": [(1, 1, 1)], PREFERRED: [0.1]}
 
 
 def test_a_blurred_volume_is_not_preferred_to_a_sharp_one(data: F32, truth: F32) -> None:
