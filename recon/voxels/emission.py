@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import xlogy
@@ -57,6 +58,16 @@ def attenuation_factors(mu: Volume, geometry: Geometry) -> F32:
     return np.exp(-Projector(geometry, mu.grid).forward(mu.data))
 
 
+class _Subset(NamedTuple):
+    """The lines of some views, what `Emission` says of them, and `sensitivity` Aᵀ survival [z, y, x]."""
+
+    projector: Projector
+    counts: F32
+    survival: F32
+    background: F32 | np.float32
+    sensitivity: F32
+
+
 def mlem(
     emission: Emission,
     grid: Grid,
@@ -90,21 +101,24 @@ def mlem(
     whole = Projector(emission.geometry, grid)
     parts = []
     for views in interleaved(whole, subsets):
-        part, survival, background = whole.subset(views), emission.survival, emission.background
-        factor = np.ones(part.projection_shape, np.float32) if survival is None else survival[views]
-        beside = np.float32(0) if background is None else background[views]
-        parts.append((part, emission.counts[views], factor, beside, part.adjoint(factor)))
-    most = max(float(part[-1].max()) for part in parts)
+        projector = whole.subset(views)
+        if emission.survival is None:
+            survival = np.ones(projector.projection_shape, np.float32)
+        else:
+            survival = emission.survival[views]
+        background = np.float32(0) if emission.background is None else emission.background[views]
+        parts.append(_Subset(projector, emission.counts[views], survival, background, projector.adjoint(survival)))
+    most = max(float(part.sensitivity.max()) for part in parts)
     if most == 0:
         raise ValueError("no line sees the grid: survival is 0 everywhere, or the lines miss it")
     least = _LEAST * most
-    x = np.where(sum(part[-1] for part in parts) > least, np.float32(1), np.float32(0))
-    seen = sum(float(x.ravel() @ part[-1].ravel()) for part in parts)
+    x = np.where(sum(part.sensitivity for part in parts) > least, np.float32(1), np.float32(0))
+    seen = sum(float(x.ravel() @ part.sensitivity.ravel()) for part in parts)
     x *= np.float32(emission.counts.sum(dtype=np.float64) / seen)
     for iteration in range(1, iterations + 1):
         likelihood = 0.0
-        for part, counts, factor, beside, sensitivity in parts:
-            mean = factor * part.forward(x) + beside
+        for projector, counts, survival, background, sensitivity in parts:
+            mean = survival * projector.forward(x) + background
             if blind := np.count_nonzero(counts[mean <= 0]):
                 raise ValueError(
                     f"{blind} lines have counts and the mean 0: they miss the grid, or "
@@ -112,7 +126,9 @@ def mlem(
                 )
             ratio = np.divide(counts, mean, out=np.zeros_like(mean), where=mean > 0)
             likelihood += float(np.sum(xlogy(counts, mean) - mean, dtype=np.float64))
-            x *= np.divide(part.adjoint(factor * ratio), sensitivity, out=np.ones_like(x), where=sensitivity > least)
+            x *= np.divide(
+                projector.adjoint(survival * ratio), sensitivity, out=np.ones_like(x), where=sensitivity > least
+            )
         if on_iteration is not None and on_iteration(iteration, likelihood):
             break
     return Volume(x, grid)
