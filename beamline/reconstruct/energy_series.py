@@ -26,11 +26,11 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
-from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.spectral import EnergyViews, Materials, fit_materials
 
 _SWEEPS = 20
+_ARCS_ALIKE = 0.01  # share of the larger one by which arcs of two scans may differ
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,19 +153,8 @@ def reconstruct_materials(
 
 
 def _joined(parts: Sequence[PreparedProjections], attenuation: NDArray[np.float64]) -> EnergyViews:
-    """The views of all scans."""
-    first = parts[0].geometry
-    for part in parts[1:]:
-        own = part.geometry
-        if (own.detector_shape, own.pixel_pitch, own.sod, own.sdd) != (
-            first.detector_shape, first.pixel_pitch, first.sod, first.sdd
-        ):  # fmt: skip
-            raise ConfigError(
-                f"The scans do not fit together: {first.detector_shape} pixels of {first.pixel_pitch:g} "
-                f"{parts[0].length_unit}, and {own.detector_shape} of {own.pixel_pitch:g}. Nothing was written."
-            )
-    if parts[0].length_unit != "mm":
-        raise ConfigError("The spectra are in 1/mm; give --pixel-size-um, as the scans do not state it.")
+    """The views of all scans; those of a scan with another rotation axis than the first are displaced."""
+    _refuse_unlike(parts)
     weights = [part.ray_weights() for part in parts]
     data = np.concatenate([part.projections.data for part in parts])
     weight = None
@@ -177,26 +166,37 @@ def _joined(parts: Sequence[PreparedProjections], attenuation: NDArray[np.float6
             ]
         ).astype(np.float32)
         data = np.where(weight > 0, data, np.float32(0))
-
-    def of_views(name: str) -> NDArray[np.float64]:
-        return np.concatenate([getattr(part.geometry, name) for part in parts])
-
+    geometry = parts[0].geometry
+    for own in (part.geometry for part in parts[1:]):
+        displaced = np.array([own.axis_col - geometry.axis_col, 0.0])
+        geometry = geometry.followed_by(replace(own, shifts=own.shifts + displaced))
     energy = np.repeat(np.arange(len(parts)), [part.geometry.n_views for part in parts])
-    geometry = replace(
-        first, angles=of_views("angles"), shifts=of_views("shifts"), roll=of_views("roll"), tilt=of_views("tilt")
-    )
     try:
-        return EnergyViews(data, _placed(geometry, parts, energy), energy, attenuation, weight)
+        return EnergyViews(data, geometry, energy, attenuation, weight)
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
 
 
-def _placed(geometry: Geometry, parts: Sequence[PreparedProjections], energy: NDArray[np.intp]) -> Geometry:
-    """The geometry of all views; a scan with another rotation axis than the first has displaced views."""
-    columns = np.array([part.geometry.axis_col for part in parts])
-    shifts = geometry.shifts.copy()
-    shifts[:, 0] += (columns - columns[0])[energy]
-    return replace(geometry, shifts=shifts)
+def _refuse_unlike(parts: Sequence[PreparedProjections]) -> None:
+    """One geometry is of all views: they share detector, beam, and the motion of the stage in an exposure."""
+    first = parts[0].geometry
+    for n, own in enumerate((part.geometry for part in parts[1:]), 2):
+        if (own.detector_shape, own.pixel_pitch, own.sod, own.sdd) != (
+            first.detector_shape, first.pixel_pitch, first.sod, first.sdd
+        ):  # fmt: skip
+            raise ConfigError(
+                f"The scans do not fit together: {first.detector_shape} pixels of {first.pixel_pitch:g} "
+                f"{parts[0].length_unit}, and {own.detector_shape} of {own.pixel_pitch:g}. Nothing was written."
+            )
+        arcs, skews = (first.width.arc, own.width.arc), (first.skew, own.skew)
+        if not all(math.isclose(*turns, rel_tol=_ARCS_ALIKE) for turns in (arcs, skews)):
+            turned = [f"{math.degrees(g.width.arc):.3g}° and {math.degrees(g.skew):.2g}° a row" for g in (first, own)]
+            raise ConfigError(
+                f"The scans do not fit together: the stage turns {turned[0]} in an exposure of scan 1, and {turned[1]} "
+                f"in one of scan {n}. Give an --exposure-arc that holds for all, or none. Nothing was written."
+            )
+    if parts[0].length_unit != "mm":
+        raise ConfigError("The spectra are in 1/mm; give --pixel-size-um, as the scans do not state it.")
 
 
 def _refuse_memory(views: EnergyViews, grid: Grid) -> None:

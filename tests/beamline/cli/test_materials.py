@@ -10,7 +10,14 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
+from beamline.core.errors import ConfigError
+from beamline.core.signals import StopOnSignal
+from beamline.projections.selection import Selection
+from beamline.projections.steps.width import Width
+from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
+from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
+from drivers.base.clock import SystemClock
 from simulators.light.palette import known
 
 pytest.importorskip("xraylib")
@@ -95,4 +102,17 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
         done = run("materials", *words, "-o", tmp_path / "out.h5", "--axis", "31.5")
         assert done.exit_code != 0
         assert said in done.output
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_scans_whose_exposures_turn_by_unlike_arcs_do_not_mix(scans: list[Path], tmp_path: Path) -> None:
+    unlike = [
+        (SourceOptions(path), Selection(axis_col=31.5, steps=(Width(arc=arc),)))
+        for path, arc in zip(scans, ("0.5", "0.502", "1", "1"), strict=True)
+    ]
+    with pytest.raises(ConfigError, match=r"turns 0.5° and 0° a row in an exposure of scan 1, and 1° .* of scan 3"):
+        reconstruct_materials(
+            unlike, read_spectra(spectra(tmp_path)), tmp_path / "out.h5", lambda event: None, SystemClock(),
+            lambda stage: lambda done, of: None, StopOnSignal(ready=False),
+        )  # fmt: skip
     assert not list(tmp_path.glob("out*"))
