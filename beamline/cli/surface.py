@@ -12,22 +12,21 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
+from beamline.storage.writers.mesh_file import MESHES, write_mesh
 from drivers.base.clock import SystemClock
-
-_SUFFIXES = (".stl", ".ply", ".obj")
 
 
 def _mesh_path(text: str) -> Path:
     """A name with the suffix of a mesh. ValueError for any other."""
-    if Path(text).suffix.lower() not in _SUFFIXES:
-        raise ValueError(f"{text!r}: the suffix names the format of a mesh; expected {', '.join(_SUFFIXES)}")
+    if Path(text).suffix.lower() not in MESHES:
+        raise ValueError(f"{text!r}: the suffix names the format of a mesh; expected {', '.join(MESHES)}")
     return Path(text)
 
 
 @click.command()
 @click.argument("volume", type=click.Path(path_type=Path))
 @click.option("-o", "--output", metavar="PATH", callback=parsed(_mesh_path), required=True,
-              help=f"Its suffix names the format: {', '.join(_SUFFIXES)}.")  # fmt: skip
+              help=f"Its suffix names the format: {', '.join(MESHES)}.")  # fmt: skip
 @click.option("--level", type=FiniteRange(), help="Value at the surface. Default: half-way between air and matter.")
 @click.option("--from", "source", type=click.Choice(["volume", "gaussians"]), default="volume", show_default=True,
               help="The voxels, or the Gaussians behind them: a fit before its finish.")  # fmt: skip
@@ -42,7 +41,6 @@ def surface(volume: Path, output: Path, level: float | None, source: str, datase
     if importlib.util.find_spec("skimage") is None:
         raise ConfigError('A surface needs scikit-image: pip install "splatline[surface]". Nothing was written.')
     from beamline.reconstruct.surface import surface_of_gaussians, surface_of_volume
-    from beamline.storage.writers.mesh_file import write_mesh
 
     refuse_shared({"VOLUME": volume, "--output": output})
     with events_shown(as_json) as sink:

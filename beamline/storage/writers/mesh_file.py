@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from beamline.core.files import whole_file
-from recon.post.surface import Mesh
+
+if TYPE_CHECKING:
+    from recon.post.surface import Mesh  # imports scipy, and help reads the suffixes here
 
 _TOGETHER = 2**16  # triangles or vertices
 
