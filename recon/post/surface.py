@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,13 @@ class Mesh:
         return len(self.vertices) - len(self.faces) // 2
 
 
+class _Shared(NamedTuple):
+    """Vertices in the slice that two slabs share: the lattice edges on which they lie, rising, and their numbers."""
+
+    edges: NDArray[np.int64] = np.empty(0, np.int64)
+    numbers: NDArray[np.int64] = np.empty(0, np.int64)
+
+
 def half_way(data: BySlices, n_slices: int) -> float:
     """The level half-way between air and matter (ISO 50 % rule): between the medians of two clusters by k-means.
 
@@ -95,21 +102,21 @@ def surface(
     thick = max(1, _BLOCK // ((ny + 2) * (nx + 2)))
     least = _least(data, n, thick, level)
     vertices, faces = list[F32](), list[NDArray[np.int32]]()
-    known, numbers, total, size = np.empty(0, np.int64), np.empty(0, np.int64), 0, 0
+    total, size = 0, 0  # vertices, and bytes of the mesh
+    below = _Shared()
     for first in range(-1, n, thick):
         last = min(first + thick, n)
         block = _padded(data, first, last, n, level)
         block = np.copysign(np.maximum(np.abs(block), least), block)
         if block.min() > 0 or block.max() < 0:
-            known = numbers = np.empty(0, np.int64)
+            below = _Shared()
+            count(min(last + 1, n), n)
             continue
         at, corners, _, _ = marching_cubes(block, 0.0)
         edges = (np.floor(at[:, 1:]) + np.ceil(at[:, 1:])).astype(np.int64) @ (2 * nx + 4, 1)
-        joined = np.flatnonzero(at[:, 0] == 0) if known.size else np.empty(0, np.int64)
-        own = np.ones(len(at), bool)
-        own[joined] = False
+        own = (at[:, 0] > 0) | (below.edges.size == 0)
         number = np.empty(len(at), np.int64)
-        number[joined] = numbers[np.searchsorted(known, edges[joined])]
+        number[~own] = below.numbers[np.searchsorted(below.edges, edges[~own])]
         number[own] = total + np.arange(own.sum())
         total += int(own.sum())
         size += 12 * (int(own.sum()) + len(corners))
@@ -122,7 +129,7 @@ def surface(
         faces.append(number[corners].astype(np.int32))
         top = np.flatnonzero(at[:, 0] == last - first)
         top = top[np.argsort(edges[top])]
-        known, numbers = edges[top], number[top]
+        below = _Shared(edges[top], number[top])
         count(min(last + 1, n), n)
     if not vertices:
         raise ValueError(f"no surface: no value lies above the level {level:.4g}")

@@ -111,3 +111,12 @@ def test_what_has_no_surface_or_too_much_is_refused() -> None:
     data[2, 3, 4] = np.nan
     with pytest.raises(ValueError, match="not finite"):
         surface(data, Grid(data.shape), 0.0)
+
+
+def test_slabs_of_air_are_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_BLOCK", 3 * 12 * 12)
+    data = np.zeros((30, 10, 10), np.float32)
+    data[10:13, 4:6, 4:6] = 1
+    done = list[tuple[int, int]]()
+    surface(data, Grid(data.shape), 0.5, count=lambda n, of: done.append((n, of)))
+    assert done == [(min(n, 30), 30) for n in range(3, 33, 3)] + [(30, 30)]
