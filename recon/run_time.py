@@ -52,7 +52,7 @@ Size = tuple[int, int, int]  # views, columns, rows
 
 @dataclass(frozen=True)
 class Extent:
-    """The size of a reconstruction.
+    """Views and slices that a reconstruction takes.
 
     Attributes:
         geometry: of the views; small runs are made of the same beam.
@@ -74,7 +74,7 @@ class Extent:
         return Grid.matching(self.geometry).shape[2]
 
     @property
-    def rows(self) -> int:
+    def slices(self) -> int:
         return sum(self.heights)
 
 
@@ -122,8 +122,8 @@ def _of_iterations(method: Method, extent: Extent, now: Clock, sweeps: int, tria
     sweep, start = (max(a + at * (b - a), 0.0) for a, b in zip(found[0], found[-1], strict=True))
     # Trials see sixteen rows; how many there are depends on the data. A weight without trials is of all rows.
     rays = extent.views * extent.cols**2 / (tried[0] * tried[1] ** 2)
-    once = rays * max(deciding - following, 0.0) * (trials / asked if asked else extent.rows / tried[2])
-    whole = (extent.cols / cols) ** 2 * extent.rows / height
+    once = rays * max(deciding - following, 0.0) * (trials / asked if asked else extent.slices / tried[2])
+    whole = (extent.cols / cols) ** 2 * extent.slices / height
     return whole * (start + sweeps * sweep) + (0.0 if extent.decided else once)
 
 
@@ -176,7 +176,7 @@ def _of_field(method: FieldMethod, extent: Extent, now: Clock) -> float:
     took(1)
     short, long = took(2), took(2 + _FIELD_STEPS)
     step = max(long - short, long / 4) / _FIELD_STEPS * method.samples_of(extent.cols) / method.samples_of(cols)
-    steps, beside = method.steps * step * len(extent.heights), extent.rows * extent.cols**2
+    steps, beside = method.steps * step * len(extent.heights), extent.slices * extent.cols**2
     steps = steps if method.seconds is None else min(steps, method.seconds)
     return steps + short * beside / (rows * cols**2)
 
@@ -190,7 +190,7 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:
     seconds = 0.0
     for height in extent.heights:
         voxels = height * extent.cols**2
-        count = _count(height, extent.cols) if given is None else given * height / extent.rows
+        count = _count(height, extent.cols) if given is None else given * height / extent.slices
         seconds += max(less + slope * (_work(voxels, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     steps = method.seconds if method.seconds is not None else (method.planned_steps or 0) * seconds * grown
@@ -214,10 +214,8 @@ def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[floa
 
     took(2)
     short, long = (min(took(steps) for _ in range(2)) for steps in _STEPS)
-    mean = long / _STEPS[1]
-    step = min(
-        max((long - short) / (_STEPS[1] - _STEPS[0]), mean / 3), mean
-    )  # on a busy machine the longer run may take less
+    step, mean = (long - short) / (_STEPS[1] - _STEPS[0]), long / _STEPS[1]
+    step = min(max(step, mean / 3), mean)  # on a busy machine the longer run may take less
     return _work(rows * cols**2, count), step
 
 

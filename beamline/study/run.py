@@ -23,7 +23,7 @@ from beamline.study.studies import Study, StudyRow, ViewSet, averaged
 from beamline.study.table import Cell, StudyTable, write_table
 from beamline.tradeoff.data import Data, write_array
 from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import ComparedScan, Opened, opened, until_stopped
+from beamline.tradeoff.opened import ComparedScan, OpenedScan, opened_scan, until_stopped
 from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
 from drivers.base.clock import Clock
 from recon.assess import metrics
@@ -95,7 +95,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     """
     folder, started, path = options.scan.folder, clock.now(), options.scan.source.path
     warn = Warnings(sink, clock)
-    scan = opened(options.scan, warn)
+    scan = opened_scan(options.scan, warn)
     table = _planned(options, scan)
     todo = [cell for cell in table.cells if cell.row.groups is not None]
     if not todo:
@@ -136,7 +136,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
     return table
 
 
-def _planned(options: StudyOptions, scan: Opened) -> StudyTable:
+def _planned(options: StudyOptions, scan: OpenedScan) -> StudyTable:
     """The table before any row is done."""
     geometry, truth = scan.prepared.geometry, scan.truth is not None
     turns = np.stack((geometry.roll, geometry.tilt), axis=1) * max(geometry.detector_shape) / 2

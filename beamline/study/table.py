@@ -68,7 +68,7 @@ class StudyTable:
         scan: facts for people, by name.
         notes: sentences on what the figures mean.
         stopped: it was interrupted before all rows were done.
-        light: of a frame; None: the dose is counted in frames.
+        light: of a view; None: the dose is counted in frames.
     """
 
     study: Study

@@ -38,13 +38,13 @@ class ComparedScan:
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class OpenedScan:
     """A scan ready for many reconstructions.
 
     Attributes:
         facts: for people, by name.
         truth: on `grid`; None where nobody knows it.
-        light: of a frame; None: not asked for.
+        light: of a view; None: not asked for, and the dose is counted in frames.
     """
 
     facts: Mapping[str, str]
@@ -54,21 +54,23 @@ class Opened:
     light: Light | None
 
 
-def opened(options: ComparedScan, warn: Warn) -> Opened:
+def opened_scan(asked: ComparedScan, warn: Warn) -> OpenedScan:
     """Read and correct the views. What is refused is refused first.
 
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    refuse_existing(options.folder)
-    wanted = None if options.truth is None else read_truth(options.truth)
-    with options.source.open() as source:
-        light, facts = light_in(source, options.light), dict(facts_of(source).table)
-        prepared = prepare_projections(source, options.selection, warn)
+    refuse_existing(asked.folder)
+    wanted = None if asked.truth is None else read_truth(asked.truth)
+    with asked.source.open() as source:
+        light, facts = light_in(source, asked.light), dict(facts_of(source).table)
+        prepared = prepare_projections(source, asked.selection, warn)
     grid = Grid.matching(prepared.geometry)
-    truth = None if wanted is None else fit_truth(wanted, grid, options.selection.binning).data
-    facts |= {"volume": " × ".join(map(str, grid.shape))}
-    return Opened(facts | ({} if light is None else {"light": "; ".join(light.said())}), prepared, grid, truth, light)
+    truth = None if wanted is None else fit_truth(wanted, grid, asked.selection.binning).data
+    facts["volume"] = " × ".join(map(str, grid.shape))
+    if light is not None:
+        facts["light"] = "; ".join(light.said())
+    return OpenedScan(facts, prepared, grid, truth, light)
 
 
 class GrowingTable(Protocol):

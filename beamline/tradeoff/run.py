@@ -19,7 +19,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.report.slice_sheet import SliceSheet
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import ComparedScan, opened, until_stopped
+from beamline.tradeoff.opened import ComparedScan, opened_scan, until_stopped
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
@@ -63,7 +63,7 @@ def run_tradeoff(
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
     folder, started = options.scan.folder, clock.now()
-    scan = opened(options.scan, Warnings(sink, clock))
+    scan = opened_scan(options.scan, Warnings(sink, clock))
     data = split(scan.prepared, scan.truth)
     trials = plan(
         options.methods,

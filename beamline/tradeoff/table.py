@@ -51,7 +51,7 @@ class TrialTable:
         length_unit: of the resolution, "mm" or "px".
         scan: facts for people, by name.
         stopped: it was interrupted before all trials were done.
-        light: of a frame; None: the dose is counted in frames.
+        light: of a view; None: the dose is counted in frames.
     """
 
     outcomes: tuple[Outcome, ...]
