@@ -27,10 +27,12 @@ from recon.voxels.tv import TotalVariationProx, difference_weights
 from recon.voxels.voxel_problem import Momentum, largest_eigenvalue
 
 _SUBSETS, _TV_STEPS = 9, 3
-_ROWS = 16  # that the trials of the weights see
-_TRIALS, _TRIAL_SWEEPS = 12, 8  # each with half the weight of the last one, from its volumes
-_FIRST = 0.1  # of the largest gradient at zero
-_HEAVIER, _AS_WELL = 4, 1.01  # weights of the other components, each twice the last; of the least residual
+_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
+_FIRST = 0.1  # the first weight, over the largest gradient at zero
+_TRIALS = 12  # of one weight for all components, each half of the last one
+_HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
+_AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
+MOST_TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS
 _LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
 
 
@@ -140,9 +142,9 @@ def fit_materials(
     Args:
         grid: of the volumes; None: as the geometry has it.
         tv_weight: of all components; None: the weights with which views held out are predicted best.
-        sweeps: over all views; over few views each of up to nine.
-        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each trial of a weight;
-            False ends the fit, with the volumes so far.
+        sweeps: of about nine steps each, which see all views equally often.
+        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each one of a trial of
+            weights (`MOST_TRIAL_SWEEPS`); False ends the fit, with the volumes so far.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
@@ -184,11 +186,11 @@ class _Fit:
     def __post_init__(self) -> None:
         views = self.views
         counts = np.bincount(views.energy, minlength=len(views.cross_sections))
-        seen = np.sqrt(counts / counts.max())[:, None]
-        u, values, mix = np.linalg.svd(seen * views.cross_sections, full_matrices=False)
+        often = np.sqrt(counts / counts.max())[:, None]
+        u, values, mix = np.linalg.svd(often * views.cross_sections, full_matrices=False)
         self._to = values[:, None] * mix
         self._back = mix.T / values
-        self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
+        self._u = np.divide(u, often, out=np.zeros_like(u), where=often > 0)
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
         self._norm = math.sqrt(float(np.vdot(data, weight * data)))
@@ -204,8 +206,8 @@ class _Fit:
                 ]
             )
         largest = np.flatnonzero(subset == np.argmax(np.bincount(subset)))
-        heights = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
-        self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
+        of_view = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
+        self.step = 1 / largest_eigenvalue(whole.subset(largest), of_view[:, None, None] * weight[largest])
         nz, ny, nx = self.grid.shape
         self.z = np.zeros((values.size, ny, nx, nz), np.float32)
 
@@ -283,23 +285,28 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         for chosen in (~held_out, held_out)
     )
 
-    def left(weights: F64) -> float:
-        for _ in fit.sweeps(weights, _TRIAL_SWEEPS):
-            pass
+    def left(weights: F64) -> float | None:
+        """Of the views held out, after a trial; None: it was ended."""
+        for residual in fit.sweeps(weights, _TRIAL_SWEEPS):
+            if not go_on(0, residual):
+                return None
         return judge.residual_of(fit.densities())  # not z: an energy's share of the views is another one here
 
     weights = np.full(len(fit.z), _FIRST * fit.steepest())
     best, least, worse = weights, math.inf, 0
     for _ in range(_TRIALS):
-        now = left(weights)
-        best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
-        if not go_on(0, now):
+        if (now := left(weights)) is None:
             return best
+        best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
         if worse == 2:
             break
         weights = weights / 2
     heavier = np.r_[1.0, np.full(len(weights) - 1, 2.0)]
     ladder = [best * heavier**octave for octave in range(_HEAVIER)]
-    residuals = [left(weights) for weights in ladder]
+    residuals = list[float]()
+    for weights in ladder:
+        if (now := left(weights)) is None:
+            return best
+        residuals.append(now)
     limit = _AS_WELL * min(residuals)
     return next(at for at, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)

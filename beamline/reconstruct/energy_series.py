@@ -27,7 +27,7 @@ from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
 from recon.base.volume import Grid, Volume
-from recon.spectral import EnergyViews, Materials, fit_materials
+from recon.spectral import MOST_TRIAL_SWEEPS, EnergyViews, Materials, fit_materials
 
 _SWEEPS = 20
 _ARCS_ALIKE = 0.01  # share of the larger one by which arcs of two scans may differ
@@ -122,7 +122,7 @@ def reconstruct_materials(
     for path in outputs.values():
         refuse_existing(path)
     parts: list[PreparedProjections] = []
-    attenuation, axis_col, progress = [], None, counting("scans")
+    attenuation, axis_col, read = [], None, counting("scans")
     for n, (source, selection) in enumerate(scans, 1):
         with ExitStack() as opened:
             scan = opened.enter_context(source.open())
@@ -132,20 +132,24 @@ def reconstruct_materials(
             chosen = replace(selection, axis_col=axis_col if selection.axis_col is None else selection.axis_col)
             parts.append(prepare_projections(scan, chosen, lambda said: sink(Warned(said, time=clock.now()))))
         axis_col = parts[0].axis_col
-        progress(n, len(scans))
+        read(n, len(scans))
     views = _joined(parts, np.array(attenuation))
     grid = Grid.matching(views.geometry)
     _refuse_memory(views, grid)
-    early = False
+    early, tried = False, 0
+    trials, progress = counting("trials of weights"), counting("sweeps")
 
     def go_on(sweep: int, residual: float) -> bool:
-        nonlocal early
+        nonlocal early, tried
         if sweep:
             progress(sweep, _SWEEPS)
+        else:
+            tried += 1
+            trials(tried, MOST_TRIAL_SWEEPS)
         early = stopping()
         return not early
 
-    stop.ready, progress = True, counting("sweeps")
+    stop.ready = True
     with stop() as stopping:
         made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
     _write(made, parts[0], scans, outputs, clock)

@@ -12,7 +12,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.reconstruction import reconstruct
-from recon.spectral import EnergyViews, _Fit, fit_materials
+from recon.spectral import MOST_TRIAL_SWEEPS, EnergyViews, _Fit, fit_materials
 from recon.voxels.projector import Projector
 
 SECTIONS = np.array([[0.2, 1.0], [0.5, 0.9], [1.0, 0.2], [0.9, 0.4]])  # [energy, material]
@@ -155,6 +155,22 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
     assert np.array_equal(first.densities, fit_materials(views, go_on=lambda sweep, residual: sweep < 3).densities)
     assert heard[-1] == (3, first.residual)
     assert [sweep for sweep, _ in heard if sweep] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("before_the_end", [1, 20])
+def test_a_stop_in_any_sweep_of_a_trial_ends_the_trials(before_the_end: int) -> None:
+    views, heard = views_of(balls(), 8, noise=0.05), list[int]()
+    fit_materials(views, sweeps=1, go_on=lambda sweep, residual: not heard.append(sweep))
+    trials = heard.count(0)
+    assert 20 < trials <= MOST_TRIAL_SWEEPS
+    heard.clear()
+
+    def go_on(sweep: int, residual: float) -> bool:
+        heard.append(sweep)
+        return len(heard) < trials - before_the_end
+
+    fit_materials(views, go_on=go_on)
+    assert heard == [0] * (trials - before_the_end) + [1]
 
 
 def test_the_share_of_nothing_is_not_a_number() -> None:

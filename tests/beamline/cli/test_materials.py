@@ -69,8 +69,11 @@ def spectra(folder: Path, energies: tuple[float, ...] = ENERGIES) -> Path:
 
 
 def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path: Path) -> None:
-    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
+    done = run(
+        "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--json"
+    )
     assert done.exit_code == 0, done.output
+    assert "trials of weights" in done.output
     share = {}
     for material in GRAINS:
         with opened_volume(tmp_path / f"out_{material}.h5") as record:
@@ -84,7 +87,7 @@ def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path
     for name, other in (("charged", "fresh"), ("fresh", "charged")):
         assert share[name][name] == pytest.approx(1, abs=0.15)
         assert share[other][name] < 0.15
-    again = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5")
+    again = run(*words)
     assert "never overwritten" in again.output
 
 
