@@ -143,8 +143,8 @@ def fit_materials(
         grid: of the volumes; None: as the geometry has it.
         tv_weight: of all components; None: the weights with which views held out are predicted best.
         sweeps: of about nine steps each, which see all views equally often.
-        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each one of a trial of
-            weights (`MOST_TRIAL_SWEEPS`); False ends the fit, with the volumes so far.
+        go_on: called with (sweep, residual) after each sweep. In trials of weights, of `MOST_TRIAL_SWEEPS` at most,
+            sweep is 0. False ends the fit, with the volumes so far.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]

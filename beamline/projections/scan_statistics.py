@@ -179,7 +179,7 @@ class Light:
 
 
 def dose_scale(light: Light | None) -> tuple[float, str]:
-    """What a frame adds to the dose that a picture shows, and the label of that axis: gray, photons or frames."""
+    """The dose of a frame in gray, photons or frames, and the label of such an axis in a picture."""
     if light is None:
         return 1.0, "dose: frames that were exposed"
     if light.gray is None:

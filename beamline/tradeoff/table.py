@@ -72,7 +72,7 @@ class TrialTable:
 
     @property
     def dose(self) -> TrialCost:
-        """Of the views of a trial, each of which is a frame of the scan."""
+        """Each view is a frame of the scan."""
         a_frame, axis = dose_scale(self.light)
         return TrialCost("dose", "dose", axis, a_frame, lambda outcome: float(outcome.trial.views))
 

@@ -69,9 +69,8 @@ def spectra(folder: Path, energies: tuple[float, ...] = ENERGIES) -> Path:
 
 
 def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path: Path) -> None:
-    done = run(
-        "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--json"
-    )
+    words = "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5"
+    done = run(*words, "--json")
     assert done.exit_code == 0, done.output
     assert "trials of weights" in done.output
     share = {}
