@@ -16,7 +16,7 @@ from recon.voxels.projector import Projector
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.builders.battery import battery
-from tests.bench.quality_cases import F32, OBJECTS, _padded
+from tests.bench.quality_cases import F32, OBJECTS, padded
 
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
 SIDE, VIEWS, THICKEST = 64, 60, 3.0  # pixels and voxels a side; the largest line integral
@@ -34,7 +34,7 @@ def _samples() -> Iterator[tuple[str, F32, F32]]:
     yield "battery", _joined(clean), can.attenuation(GRID)
     twice = recon.Geometry.parallel(GEOMETRY.angles, (2 * SIDE, 2 * SIDE), 0.5 / SIDE)
     for name in ("shell", "thorax"):
-        large = _padded(OBJECTS[name](DATA), 4 * SIDE).reshape(2 * SIDE, 2, 2 * SIDE, 2, 2 * SIDE, 2)
+        large = padded(OBJECTS[name](DATA), 4 * SIDE).reshape(2 * SIDE, 2, 2 * SIDE, 2, 2 * SIDE, 2)
         volume = large.mean(axis=(1, 3, 5), dtype=np.float32)
         clean = Projector(twice, recon.Grid.matching(twice)).forward(volume)
         yield name, _joined(clean), volume.reshape(SIDE, 2, SIDE, 2, SIDE, 2).mean(axis=(1, 3, 5), dtype=np.float32)
