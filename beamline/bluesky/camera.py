@@ -42,7 +42,7 @@ from drivers.base.protocols import CameraSettings, TriggerSource
 
 PATIENCE = 5.0
 """s beyond the exposure after which a frame that the detector triggered is lost."""
-SLICE = 0.2  # s between looks at a request to stop
+LOOK_EVERY = 0.2  # s, at a request to stop
 
 
 class ShownFrames(StrictEnum):
@@ -157,9 +157,9 @@ class _Frames(DetectorAcquireLogic):
             camera.disarm()
 
     def _next(self, by_software: bool) -> Any:
-        """The next frame; None after SLICE s without one, where pulses come by a cable."""
+        """The next frame; None after LOOK_EVERY s without one, where pulses come by a cable."""
         try:
-            return self._devices.camera.next_frame(self.settings.exposure + PATIENCE if by_software else SLICE)
+            return self._devices.camera.next_frame(self.settings.exposure + PATIENCE if by_software else LOOK_EVERY)
         except DeviceTimeout:
             if by_software:
                 raise
