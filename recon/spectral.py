@@ -172,6 +172,8 @@ class _Fit:
     Attributes:
         z: float32 [component, y, x, z].
         subsets: of the views; each has all energies.
+        _to, _back: from densities to components, and back.
+        _u: U [energy, component].
         step: 1 / L. L bounds the curvature of a subset: the largest eigenvalue of AᵀWA where a view of energy e weighs
             |U[e]|². That is a bound since A has no negative entry, so |A Σ U z| <= |U| A |z|.
     """

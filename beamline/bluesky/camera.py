@@ -42,7 +42,7 @@ from drivers.base.protocols import CameraSettings, TriggerSource
 
 PATIENCE = 5.0
 """s beyond the exposure after which a frame that the detector triggered is lost."""
-SLICE = 0.2  # s between looks at a request to stop
+LOOK_EVERY = 0.2  # s, at a request to stop
 
 
 class ShownFrames(StrictEnum):
@@ -131,17 +131,17 @@ class _Frames(DetectorAcquireLogic):
     def _take(self, kind: FrameKind, loop: asyncio.AbstractEventLoop) -> None:
         devices, camera, writer = self._devices, self._devices.camera, self._writer
         assert writer is not None
-        itself, exposure = self.settings.trigger is TriggerSource.SOFTWARE, self.settings.exposure
+        by_software, exposure = self.settings.trigger is TriggerSource.SOFTWARE, self.settings.exposure
         period, triggered = max(camera.timing.min_period, exposure + self._apart), -math.inf
         try:
             for i in range(self.n):
                 angle = math.nan
-                if itself:
+                if by_software:
                     angle = math.nan if devices.stage.moving() else devices.stage.position()
                     self._clock.sleep(triggered + period - self._clock.now())
                     camera.software_trigger()
                     triggered = self._clock.now()
-                while (found := self._next(itself)) is None:
+                while (found := self._next(by_software)) is None:
                     if self._stop.is_set():
                         return
                 if found.framestamp != i:
@@ -156,12 +156,12 @@ class _Frames(DetectorAcquireLogic):
         finally:
             camera.disarm()
 
-    def _next(self, itself: bool) -> Any:
-        """The next frame; None after a while without one, where pulses come from elsewhere."""
+    def _next(self, by_software: bool) -> Any:
+        """The next frame; None after LOOK_EVERY s without one, where pulses come by a cable."""
         try:
-            return self._devices.camera.next_frame(self.settings.exposure + PATIENCE if itself else SLICE)
+            return self._devices.camera.next_frame(self.settings.exposure + PATIENCE if by_software else LOOK_EVERY)
         except DeviceTimeout:
-            if itself:
+            if by_software:
                 raise
             return None
 
@@ -185,14 +185,14 @@ class _File(DetectorDataLogic):
         self._frames = frames
 
     async def prepare_unbounded(self, datakey_name: str) -> StreamResourceDataProvider:
-        path, shape = await self._frames.new_file()
+        path, frame = await self._frames.new_file()
         resources = [
             StreamResourceInfo(
-                data_key=datakey_name + ending, shape=shape if ending == "" else (), dtype_numpy=kind,
-                chunk_shape=(1, *shape) if ending == "" else (1,), source=f"splatline:{dataset}",
-                parameters={"dataset": dataset, "swmr": True},
+                data_key=datakey_name + ending, shape=column.row_shape(frame), dtype_numpy=column.kind,
+                chunk_shape=(1, *column.row_shape(frame)), source=f"splatline:{column.dataset}",
+                parameters={"dataset": column.dataset, "swmr": True},
             )
-            for ending, (dataset, kind, _) in COLUMNS.items()
+            for ending, column in COLUMNS.items()
         ]  # fmt: skip
         return StreamResourceDataProvider(file_url(path), resources, "application/x-hdf5", self._frames.rows)
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 from urllib.parse import urlsplit
 
 from beamline.config.load import Config
@@ -28,10 +28,24 @@ REACH = 1.0
 """s that a proxy of 0MQ has to answer, and at the end to take what it was sent."""
 JOIN = 0.5
 """s until a proxy takes documents: 0MQ connects in the background, and drops what comes before."""
-COLUMNS = {  # ending of the data key: dataset, numpy type, unit
-    "": (layout.DATA, "<u2", "counts"),
-    "-angle": (layout.ANGLE, "<f8", "degree"),
-    "-kind": (layout.KIND, "<i4", ""),
+
+
+class Column(NamedTuple):
+    """A dataset of the scan file with a row for each frame, which is a data key."""
+
+    dataset: str
+    kind: str
+    unit: str
+
+    def row_shape(self, frame: tuple[int, int]) -> tuple[int, ...]:
+        """Of a row, where frames have the shape `frame`."""
+        return frame if self.dataset == layout.DATA else ()
+
+
+COLUMNS = {  # by the ending of the data key
+    "": Column(layout.DATA, "<u2", "counts"),
+    "-angle": Column(layout.ANGLE, "<f8", "degree"),
+    "-kind": Column(layout.KIND, "<i4", ""),
 }
 
 
@@ -62,14 +76,14 @@ class ScanStream:
         """Of a descriptor."""
         return {
             self._name + ending: {
-                "source": f"splatline:{dataset}",
-                "shape": list(self.shape) if ending == "" else [],
-                "dtype": "array" if ending == "" else "number",
-                "dtype_numpy": kind,
-                "units": unit,
+                "source": f"splatline:{column.dataset}",
+                "shape": list(column.row_shape(self.shape)),
+                "dtype": "array" if column.row_shape(self.shape) else "number",
+                "dtype_numpy": column.kind,
+                "units": column.unit,
                 "external": "STREAM:",
             }
-            for ending, (dataset, kind, unit) in COLUMNS.items()
+            for ending, column in COLUMNS.items()
         }
 
     def __call__(self, event: Event) -> None:
@@ -99,9 +113,9 @@ class ScanStream:
 
     def _resources(self) -> Iterator[Any]:
         compose = self._library.ComposeStreamResource()
-        for ending, (dataset, _, _) in COLUMNS.items():
-            chunk = (1, *self.shape) if ending == "" else (1,)
-            parameters = {"dataset": dataset, "chunk_shape": chunk, "swmr": True}
+        for ending, column in COLUMNS.items():
+            chunk = (1, *column.row_shape(self.shape))
+            parameters = {"dataset": column.dataset, "chunk_shape": chunk, "swmr": True}
             yield compose(
                 mimetype="application/x-hdf5",
                 uri=file_url(self._path),

@@ -109,7 +109,7 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
             refuse_existing(output)
         with open_scan(scan) as source:
             if light is not None:
-                light.refuse(source)
+                light.refuse_impossible(source)
             found = statistics_of(source, counting("statistics", sink, clock))
             dose = [] if light is None else light_of(source, found, light).said()
         rows = table(found)

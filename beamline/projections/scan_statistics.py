@@ -124,7 +124,7 @@ class LightAsked:
     photons_per_count: float
     material: str | None = None
 
-    def refuse(self, source: ScanSource) -> None:
+    def refuse_impossible(self, source: ScanSource) -> None:
         """Before any frame is read.
 
         Raises:
@@ -137,7 +137,7 @@ class LightAsked:
 
 
 def _gray(material: str, source: ScanSource, photons: float) -> float:
-    """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `LightAsked.refuse`."""
+    """Absorbed at the surface by so many photons a pixel. Raises ConfigError as `LightAsked.refuse_impossible`."""
     if source.cone is not None:
         raise ConfigError(f"{source.path} is of a cone; --dose-in is for a parallel beam of one energy.")
     if source.pixel_size_mm is None or source.energy_kev is None:
@@ -191,9 +191,9 @@ def light_of(source: ScanSource, found: list[KindStatistics], asked: LightAsked)
     """From the flats and darks among the statistics `found`.
 
     Raises:
-        ConfigError: as `LightAsked.refuse`.
+        ConfigError: as `LightAsked.refuse_impossible`.
     """
-    asked.refuse(source)
+    asked.refuse_impossible(source)
     mean = {each.kind: each.mean for each in found}
     photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
     seconds = (source.exposures[source.image_key == kind] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
@@ -212,11 +212,11 @@ def light_in(source: ScanSource, asked: LightAsked | None) -> Light | None:
     """Reads darks and flats; None if nobody asked.
 
     Raises:
-        ConfigError: as `LightAsked.refuse`, before any frame is read.
+        ConfigError: as `LightAsked.refuse_impossible`, before any frame is read.
     """
     if asked is None:
         return None
-    asked.refuse(source)
+    asked.refuse_impossible(source)
     return light_of(source, statistics_of(source, lambda n, of: None, (FrameKind.DARK, FrameKind.FLAT)), asked)
 
 

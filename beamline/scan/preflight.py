@@ -200,11 +200,17 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "angles_deg": np.degrees(plan.angles).tolist(),
     }
     known = scan_info(config, instrument)
-    return replace(known, exposure=plan.exposure, period=timeline.views.period, plan=json.dumps(asked))
+    return replace(
+        known,
+        exposure=plan.exposure,
+        period=timeline.views.period,
+        plan=json.dumps(asked),
+        filter=plan.filter or known.filter,
+    )
 
 
 def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
-    """Facts for the file that need no plan. DeviceError: a device does not answer."""
+    """Facts for the file that need no plan; the filter is where it stands. DeviceError: a device does not answer."""
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:
@@ -221,6 +227,6 @@ def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
         axis_col=optics.axis_col,
         config=resolved_yaml(config),
         devices={device.name: device.describe() for device in (devices.stage, devices.camera)},
-        filter=config.scan.filter or (devices.filter.place() if devices.filter is not None else None),
+        filter=None if devices.filter is None else devices.filter.place(),
         beam_unit=None if isinstance(monitor, NoBeamMonitor) else monitor.unit,
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 
-_META = "zarr.json", ".zgroup", ".zarray"
+_METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
@@ -23,7 +23,7 @@ Spacing = tuple[float, float, float]
 
 def is_zarr(path: Path) -> bool:
     """Whether a folder is a Zarr, of whatever program."""
-    return any((path / name).is_file() for name in _META)
+    return any((path / name).is_file() for name in _METADATA)
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     try:
         import zarr
     except ImportError as error:
-        raise DataError(f"{path} is a Zarr of another program: to read it, pip install zarr.") from error
+        raise DataError(f"{path} is a Zarr, which takes its own library: to read it, pip install zarr.") from error
     try:
         root: Any = zarr.open(str(path), mode="r")
         image = _image(root)
@@ -112,6 +112,6 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
 
 
 def _is_halved(finest: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Whether a power of two takes one shape to the other, along each axis, rounded either way."""
+    """Whether each axis is divided by a power of two, which may differ from axis to axis; rounded either way."""
     steps = [2 ** round(np.log2(n / m)) for n, m in zip(finest, shape, strict=True)]
     return all(m in (n // by, -(-n // by)) for n, m, by in zip(finest, shape, steps, strict=True))

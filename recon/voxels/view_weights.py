@@ -46,7 +46,7 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
         return np.full(theta.size, np.pi / theta.size)
     gaps = np.diff(starts, append=starts[0] + np.pi)
     typical = float(np.median(gaps))
-    gaps = np.where(gaps > max(_GAP_LIMIT * typical, _by_chance(gaps.size, math.pi)), typical, gaps)
+    gaps = np.where(gaps > _widest(gaps, math.pi), typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)
     weights[order] = (cells / np.bincount(group))[group]
@@ -201,17 +201,17 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
     typical = float(np.median(gaps))
     if math.pi - float(angular_weights(geometry.angles).sum()) < typical / 2:
         return []
-    limit = max(_GAP_LIMIT * typical, _by_chance(gaps.size, math.pi))
-    wide = np.flatnonzero(gaps > limit)
+    wide = np.flatnonzero(gaps > _widest(gaps, math.pi))
     return [Wedge(float(np.mod(theta[at] + typical / 2, np.pi)), float(gaps[at] - typical)) for at in wide]
 
 
-def _by_chance(gaps: int, circle: float) -> float:
-    """The widest gap of so many random ones in a circle that chance explains, 19 times in 20.
+def _widest(gaps: F64, circle: float) -> float:
+    """The widest gap that even or random views leave in a circle; in a wider one, views are missing.
 
-    One of n exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1).
+    One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1), here 1 in 20.
     """
-    return circle * (1 - (0.05 / gaps) ** (1 / (gaps - 1)))
+    by_chance = circle * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
+    return max(_GAP_LIMIT * float(np.median(gaps)), by_chance)
 
 
 def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
@@ -271,4 +271,4 @@ def _gaps(theta: F64) -> tuple[NDArray[np.intp], F64]:
 def _leave_an_arc(gaps: F64) -> bool:
     widest, typical = float(gaps.max()), float(np.median(gaps))
     arc = widest > np.pi / 4 and widest > 3 * typical
-    return arc or widest >= np.pi or widest > max(_GAP_LIMIT * typical, _by_chance(gaps.size, 2 * math.pi))
+    return arc or widest >= np.pi or widest > _widest(gaps, 2 * math.pi)

@@ -54,7 +54,8 @@ def test_a_step_scan_of_bluesky_becomes_a_scan_file_with_angles(engine: Any, tmp
     from beamline.bluesky.camera import CameraDetector
     from beamline.bluesky.devices import Rotation
 
-    heard, settings = Heard(), small("recon.live=false", "simulation.clock=virtual")
+    unmoved = "devices.filter={kind: simulated, places: [none, Al]}", "scan.filter=Al"
+    heard, settings = Heard(), small("recon.live=false", "simulation.clock=virtual", *unmoved)
     engine.subscribe(heard)
     with ExitStack() as held:
         instrument = held.enter_context(connect(settings))
@@ -77,6 +78,7 @@ def test_a_step_scan_of_bluesky_becomes_a_scan_file_with_angles(engine: Any, tmp
         kinds, angles = file["entry/frame_log/kind"][()], file["entry/sample/rotation_angle"][()]
         frames = file["entry/instrument/detector/data"][()].astype(float)
         assert file["entry/progress/status"].asstr()[()] == "complete" and not nexus_findings(file)
+        assert "entry/instrument/filter" not in file  # nobody moved it
     np.testing.assert_array_equal(kinds, [2, 1, 0, 0, 0])
     np.testing.assert_allclose(angles, [0, 0, 0, 30, 60], atol=1e-3)
     dark, flat, *views = frames

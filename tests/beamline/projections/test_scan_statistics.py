@@ -99,6 +99,6 @@ def test_what_a_dose_lacks_is_said_before_any_frame_is_read(
     asked = LightAsked(0.25, material)
     with open_scan(path) as source, pytest.MonkeyPatch.context() as patch:
         patch.setattr(source, "read", lambda rows: pytest.fail(f"rows {rows} were read"))
-        for refused in (lambda: asked.refuse(source), lambda: light_in(source, asked)):
+        for refused in (lambda: asked.refuse_impossible(source), lambda: light_in(source, asked)):
             with pytest.raises(ConfigError, match=said):
                 refused()

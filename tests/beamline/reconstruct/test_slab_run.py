@@ -162,7 +162,7 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
 
     def seconds(method: object, extent: Extent, now: object) -> float:
         seen.append(extent)
-        return float(extent.rows)
+        return float(extent.slices)
 
     monkeypatch.setattr(estimate, "run_seconds", seconds)
     all_of_it, rest = (
