@@ -32,6 +32,8 @@ _TRIALS, _TRIAL_SWEEPS = 12, 8  # each with half the weight of the last one, fro
 _FIRST = 0.1  # of the largest gradient at zero
 _HEAVIER, _AS_WELL = 4, 1.01  # weights of the other components, each twice the last; of the least residual
 _LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
+_NOTHING = 1e-20  # singular value of materials that attenuate nothing
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +68,10 @@ class EnergyViews:
         if self.energy.shape != wanted[:1] or self.energy.min() < 0 or self.energy.max() >= n:
             raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {wanted[0]} views")
         seen = self.cross_sections[np.unique(self.energy)]
+        if not np.isfinite(seen).all():
+            raise ValueError("cross_sections must be finite")
         values = np.linalg.svd(seen, compute_uv=False)
-        if len(seen) < materials or values[-1] < _LEAST_SINGULAR * values[0]:
+        if len(seen) < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
             raise ValueError(
                 f"views of {len(seen)} energies do not tell {materials} materials apart: give more energies, or fewer "
                 "materials"
@@ -141,8 +145,8 @@ def fit_materials(
         grid: of the volumes; None: as the geometry has it.
         tv_weight: of all components; None: the weights with which views held out are predicted best.
         sweeps: over all views; over few views each of up to nine.
-        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each trial of a weight;
-            False ends the fit, with the volumes so far.
+        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each sweep of a trial of
+            weights, of which there are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
@@ -191,7 +195,7 @@ class _Fit:
         self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
-        self._norm = math.sqrt(float(np.vdot(data, weight * data)))
+        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # views of nothing leave nothing
         subset = views.parted(subsets_of(views.geometry, _SUBSETS))
         self.subsets = []
         for number in range(subset.max() + 1):
@@ -283,23 +287,31 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         for chosen in (~held_out, held_out)
     )
 
+    going = True
+
     def left(weights: F64) -> float:
-        for _ in fit.sweeps(weights, _TRIAL_SWEEPS):
-            pass
+        nonlocal going
+        for residual in fit.sweeps(weights, _TRIAL_SWEEPS):
+            if not (going := go_on(0, residual)):
+                return math.inf
         return judge.residual_of(fit.densities())  # not z: an energy's share of the views is another one here
 
     weights = np.full(len(fit.z), _FIRST * fit.steepest())
     best, least, worse = weights, math.inf, 0
     for _ in range(_TRIALS):
         now = left(weights)
-        best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
-        if not go_on(0, now):
+        if not going:
             return best
+        best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
         if worse == 2:
             break
         weights = weights / 2
     heavier = np.r_[1.0, np.full(len(weights) - 1, 2.0)]
     ladder = [best * heavier**octave for octave in range(_HEAVIER)]
-    residuals = [left(weights) for weights in ladder]
+    residuals: list[float] = []
+    for weights in ladder:
+        residuals.append(left(weights))
+        if not going:
+            return best
     limit = _AS_WELL * min(residuals)
     return next(at for at, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)
