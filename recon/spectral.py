@@ -146,7 +146,7 @@ def fit_materials(
         tv_weight: of all components; None: the weights with which views held out are predicted best.
         sweeps: over all views; over few views each of up to nine.
         go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each sweep of a trial of
-            weights, of which there are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
+            weights. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
