@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
 from beamline.cli.options import json_option, refuse_shared
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import counting, events_shown
@@ -18,7 +19,11 @@ from drivers.base.clock import SystemClock
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
-@click.command()
+@click.command(
+    cls=Grouped,
+    first=("spectra", "output", "views", "rows", "binning", "axis", "pixel_size_um", "flags", "rings", "as_json"),
+)
+@heading(DATA)
 @click.argument("files", metavar="SCAN...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--spectra",
@@ -26,10 +31,12 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     required=True,
     help="CSV table: energy_kev and the name of each material in the first line, then keV and 1/mm.",
 )
+@heading(OUTPUT)
 @click.option(
     "-o", "--output", metavar="PATH.h5", type=_FILE, required=True, help="_NAME joins its stem for each material."
 )
 @selection_options
+@heading(OUTPUT)
 @json_option
 def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
     """Fit the volume fraction of each material to scans of one sample at several energies, all at once.
