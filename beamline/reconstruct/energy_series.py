@@ -172,7 +172,7 @@ def reconstruct_materials(
         early = stopping()
         return not early
 
-    stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps, at most")
+    stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps")
     with stop() as stopping:
         made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
     _write(made, parts[0], scans, outputs, early, clock.now())
