@@ -32,8 +32,9 @@ _FIRST = 0.1  # the first weight, over the largest gradient at zero
 _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
-MOST_TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS
 _LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
+_NOTHING = 1e-20  # singular value of materials that attenuate nothing
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +69,10 @@ class EnergyViews:
         if self.energy.shape != wanted[:1] or self.energy.min() < 0 or self.energy.max() >= n:
             raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {wanted[0]} views")
         seen = self.cross_sections[np.unique(self.energy)]
+        if not np.isfinite(seen).all():
+            raise ValueError("cross_sections must be finite")
         values = np.linalg.svd(seen, compute_uv=False)
-        if len(seen) < materials or values[-1] < _LEAST_SINGULAR * values[0]:
+        if len(seen) < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
             raise ValueError(
                 f"views of {len(seen)} energies do not tell {materials} materials apart: give more energies, or fewer "
                 "materials"
@@ -143,8 +146,8 @@ def fit_materials(
         grid: of the volumes; None: as the geometry has it.
         tv_weight: of all components; None: the weights with which views held out are predicted best.
         sweeps: of about nine steps each, which see all views equally often.
-        go_on: called with (sweep, residual) after each sweep. In trials of weights, of `MOST_TRIAL_SWEEPS` at most,
-            sweep is 0. False ends the fit, with the volumes so far.
+        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each sweep of a trial of
+            weights. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
@@ -188,14 +191,14 @@ class _Fit:
     def __post_init__(self) -> None:
         views = self.views
         counts = np.bincount(views.energy, minlength=len(views.cross_sections))
-        often = np.sqrt(counts / counts.max())[:, None]
-        u, values, mix = np.linalg.svd(often * views.cross_sections, full_matrices=False)
+        seen = np.sqrt(counts / counts.max())[:, None]
+        u, values, mix = np.linalg.svd(seen * views.cross_sections, full_matrices=False)
         self._to = values[:, None] * mix
         self._back = mix.T / values
-        self._u = np.divide(u, often, out=np.zeros_like(u), where=often > 0)
+        self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
         whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
         weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
-        self._norm = math.sqrt(float(np.vdot(data, weight * data)))
+        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # views of nothing leave nothing
         subset = views.parted(subsets_of(views.geometry, _SUBSETS))
         self.subsets = []
         for number in range(subset.max() + 1):
@@ -208,8 +211,8 @@ class _Fit:
                 ]
             )
         largest = np.flatnonzero(subset == np.argmax(np.bincount(subset)))
-        of_view = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
-        self.step = 1 / largest_eigenvalue(whole.subset(largest), of_view[:, None, None] * weight[largest])
+        heights = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
+        self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
         nz, ny, nx = self.grid.shape
         self.z = np.zeros((values.size, ny, nx, nz), np.float32)
 
@@ -287,17 +290,20 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         for chosen in (~held_out, held_out)
     )
 
-    def left(weights: F64) -> float | None:
-        """Of the views held out, after a trial; None: it was ended."""
+    going = True
+
+    def left(weights: F64) -> float:
+        nonlocal going
         for residual in fit.sweeps(weights, _TRIAL_SWEEPS):
-            if not go_on(0, residual):
-                return None
+            if not (going := go_on(0, residual)):
+                return math.inf
         return judge.residual_of(fit.densities())  # not z: an energy's share of the views is another one here
 
     weights = np.full(len(fit.z), _FIRST * fit.steepest())
     best, least, worse = weights, math.inf, 0
     for _ in range(_TRIALS):
-        if (now := left(weights)) is None:
+        now = left(weights)
+        if not going:
             return best
         best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
         if worse == 2:
@@ -305,10 +311,10 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         weights = weights / 2
     heavier = np.r_[1.0, np.full(len(weights) - 1, 2.0)]
     ladder = [best * heavier**octave for octave in range(_HEAVIER)]
-    residuals = list[float]()
+    residuals: list[float] = []
     for weights in ladder:
-        if (now := left(weights)) is None:
+        residuals.append(left(weights))
+        if not going:
             return best
-        residuals.append(now)
     limit = _AS_WELL * min(residuals)
     return next(at for at, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)

@@ -21,7 +21,7 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 
 @click.command(
     cls=Grouped,
-    first=("spectra", "views", "rows", "cols", "binning", "axis", "rings", "pixel_size_um", "air", "output"),
+    first=("spectra", "output", "views", "rows", "binning", "axis", "pixel_size_um", "flags", "rings", "as_json"),
 )
 @heading(DATA)
 @click.argument("files", metavar="SCAN...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -31,11 +31,12 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     required=True,
     help="CSV table: energy_kev and the name of each material in the first line, then keV and 1/mm.",
 )
-@selection_options
 @heading(OUTPUT)
 @click.option(
     "-o", "--output", metavar="PATH.h5", type=_FILE, required=True, help="_NAME joins its stem for each material."
 )
+@selection_options
+@heading(OUTPUT)
 @json_option
 def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
     """Fit the volume fraction of each material to scans of one sample at several energies, all at once.

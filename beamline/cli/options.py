@@ -21,6 +21,10 @@ class FiniteRange(click.FloatRange):
             self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
 
+    def _describe_range(self) -> str:
+        """In a help page; click's own says `x<=None` without bounds."""
+        return "" if self.min is None and self.max is None else super()._describe_range()
+
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)

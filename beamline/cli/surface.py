@@ -62,6 +62,6 @@ def surface(volume: Path, output: Path, level: float | None, source: str, datase
         sink(Done({"output": output, "level": found.level, **facts, "volume": mesh.volume, "unit": unit},
                   time=clock.now()))  # fmt: skip
     if not as_json:
-        click.echo(f"output   {output}\nlevel    {found.level:.5g} 1/{unit}")
+        click.echo(f"output   {output}\nlevel    {found.level:.5g} {found.level_unit}".rstrip())
         click.echo(f"mesh     {facts['vertices']} vertices, {facts['triangles']} triangles, Euler number {mesh.euler}")
         click.echo(f"matter   {mesh.volume:.6g} {unit}³ inside")

@@ -113,7 +113,7 @@ def _branches(node: Schema, data: Any, root: Schema) -> list[Schema]:
 def _child(branch: Schema, part: str | int) -> Schema | None:
     if isinstance(part, int):
         items: Sequence[Schema] = branch.get("prefixItems", [])
-        return items[part] if part < len(items) else None
+        return items[part] if part < len(items) else branch.get("items")
     extra = branch.get("additionalProperties")
     return branch.get("properties", {}).get(part) or (extra if isinstance(extra, dict) else None)
 
@@ -134,10 +134,14 @@ def _words(branch: Schema) -> str:
         bounds = [("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<=")]
         limits = [f"{sign} {_number(branch[name])}" for name, sign in bounds if name in branch]
         return " ".join([text, " and ".join(limits)]).strip()
+    if kind == "array" and "items" in branch:
+        return f"a list of {branch.get('minItems', 0)} or more: {_words(branch['items'])}"
     if kind == "array":
         return f"a list of {branch.get('minItems')}: {branch.get('description')}"
     if kind == "object":
         return f"a group of keys: {', '.join(branch.get('properties', {})) or 'any'}"
     if kind == "string":
-        return f"text of {branch['description']}" if "pattern" in branch else "text"
+        if "pattern" in branch:
+            return f"text of {branch['description']}"
+        return f"text of {branch['minLength']} to {branch['maxLength']} characters" if "minLength" in branch else "text"
     return {"boolean": "true | false"}.get(kind, kind)

@@ -81,7 +81,7 @@ class ShownVolume:
                 values, self._name = _fbp_of(path, record), f"{path.name}, FBP"
             self.shape: tuple[int, int, int] = values.shape
             self._slices = slices_of(path, values, held)
-            self._length_unit, self._parameters = record.length_unit, record.parameters
+            self._length_unit, self._unit, self._parameters = record.length_unit, record.unit, record.parameters
             window: Any = record.parameters.get("window") if values.dtype.kind == "u" else None
             self._grey = None if window is None else (window[0], (window[1] - window[0]) / np.iinfo(values.dtype).max)
             self._changed = path.stat().st_mtime
@@ -106,7 +106,7 @@ class ShownVolume:
             "shape": self.shape,
             "voxel": [float(step) for step in self._grid.spacing],
             "length_unit": unit,
-            "unit": "" if unit == "px" else f"1/{unit}",
+            "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
             "coarse_bin": self._slices.bin,

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Sink, Warned
-from beamline.core.files import refuse_existing, remove
+from beamline.core.files import refuse_existing, remove, text_in
 from beamline.core.machine import free_memory
 from beamline.core.signals import StopOnSignal
 from beamline.core.text import size
@@ -26,11 +27,14 @@ from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
+from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.spectral import MOST_TRIAL_SWEEPS, EnergyViews, Materials, fit_materials
+from recon.spectral import TRIAL_SWEEPS, EnergyViews, Materials, fit_materials
 
 _SWEEPS = 20
+_COPIES = 8  # of all line integrals: of the scans, joined, as lines and of a subset; with a weight each
 _ARCS_ALIKE = 0.01  # share of the larger one by which arcs of two scans may differ
+_SUFFIX = ".h5"
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,20 +69,29 @@ def read_spectra(path: Path) -> Spectra:
         DataError: the file cannot be read, or is no such table.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            head, *lines = [line for line in csv.reader(file) if line]
-        values = np.array([[float(value) for value in line] for line in lines])
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is no table of spectra: {error}. Expected {_TABLE}.") from error
+        lines = [
+            line for line in csv.reader(text_in(path, encoding="utf-8-sig").splitlines(True)) if "".join(line).strip()
+        ]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
+    head, *rest = lines or [[]]
     names = tuple(name.strip() for name in head[1:])
-    wanted = (len(lines), len(head))
-    if head[0].strip() != "energy_kev" or not names or len(set(names)) < len(names) or values.shape != wanted:
-        raise DataError(f"{path} is no table of spectra. Expected {_TABLE}.")
+    if not rest or not names or head[0].strip() != "energy_kev":
+        raise DataError(f"{path} is no table of spectra: it begins {','.join(head)[:80]!r}. Expected {_TABLE}.")
+    values = np.empty((len(rest), len(head)))
+    for number, line in enumerate(rest):
+        try:
+            values[number] = [float(cell) for _, cell in zip(head, line, strict=True)]
+        except ValueError:
+            said = ",".join(line)[:80]
+            raise DataError(f"{path}: {said!r} are not {len(head)} numbers. Expected {_TABLE}.") from None
     values = values[np.argsort(values[:, 0])]
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
         raise DataError(f"{path}: energies must differ, and all values be finite and 0 or more.")
-    if any(not name or set(name) & set('/\\:*?"<>|') for name in names):
+    if any(not name.isprintable() or set(name) & set('/\\:*?"<>|') for name in names) or "" in names:
         raise DataError(f"{path}: names of materials are parts of file names; found {', '.join(map(repr, names))}.")
+    if len({name.casefold() for name in names}) < len(names):
+        raise DataError(f"{path}: names of materials must differ, in more than capitals; found {', '.join(names)}.")
     return Spectra(path, names, values[:, 0], values[:, 1:])
 
 
@@ -118,41 +131,51 @@ def reconstruct_materials(
         ConfigError: scans that do not fit together, energies that are missing or do not tell the materials apart, or
             too little memory. DataError: a scan cannot be read, or an output exists. Nothing is written then.
     """
-    outputs = {name: output.with_name(f"{output.stem}_{name}.h5") for name in spectra.names}
+    if output.suffix.lower() != _SUFFIX:
+        raise ConfigError(f"--output {output}: expected a name that ends in {_SUFFIX}. Nothing was written.")
+    outputs = {name: output.with_name(f"{output.stem}_{name}{_SUFFIX}") for name in spectra.names}
     for path in outputs.values():
         refuse_existing(path)
     parts: list[PreparedProjections] = []
-    attenuation, axis_col, read = [], None, counting("scans")
+    attenuation, axis_col, progress = [], None, counting("scans")
+
+    def warn(said: str) -> None:
+        sink(Warned(said, time=clock.now()))
+
     for n, (source, selection) in enumerate(scans, 1):
         with ExitStack() as opened:
             scan = opened.enter_context(source.open())
             if scan.energy_kev is None:
-                raise ConfigError(f"{scan.path} does not state its energy. Nothing was written.")
+                raise ConfigError(
+                    f"{scan.path} does not state its energy (keV, instrument/beam/incident_energy of NXtomo), which "
+                    "chooses the line of the spectra. Nothing was written."
+                )
             attenuation.append(spectra.at(scan.energy_kev))
             chosen = replace(selection, axis_col=axis_col if selection.axis_col is None else selection.axis_col)
-            parts.append(prepare_projections(scan, chosen, lambda said: sink(Warned(said, time=clock.now()))))
+            held, alike = sum(part.projections.data.size for part in parts), len(scans) - len(parts)
+            check = partial(_refuse_memory, len(spectra.names), held, alike)
+            parts.append(prepare_projections(scan, chosen, warn, check=check))
         axis_col = parts[0].axis_col
-        read(n, len(scans))
+        progress(n, len(scans))
     views = _joined(parts, np.array(attenuation))
     grid = Grid.matching(views.geometry)
-    _refuse_memory(views, grid)
     early, tried = False, 0
-    trials, progress = counting("trials of weights"), counting("sweeps")
 
     def go_on(sweep: int, residual: float) -> bool:
-        nonlocal early, tried
+        nonlocal early, tried, progress
         if sweep:
             progress(sweep, _SWEEPS)
         else:
             tried += 1
-            trials(tried, MOST_TRIAL_SWEEPS)
+            trials(tried, TRIAL_SWEEPS)
+            progress = counting("sweeps")
         early = stopping()
         return not early
 
-    stop.ready = True
+    stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps")
     with stop() as stopping:
         made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
-    _write(made, parts[0], scans, outputs, clock)
+    _write(made, parts[0], scans, outputs, early, clock.now())
     return MaterialRun(outputs, made.residual, early)
 
 
@@ -203,12 +226,20 @@ def _refuse_unlike(parts: Sequence[PreparedProjections]) -> None:
         raise ConfigError("The spectra are in 1/mm; give --pixel-size-um, as the scans do not state it.")
 
 
-def _refuse_memory(views: EnergyViews, grid: Grid) -> None:
-    materials = views.cross_sections.shape[1]
-    needs = 4 * (8 * materials * math.prod(grid.shape) + (4 + 2 * (views.weight is not None)) * views.projections.size)
-    if needs > SHARE * free_memory():
+def _refuse_memory(materials: int, held: int, alike: int, geometry: Geometry) -> None:
+    """ConfigError where the fit would need too much memory; nothing of this scan is read yet.
+
+    Args:
+        held: rays of the scans before, which are in memory.
+        alike: how many scans, this one and those after it, are taken to have the views of `geometry`.
+    """
+    grid = Grid.matching(geometry)
+    rays = held + alike * geometry.n_views * math.prod(geometry.detector_shape)
+    needs = 4 * (8 * materials * math.prod(grid.shape) + _COPIES * rays)
+    may_use = SHARE * (free_memory() + 4 * held)
+    if needs > may_use:
         raise ConfigError(
-            f"{materials} materials of {grid.shape} voxels need {size(needs)} of memory; {size(SHARE * free_memory())} "
+            f"{materials} materials of {grid.shape} voxels need {size(needs)} of memory; {size(may_use)} "
             "may be used. Give --rows, --views or --bin. Nothing was written."
         )
 
@@ -218,21 +249,26 @@ def _write(
     first: PreparedProjections,
     scans: Sequence[tuple[SourceOptions, Selection]],
     outputs: dict[str, Path],
-    clock: Clock,
+    early: bool,
+    time: float,
 ) -> None:
     """All files, or none of them."""
     written: list[Path] = []
+    paths = [str(Path(source.path).resolve()) for source, _ in scans]
     try:
         for (name, path), density in zip(outputs.items(), made.densities, strict=True):
             record = ReconRecord(
                 volume=Volume(density, made.grid),
                 length_unit=first.length_unit,
-                raw_file=", ".join(str(Path(source.path).resolve()) for source, _ in scans),
+                raw_file=paths[0],
                 title=f"volume fraction of {name}",
                 sample="not stated",
-                time=clock.now(),
+                time=time,
+                is_share=True,
                 parameters={
                     "method": "materials",
+                    "scans": ", ".join(paths),
+                    **({"ended_early": True} if early else {}),
                     "material": name,
                     "axis_col": first.axis_col,
                     "weights": made.weights,

@@ -11,8 +11,8 @@ import numpy as np
 from beamline.core.machine import free_memory
 from beamline.reconstruct.model import Model, read_model
 from beamline.storage.volumes.files import opened_volume
+from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.arrays import F32
-from recon.base.volume import Grid
 from recon.post.surface import BySlices, Mesh, half_way, surface
 from recon.splatting.splat import voxelize
 from recon.splatting.surface import on_level
@@ -23,11 +23,12 @@ Count = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh, the level that it follows, and the unit of its lengths."""
+    """A mesh, the level that it follows, and the units of its lengths and of the level."""
 
     mesh: Mesh
     level: float
     unit: str
+    level_unit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,7 @@ class _Voxelised:
 def surface_of_volume(path: Path, dataset: str | None, level: float | None, count: Count) -> Surface:
     """The surface of a volume file of any format, read by slices. DataError, and ValueError as `surface`."""
     with opened_volume(path, dataset) as record:
-        return _surface(record.volume.data, record.volume.grid, record.length_unit, level, count)
+        return _surface(record.volume.data, record, level, count)
 
 
 def surface_of_gaussians(path: Path, level: float | None, count: Count) -> Surface:
@@ -57,14 +58,16 @@ def surface_of_gaussians(path: Path, level: float | None, count: Count) -> Surfa
     """
     model = read_model(path)
     grid = model.record.volume.grid
-    found = _surface(_Voxelised(model), grid, model.record.length_unit, level, count)
-    mesh, vertices = found.mesh, found.mesh.vertices
+    found = _surface(_Voxelised(model), model.record, level, count)
+    vertices = found.mesh.vertices
     low, high = grid.edges
     free = ((vertices > low + 1e-3 * grid.voxel_size) & (vertices < high - 1e-3 * grid.voxel_size)).all(axis=1)
     vertices[free] = on_level(model.gaussians, vertices[free].astype(np.float64), found.level, grid.voxel_size)
-    return Surface(mesh, found.level, found.unit)
+    return found
 
 
-def _surface(data: BySlices, grid: Grid, unit: str, level: float | None, count: Count) -> Surface:
+def _surface(data: BySlices, record: ReconRecord, level: float | None, count: Count) -> Surface:
+    grid = record.volume.grid
     level = half_way(data, grid.shape[0]) if level is None else level
-    return Surface(surface(data, grid, level, _SHARE * free_memory(), count), level, unit)
+    mesh = surface(data, grid, level, _SHARE * free_memory(), count)
+    return Surface(mesh, level, record.length_unit, record.unit)

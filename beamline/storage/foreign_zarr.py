@@ -88,7 +88,9 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
             f"{path} holds {finest.dtype} of shape {finest.shape}; expected real numbers [z, y, x], of one time and "
             "one channel. Copy one to a file of its own."
         )
-    halved = tuple(ZarrScale(path, array) for array in coarser if _is_halved(finest.shape[-3:], array.shape[-3:]))
+    if spacing is not None and not all(0 < step < np.inf for step in spacing):
+        raise DataError(f"{path} states voxels of {spacing} mm; expected lengths above 0. Nothing was read.")
+    halved = tuple(ZarrScale(path, array) for array in coarser if _is_halved(finest.shape[-3:], array))
     return ZarrScale(path, finest, halved), spacing
 
 
@@ -111,7 +113,10 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
     return z, y, x
 
 
-def _is_halved(finest: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Whether each axis is divided by a power of two, which may differ from axis to axis; rounded either way."""
+def _is_halved(finest: tuple[int, ...], array: Any) -> bool:
+    """Whether a power of two takes one shape to that of an array, along each axis, rounded either way."""
+    shape = getattr(array, "shape", ())[-3:]  # a group has none
+    if len(shape) < 3 or 0 in (*shape, *finest):
+        return False
     steps = [2 ** round(np.log2(n / m)) for n, m in zip(finest, shape, strict=True)]
     return all(m in (n // by, -(-n // by)) for n, m, by in zip(finest, shape, steps, strict=True))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,7 +13,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.reconstruction import reconstruct
-from recon.spectral import MOST_TRIAL_SWEEPS, EnergyViews, _Fit, fit_materials
+from recon.spectral import TRIAL_SWEEPS, EnergyViews, _Fit, fit_materials
 from recon.voxels.projector import Projector
 
 SECTIONS = np.array([[0.2, 1.0], [0.5, 0.9], [1.0, 0.2], [0.9, 0.4]])  # [energy, material]
@@ -157,20 +158,31 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
     assert [sweep for sweep, _ in heard if sweep] == [1, 2, 3]
 
 
-@pytest.mark.parametrize("before_the_end", [1, 20])
-def test_a_stop_in_any_sweep_of_a_trial_ends_the_trials(before_the_end: int) -> None:
-    views, heard = views_of(balls(), 8, noise=0.05), list[int]()
-    fit_materials(views, sweeps=1, go_on=lambda sweep, residual: not heard.append(sweep))
-    trials = heard.count(0)
-    assert 20 < trials <= MOST_TRIAL_SWEEPS
-    heard.clear()
+def test_each_sweep_of_a_trial_of_weights_may_end_the_fit() -> None:
+    heard: list[int] = []
+    views = views_of(balls(), 8, noise=0.05)
+
+    most = math.inf
 
     def go_on(sweep: int, residual: float) -> bool:
         heard.append(sweep)
-        return len(heard) < trials - before_the_end
+        return len(heard) < most
 
-    fit_materials(views, go_on=go_on)
-    assert heard == [0] * (trials - before_the_end) + [1]
+    fit_materials(views, sweeps=1, go_on=go_on)
+    tried = heard.count(0)
+    assert 5 * 8 <= tried <= TRIAL_SWEEPS
+    for stop in (1, tried - 3):  # in the first trial, and in those of the other components
+        heard.clear()
+        most = stop
+        fit_materials(views, sweeps=2, go_on=go_on)
+        assert heard == [0] * stop + [1]
+
+
+def test_views_of_nothing_leave_nothing() -> None:
+    views = views_of(np.zeros_like(balls()), 8)
+    made = fit_materials(views, sweeps=2)
+    assert not made.densities.any()
+    assert made.residual == 0
 
 
 def test_the_share_of_nothing_is_not_a_number() -> None:
@@ -188,6 +200,8 @@ def test_the_share_of_nothing_is_not_a_number() -> None:
         ([[1.0, 2.0], [2.0, 1.0]], [0, 0, 0, 0], "1 energies do not tell"),
         ([[1.0, 2.0], [2.0, 1.0]], [0, 2, 0, 1], "an index 0 ... 1"),
         ([[1.0, 2.0], [2.0, 1.0]], [0, 1, 0], "for each of 4 views"),
+        ([[0.0, 0.0], [0.0, 0.0]], [0, 1, 0, 1], "do not tell 2 materials apart"),
+        ([[1.0, np.nan], [0.5, 1.0]], [0, 1, 0, 1], "cross_sections must be finite"),
     ],
 )
 def test_what_does_not_fit_is_refused(sections: Sequence[Sequence[float]], energy: list[int], said: str) -> None:

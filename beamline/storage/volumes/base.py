@@ -138,7 +138,7 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
         "raw_file": record.raw_file,
         "date": datetime.fromtimestamp(record.time, UTC).isoformat(timespec="seconds"),
         "length_unit": record.length_unit,
-        "values": f"1/{record.length_unit}",
+        "values": record.unit,
         **({} if pixels.window is None else {"window": pixels.window}),
         "voxel_size": grid.voxel_size,
         "slice_pitch": grid.slice_pitch,
@@ -173,6 +173,7 @@ def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
         time=datetime.fromisoformat(facts["date"]).timestamp(),
         parameters={**facts["parameters"], **window},
         metrics=facts["metrics"],
+        is_share=facts.get("values") == "",
     )
 
 

@@ -39,7 +39,7 @@ class ReconRecord:
     """A volume and where it comes from.
 
     Attributes:
-        length_unit: "mm" where the pixel size is known, else "px"; the volume is in 1/length_unit.
+        length_unit: "mm" where the pixel size is known, else "px".
         raw_file: name of the scan it was made from.
         time: s since the Unix epoch when it was made.
         parameters: every setting used, by name; numbers, strings and arrays.
@@ -47,6 +47,7 @@ class ReconRecord:
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
+        is_share: the voxels are shares of the volume that a material fills, without a unit, and no attenuation.
         model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
     """
 
@@ -62,6 +63,12 @@ class ReconRecord:
     model: Mapping[str, Any] = field(default_factory=dict)
     deviation: NDArray[np.float32] | None = None
     fbp: NDArray[np.float32] | None = None
+    is_share: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Of the voxels; empty for shares."""
+        return "" if self.is_share else f"1/{self.length_unit}"
 
 
 def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
@@ -120,10 +127,12 @@ def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
         for first in range(0, shape[0], _SLAB):
             other[first : first + _SLAB] = values[first : first + _SLAB]
             file.require_taken()
-        other.attrs["units"] = f"1/{record.length_unit}"
-        other.attrs["long_name"] = f"{meaning} (1/{record.length_unit})"
-    data["data"].attrs["units"] = f"1/{record.length_unit}"
-    data["data"].attrs["long_name"] = f"linear attenuation coefficient (1/{record.length_unit})"
+        other.attrs["units"] = record.unit
+        other.attrs["long_name"] = f"{meaning} ({record.unit})"
+    data["data"].attrs["units"] = record.unit
+    data["data"].attrs["long_name"] = (
+        "volume fraction" if record.is_share else f"linear attenuation coefficient ({record.unit})"
+    )
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
         data[name] = centres
         data[name].attrs["units"] = record.length_unit
@@ -214,6 +223,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
         deviation=data.get(DEVIATION),
         fbp=data.get(FBP),
+        is_share=data["data"].attrs.get("units") == "",
     )
 
 

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
-from beamline.core.errors import ConfigError
-from beamline.core.signals import StopOnSignal
-from beamline.projections.selection import Selection
-from beamline.projections.steps.width import Width
-from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
-from beamline.storage.readers.open import SourceOptions
+from beamline.cli.terminal import counting
+from beamline.core.errors import DataError
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.energy_series import read_spectra
 from beamline.storage.volumes.files import opened_volume
-from drivers.base.clock import SystemClock
+from recon.base.ray_width import RayWidth
 from simulators.light.palette import known
 
 pytest.importorskip("xraylib")
@@ -69,10 +71,8 @@ def spectra(folder: Path, energies: tuple[float, ...] = ENERGIES) -> Path:
 
 
 def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path: Path) -> None:
-    words = "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5"
-    done = run(*words, "--json")
+    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
     assert done.exit_code == 0, done.output
-    assert "trials of weights" in done.output
     share = {}
     for material in GRAINS:
         with opened_volume(tmp_path / f"out_{material}.h5") as record:
@@ -82,11 +82,14 @@ def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path
                 name: float(np.median(np.asarray(volume.data)[3][np.hypot(x - at[0], y - at[1]) < 0.006]))
                 for name, at in GRAINS.items()
             }
-            assert record.length_unit == "mm"
+            assert (record.length_unit, record.unit) == ("mm", "")  # a share has no unit
+            assert record.raw_file == str(scans[0].resolve())
+            assert record.parameters["scans"] == ", ".join(str(path.resolve()) for path in scans)
+            assert "ended_early" not in record.parameters
     for name, other in (("charged", "fresh"), ("fresh", "charged")):
         assert share[name][name] == pytest.approx(1, abs=0.15)
         assert share[other][name] < 0.15
-    again = run(*words)
+    again = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5")
     assert "never overwritten" in again.output
 
 
@@ -107,14 +110,96 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
     assert not list(tmp_path.glob("out*"))
 
 
-def test_scans_whose_exposures_turn_by_unlike_arcs_do_not_mix(scans: list[Path], tmp_path: Path) -> None:
-    unlike = [
-        (SourceOptions(path), Selection(axis_col=31.5, steps=(Width(arc=arc),)))
-        for path, arc in zip(scans, ("0.5", "0.502", "1", "1"), strict=True)
-    ]
-    with pytest.raises(ConfigError, match=r"turns 0.5° and 0° a row in an exposure of scan 1, and 1° .* of scan 3"):
-        reconstruct_materials(
-            unlike, read_spectra(spectra(tmp_path)), tmp_path / "out.h5", lambda event: None, SystemClock(),
-            lambda stage: lambda done, of: None, StopOnSignal(ready=False),
-        )  # fmt: skip
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("energy_kev,a,A\n8.3,1,2\n8.4,2,1\n", "more than capitals"),
+        ('energy_kev,"a\nb"\n8.3,1\n8.4,2\n', "parts of file names"),
+        ("energy_kev,a\0b\n8.3,1\n8.4,2\n", "parts of file names"),
+        ("energy_kev," + 200_000 * "a" + "\n8.3,1\n8.4,2\n", "field larger than"),
+        ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "'8.4,1' are not 3 numbers"),
+        ("\n", "no table of spectra"),
+        ("energy_kev,a,b\n8.3,0,0\n8.4,0,0\n", "do not tell 2 materials apart"),
+    ],
+)
+def test_a_hostile_table_is_refused(scans: list[Path], tmp_path: Path, table: str, said: str) -> None:
+    (tmp_path / "table.csv").write_text(table, newline="")
+    done = run(
+        "materials", *scans[:2], "--spectra", tmp_path / "table.csv", "-o", tmp_path / "out.h5", "--axis", "31.5"
+    )
+    assert done.exit_code in (2, 5), done.output
+    assert said in done.output
     assert not list(tmp_path.glob("out*"))
+
+
+def test_a_line_of_blanks_in_the_table_is_no_line(tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text("\ufeffenergy_kev,a\r\n8.4,2\r\n  \r\n8.3,1\r\n\r\n", encoding="utf-8")
+    assert list(read_spectra(tmp_path / "table.csv").at(8.35)) == pytest.approx([1.5])
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with a name are of POSIX")
+def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    with pytest.raises(DataError, match="a regular file is expected"):
+        read_spectra(tmp_path / "pipe.csv")
+
+
+@pytest.mark.parametrize("name", ["", "out.tif", "out"])
+def test_an_output_of_another_format_is_refused(scans: list[Path], tmp_path: Path, name: str) -> None:
+    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / name if name else "")
+    assert done.exit_code == 2
+    assert "ends in .h5" in done.output
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_too_little_memory_is_said_before_a_scan_is_corrected(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("beamline.reconstruct.energy_series.free_memory", lambda: 1e6)
+    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
+    assert done.exit_code == 2
+    assert "Give --rows, --views or --bin" in done.output
+    assert "scans: 1/4" not in done.output
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_ctrl_c_while_weights_are_tried_ends_with_the_volumes_so_far(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[int] = []
+
+    def interrupted(n: int, of: int) -> None:
+        shown.append(n)
+        if n == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    told = counting
+    monkeypatch.setattr(
+        "beamline.cli.materials.counting",
+        lambda stage, sink, clock: interrupted if stage.startswith("trial") else told(stage, sink, clock),
+    )
+    done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
+    assert done.exit_code == 4, done.output
+    assert shown == [1, 2, 3]
+    for material in GRAINS:
+        with opened_volume(tmp_path / f"out_{material}.h5") as record:
+            assert record.parameters["ended_early"]
+
+
+@pytest.mark.parametrize(("arc", "code"), [(0.2, 2), (0.1001, 0)])
+def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
+    scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arc: float, code: int
+) -> None:
+    made: list[PreparedProjections] = []
+
+    def prepared(*args: Any, **more: Any) -> PreparedProjections:
+        part = prepare_projections(*args, **more)
+        made.append(replace(part, geometry=part.geometry.seen_with(RayWidth(arc=arc if made else 0.1))))
+        return made[-1]
+
+    monkeypatch.setattr("beamline.reconstruct.energy_series.prepare_projections", prepared)
+    monkeypatch.setattr("beamline.reconstruct.energy_series._SWEEPS", 1)
+    words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--rows", "0:1"
+    done = run("materials", *scans[:2], *words)
+    assert done.exit_code == code, done.output
+    assert ("Give an --exposure-arc that holds for all" in " ".join(done.output.split())) == (code == 2)

@@ -207,3 +207,20 @@ def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
 def test_a_number_beyond_all_that_is_real_is_refused(tmp_path: Path, setting: str) -> None:
     said = faults(tmp_path, GOOD, setting)
     assert setting.split("=")[0] in said and "expected" in said and "<= 1e" in said.replace("10000", "1e4")
+
+
+@pytest.mark.parametrize(
+    ("places", "said"),
+    [
+        ("[]", "devices.filter.places is []; expected a list of 1 or more: text of 1 to 80 characters"),
+        ("['']", "devices.filter.places.0 is ''; expected text of 1 to 80 characters"),
+        ("[3]", "devices.filter.places.0 is 3; expected text of 1 to 80 characters"),
+    ],
+)
+def test_a_list_of_names_says_what_it_expects(tmp_path: Path, places: str, said: str) -> None:
+    path = tmp_path / "my.yaml"
+    path.write_text(f"devices:\n  filter: {{kind: simulated, places: {places}}}\n")
+    with pytest.raises(ConfigError) as refused:
+        load(path)
+    assert said in str(refused.value)
+    assert ": None" not in str(refused.value)

@@ -139,3 +139,32 @@ def test_what_is_no_volume_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "zarr", None)
     with pytest.raises(DataError, match="to read it, pip install zarr"), opened_volume(tmp_path / "bare.zarr"):
         pass
+
+
+@pytest.mark.parametrize("coarser", ["group", "image", "empty"])
+def test_a_coarser_scale_that_is_no_volume_is_left_out(tmp_path: Path, coarser: str) -> None:
+    _write(tmp_path / "v.zarr", 3, "zstd")
+    group = pytest.importorskip("zarr").open_group(str(tmp_path / "v.zarr"))
+    del group["s1"]
+    if coarser == "group":
+        group.create_group("s1")
+    else:
+        group.create_array(
+            "s1",
+            shape={"image": (65, 76), "empty": (0, 65, 76)}[coarser],
+            dtype="u2",
+            chunks=(8,) * (2 + (coarser == "empty")),
+        )
+    finest, _ = open_zarr(tmp_path / "v.zarr")
+    assert (finest.shape, finest.coarser) == (SHAPE, ())
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, math.nan, math.inf])
+def test_a_voxel_without_a_size_is_refused(tmp_path: Path, scale: float) -> None:
+    _write(tmp_path / "v.zarr", 2, "zstd")
+    group = pytest.importorskip("zarr").open_group(str(tmp_path / "v.zarr"))
+    said = group.attrs["multiscales"]
+    said[0]["datasets"][0]["coordinateTransformations"] = [{"type": "scale", "scale": [1.0, 1.0, str(scale)]}]
+    group.attrs["multiscales"] = said
+    with pytest.raises(DataError, match="expected lengths above 0"):
+        open_zarr(tmp_path / "v.zarr")
