@@ -173,8 +173,11 @@ def reconstruct_materials(
         return not early
 
     stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps")
-    with stop() as stopping:
-        made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
+    try:
+        with stop() as stopping:
+            made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
+    except ValueError as error:
+        raise ConfigError(f"{error}. Nothing was written.") from error
     _write(made, parts[0], scans, outputs, early, clock.now())
     return MaterialRun(outputs, made.residual, early)
 

@@ -104,7 +104,10 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
         )
     heights = [slab.slices.stop - slab.slices.start for slab in left]
     extent = Extent(geometry, heights, decided=options.partial is not None)
-    seconds = run_seconds(needs.method, extent, clock.now) if left else 0.0
+    try:
+        seconds = run_seconds(needs.method, extent, clock.now) if left else 0.0
+    except ValueError as error:  # as the method itself refuses the views
+        raise DataError(f"{source.path} cannot be reconstructed by {options.method.name}: {error}.") from error
     seconds *= 1 + options.uncertainty  # error bars take at most as long as the volume
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in left)
     height = slabs[0].own.stop

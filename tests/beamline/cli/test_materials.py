@@ -203,3 +203,11 @@ def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
     done = run("materials", *scans[:2], *words)
     assert done.exit_code == code, done.output
     assert ("Give an --exposure-arc that holds for all" in " ".join(done.output.split())) == (code == 2)
+
+
+def test_a_source_within_the_field_is_refused(scans: list[Path], tmp_path: Path) -> None:
+    words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--cone", "0.01:0.02"
+    done = run("materials", *scans[:2], *words)
+    assert done.exit_code == 2, done.output
+    assert "the box reaches" in done.output
+    assert not list(tmp_path.glob("out*"))

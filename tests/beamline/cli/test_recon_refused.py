@@ -224,3 +224,14 @@ def test_budgets_are_of_finished_scans_and_the_fit(folder: Path, options: list[s
     result = beamline("recon", "scan.h5", "--budget", "1m", *options)
     assert result.exit_code == 2
     assert "--budget" in result.stderr and left(folder) == {"scan.h5"}
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"]])
+def test_a_source_within_the_field_is_refused_by_a_dry_run_too(folder: Path, options: list[str]) -> None:
+    write_exchange(folder / "scan.h5", SCAN)
+    cone = ["--cone", "0.01:0.02", "--pixel-size-um", "10", "--axis", "20", "--angles", "whole.txt"]
+    (folder / "whole.txt").write_text("\n".join(str(angle) for angle in np.linspace(0, 360, N, endpoint=False)))
+    result = beamline("recon", "scan.h5", "-m", "sirt", *cone, *options)
+    assert result.exit_code == 5, result.output
+    assert "cannot be reconstructed by sirt: the box reaches" in " ".join(result.stderr.split())
+    assert left(folder) == {"scan.h5", "whole.txt"}
