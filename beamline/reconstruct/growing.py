@@ -31,6 +31,7 @@ from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
+from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.views import parse_views
 from recon.prep.correct import Projections, merge_and_empty
@@ -145,10 +146,10 @@ class ScanFollower:
                     self._fit.replace_newest(data[0])
                 data, views, self._newest = data[1:], views[1:], None
             if views.size:
-                self._fit.add_views(data, self.source.angles[views])
+                self._fit.add_views(data, self._angles(views))
         if self._newest is None and (newest := self._correction.newest()) is not None:
             self._newest = newest
-            self._fit.add_views(newest.data, self.source.angles[newest.view_ids])
+            self._fit.add_views(newest.data, self._angles(newest.view_ids))
 
     def _chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """The views of the selection, by their place among all views taken, which later frames do not change."""
@@ -185,6 +186,22 @@ class ScanFollower:
     def _binned(self, axis_col: float) -> float:
         return geometry_of(self.source, self._options.selection, axis_col, np.zeros(1)).axis_col
 
+    def _seen(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, dict[str, StepDone]]:
+        """The geometry of views with the motion of the stage in their exposures, and what its steps did."""
+        selection, done = self._options.selection, dict[str, StepDone]()
+        geometry = geometry_of(self.source, selection, axis_col, self.source.angles[view_ids])
+        for step in selection.in_order:
+            if isinstance(step, RayStep):
+                geometry, done[step.name] = step.rays(self.source, selection, geometry)
+        return geometry, done
+
+    def _angles(self, view_ids: NDArray[np.int64], axis_col: float | None = None) -> NDArray[np.float64]:
+        """Angles of views for the fit: in the middle of the exposure, of the middle row. The fit knows no motion."""
+        column = self.axis_col if axis_col is None else axis_col
+        assert column is not None  # the fit has an axis
+        geometry, _ = self._seen(column, view_ids)
+        return np.asarray(geometry.angles + geometry.skew * (geometry.detector_shape[0] - 1) / 2)
+
     def _new_fit(self, axis_col: float) -> StreamingFit:
         check_axis(self.source, axis_col)
         template = geometry_of(self.source, self._options.selection, axis_col, np.zeros(1))
@@ -193,7 +210,7 @@ class ScanFollower:
         self._sink(ReconStarted(self.source.path, options.method.name, self.n_views, axis_col, again, time=now))
         fit = options.streaming.stream(template, options.seed, self._clock.now)
         for batch in self._batches:
-            fit.add_views(batch.data, self.source.angles[batch.view_ids])
+            fit.add_views(batch.data, self._angles(batch.view_ids, axis_col))
         self._newest = None
         return fit
 
@@ -221,7 +238,7 @@ class ScanFollower:
         self._correction = self._correction.renewed()
         self._batches = []
         self._batches = [self._correction.at_once(frames)]
-        self._fit.replace_views(self._batches[0].data, self.source.angles[frames] if gone else None)
+        self._fit.replace_views(self._batches[0].data, self._angles(frames) if gone else None)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; False if there is nothing to fit yet."""
@@ -334,12 +351,12 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        geometry = geometry_of(self.source, selection, axis_col, self.source.angles[projections.view_ids])
+        geometry, seen = self._seen(axis_col, projections.view_ids)
         axis = axis_col, self._axis.estimate
         found = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
-        done = self._correction.done
+        done = {**self._correction.done, **seen}
         for step in selection.in_order:
-            if isinstance(step, PlaceStep | RayStep):
+            if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:

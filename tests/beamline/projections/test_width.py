@@ -9,14 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+import recon
 from beamline.core.errors import ConfigError
+from beamline.core.sinks import Warnings
 from beamline.projections.selection import Selection, geometry_of
 from beamline.projections.steps.calibrate import Calibrate
 from beamline.projections.steps.step import StepDone, options_of
 from beamline.projections.steps.width import Width
+from beamline.reconstruct.growing import ScanFollower
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.result import OutputPaths
 from beamline.simulate.scene_file import Scan, open_scene
 from beamline.simulate.write import write_scan
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
 from simulators.devices.clock import VirtualClock
 from tests.beamline.array_source import ArraySource
@@ -141,3 +146,16 @@ def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: lis
     moved = math.radians(180) / 6 / scan.period * 0.012
     assert seen.width.arc == pytest.approx(moved if effects else 0)
     assert (done.said != "") == bool(effects)
+
+
+def test_a_followed_scan_sees_the_middle_of_the_exposure_too(tmp_path: Path) -> None:
+    """Else its volume is turned by half of the arc from that of the finished scan, and its finish knows no motion."""
+    source, clock = _source(), VirtualClock()
+    options = ReconOptions(SourceOptions("scan.h5"), OutputPaths(tmp_path / "out.h5", None), Selection(), recon.R2())
+    follower = ScanFollower(options, source, lambda event: None, clock, Warnings(lambda event: None, clock))
+    ids = np.arange(2, 40)
+    turned = ARC / 2 + SKEW * (SHAPE[0] - 1) / 2
+    np.testing.assert_allclose(follower._angles(ids, 100.0), source.angles[ids] + turned)
+    geometry, done = follower._seen(100.0, ids)
+    assert (geometry.width.arc, geometry.skew) == (pytest.approx(ARC), pytest.approx(SKEW))
+    assert done["width"].parameters["exposure_arc_deg"] == pytest.approx(1.6)
