@@ -65,7 +65,5 @@ def test_an_energy_series(example: Example, tmp_path: Path) -> None:
 def test_scan_inspect_rescan(example: Example, tmp_path: Path) -> None:
     out = example("inspect_and_rescan.py", "cathode-3")
     assert out.startswith("runs/") and "51 frames, volume None" in out
-    assert [run.name.partition("_")[2] for run in sorted((tmp_path / "runs").iterdir())] == [
-        "cathode-3_look-1",
-        "cathode-3",
-    ]
+    # Both may begin in one second, which is all that their names tell of the order.
+    assert {run.name.partition("_")[2] for run in (tmp_path / "runs").iterdir()} == {"cathode-3_look-1", "cathode-3"}
