@@ -117,7 +117,7 @@ def _filter(config: FilterConfig, found: Sequence[SerialPort], clock: Clock) -> 
         return
     if place is None:
         advice = "Compare devices.filter.places with the values of status_pv; a scan that names its place moves it"
-        yield Diagnosis(name, Grade.WARNING, "It stands at none of its places.", expected, advice)
+        yield Diagnosis(name, Grade.WARNING, "It stands at no place that has a name.", expected, advice)
     else:
         yield Diagnosis(name, Grade.OK, f"{place}.", expected, values={"place": place})
 

@@ -33,7 +33,7 @@ from recon.spectral import TRIAL_SWEEPS, EnergyViews, Materials, fit_materials
 
 _SWEEPS = 20
 _COPIES = 8  # of all line integrals: of the scans, joined, as lines and of a subset; with a weight each
-_ARCS_ALIKE = 0.01  # share of the larger one by which arcs of two scans may differ
+_ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger one
 _SUFFIX = ".h5"
 
 

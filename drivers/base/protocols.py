@@ -233,7 +233,7 @@ class Filter(Protocol):
         """Bring it there, and return when it is. Raises DeviceError: it did not arrive."""
 
     def place(self) -> str | None:
-        """Where it stands; None: at none of its places, or not known. Raises DeviceError."""
+        """Where it stands; None: the place has no name, or is not known. Raises DeviceError."""
 
 
 @runtime_checkable

@@ -28,7 +28,7 @@ PLACES = {"none": 0.0, "Al 1 mm": 1.0, "Cu": 2.0}
 
 @dataclass
 class Rig:
-    """A filter that is at none of its places; `moves` counts what it was told; `broken`: it no longer obeys."""
+    """A filter at a place without a name; `moves` counts what it was told; `broken`: it no longer obeys."""
 
     filter: Filter
     moves: Callable[[], int]

@@ -120,6 +120,6 @@ def test_the_doctor_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_p
         assert found() == ("ok", "Cu.")
         served.values["f"] = 1.0
         clock.sleep(1)
-        assert found() == ("warning", "It stands at none of its places.")
+        assert found() == ("warning", "It stands at no place that has a name.")
         ioc.stop()
     assert found()[0] == "failed"
