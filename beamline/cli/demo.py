@@ -132,6 +132,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
 
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
+    from beamline.reconstruct.model import read_model
     from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
     from beamline.reconstruct.result import OutputPaths, axis_of, write_result
     from beamline.report.record import history_from
@@ -154,6 +155,7 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
         seconds=record.metrics["seconds"],
         history=history_from(record.history),
         settings=record.parameters,
+        gaussians=read_model(folder / RECON).gaussians if record.model else None,
         psnr=[(seconds, psnr(ideal.data, volume.data)) for seconds, volume in snapshots.volumes],
     )
     target = OutputPaths(folder / RECON, folder / REPORT, replace=True)

@@ -16,7 +16,7 @@ from recon.post.clusters import clusters
 _BLOCK = 2**20  # voxels of a slab: a second or two where all is noise
 _LOOKED = 2**20  # voxels from which the level is found
 _RANGE = 0.5, 99.5  # percentiles at which they are cut, as for particles: a speck of metal is not the matter
-_APART = 5e-4  # of the largest contrast, by which each voxel is at least off the level
+_APART = 5e-4  # least distance of a voxel from the level, over the largest contrast
 _WORK = 3  # copies of a mesh while it is joined
 
 

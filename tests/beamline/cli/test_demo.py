@@ -72,6 +72,7 @@ def test_from_trigger_to_judged_volume(here: Path) -> None:
     record = read_reconstruction(folder / "recon.h5")
     assert record.metrics["psnr"] == done["psnr"]
     assert record.parameters["command"] == "beamline demo"
+    assert len(record.model["densities"]) == record.parameters["gaussians"]  # `beamline voxelise` takes it
     assert {"ssim_weight", "tv_weight", "rates", "policy_every", "seconds_after_scan", "finish"} <= set(
         record.parameters
     )
