@@ -51,6 +51,10 @@ FAULTS = {
         "my.yaml:8: devices.camera.roi.3 is 'x'; expected a whole number >= 1",
     ),
     "name": (("name: test", "name: a/b"), "sample.name is 'a/b'; expected text of letters, digits and _"),
+    "no text": (
+        ('port: "sim://pm16c"', "port: .nan"),
+        "my.yaml:7: devices.stage.port is .nan; expected text that is not empty",
+    ),
     "scalar for a group": (
         ("{pixel_size_um: 5}", "5"),
         "my.yaml:11: optics is 5; expected a group of keys: pixel_size_um",
