@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from recon.axis_by_views import axis_by_views
 from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.prep.align import AxisError
+from recon.voxels.projector import Projector
 
 VIEWS, ROWS, COLS, SOD, SDD = 36, 6, 64, 60.0, 90.0
 BALLS = np.array([[9.0, -4.0, 1.0, 5.0], [-7.0, 6.0, -2.0, 4.0], [-2.0, -10.0, 0.0, 3.0]])  # x, y, z, radius in mm
@@ -39,6 +41,19 @@ def test_the_axis_is_found_to_a_tenth_of_a_column(sod: float, sdd: float, start:
     found = axis_by_views(views, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, start))
     assert found.value == pytest.approx(29.2, abs=0.1) and found.confident and found.method == "views held out"
     assert abs(found.candidates[found.curve.argmin()] - 29.2) <= 1
+
+
+def test_the_axis_of_a_sample_wider_than_the_field() -> None:
+    """Foam in 86 columns, seen in 80 of them. The field alone has no room for the rest, and each axis looks alike."""
+    rng, rows, n = np.random.default_rng(1), 12, 96
+    y, x = np.mgrid[:n, :n] - (n - 1) / 2
+    cells = np.kron(rng.random((rows // 4, n // 4, n // 4)) > 0.6, np.ones((4, 4, 4)))
+    foam = (0.01 * cells * (np.hypot(x, y) < 43)).astype(np.float32)
+    whole = Geometry.cone(2 * np.pi * np.arange(48) / 48, (rows, 2 * n), 1.0, 2.5 * n, 5.0 * n, n + 1.8)
+    views = Projector(whole, Grid(foam.shape, 1.0)).forward(foam)[..., 56:-56]
+    views += rng.normal(0, 0.01, views.shape).astype(np.float32)
+    found = axis_by_views(views, replace(whole, detector_shape=views.shape[1:], axis_col=39.5))
+    assert found.value == pytest.approx(41.8, abs=0.2) and found.confident
 
 
 def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> None:
