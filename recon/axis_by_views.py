@@ -36,8 +36,8 @@ def axis_by_views(
     """The column by which a volume of two thirds of the views leaves least of the others.
 
     The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
-    best candidate. A parabola through three candidates on finer pixels ends it. Where no candidate is clearly the best
-    and the sample is wider than the field, the search is made again in a box of twice the field's width.
+    best candidate. A parabola through three candidates on finer pixels ends it. If no candidate is clearly the best,
+    a sample wider than the field is searched again, in a box of twice the field's width.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
