@@ -125,7 +125,9 @@ def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
 def test_the_weight_with_the_smallest_error_is_found(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error that is a parabola of log μ has its vertex where a parabola through three points has it."""
     _errors(best, monkeypatch)
-    assert preferred_weight(_views(), 3.0) == pytest.approx(3.0 * best)
+    found = preferred_weight(_views(), 3.0)
+    assert found is not None and found.weight == pytest.approx(3.0 * best)
+    assert 1 <= found.residual <= 1 + math.log(math.sqrt(2)) ** 2
 
 
 @pytest.mark.parametrize(
@@ -139,6 +141,17 @@ def test_two_runs_are_taken_where_they_predict_unseen_views_better(
     trial = Mock(of=lambda problem: lambda weight, twice=False: errors[weight, twice])
     monkeypatch.setattr("recon.voxels.held_out_weight._Trial", trial)
     assert bregman_weight(_views(), 2.0) == found
+
+
+def test_one_run_is_not_tried_again_where_two_are_clearly_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[bool] = []
+
+    def error(weight: float, twice: bool = False) -> float:
+        tried.append(twice)
+        return 2.0
+
+    monkeypatch.setattr("recon.voxels.held_out_weight._Trial", Mock(of=lambda problem: error))
+    assert bregman_weight(_views(), 2.0, 1.9) is None and tried == [True]
 
 
 def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,3 +265,18 @@ def test_views_held_out_that_weigh_nothing_in_the_busiest_rows_leave_the_weight_
     weights[split_views(geometry)[1], :ROWS] = 0
     found = recon.reconstruct(data, geometry, FistaTv(iterations=1), grid=grid, use=recon.DataUse(weights=weights))
     assert np.isfinite(found.volume.data).all()
+
+
+@pytest.mark.parametrize(
+    ("errors", "steadily", "sweeps"),
+    [
+        ([1.0, 0.97, 0.95], True, 24), ([1.0, 0.95, 0.97], True, 8), ([1.0, 0.995, 0.992], True, 8), ([], True, 8),
+        ([1.0, 0.95, 0.97], False, 24), ([1.0, 0.995, 0.996], False, 8), ([1.0, 1.1], False, 8), ([], False, 8),
+    ],
+)  # fmt: skip
+def test_more_sweeps_have_to_bring_unseen_views_nearer(
+    errors: list[float], steadily: bool, sweeps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Round for round; after a fit that was ended early any round counts."""
+    monkeypatch.setattr("recon.voxels.held_out_weight.residuals_of_rounds", lambda *_: errors)
+    assert preferred_sweeps(_views(), np.zeros(1, np.float32), 1.0, 8, steadily=steadily) == sweeps
