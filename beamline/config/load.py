@@ -124,6 +124,7 @@ def plan_of(config: Config) -> ScanPlan:
         warm_up=scan.warm_up_s,
         return_views=scan.return_views,
         filter=scan.filter,
+        energy=scan.energy,
         darks=_field(scan.darks, scan.exposure_s),
         flats=_field(scan.flats, scan.exposure_s),
         scheme=scan.angles.scheme,

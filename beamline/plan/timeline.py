@@ -95,6 +95,7 @@ def work_out(
         retake_seconds=retake_seconds,
         warm_up=plan.warm_up,
         filter=plan.filter,
+        energy=plan.energy,
     )
 
 

@@ -206,22 +206,26 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         period=timeline.views.period,
         plan=json.dumps(asked),
         filter=plan.filter or known.filter,
+        energy_kev=plan.energy or known.energy_kev,
+        monochromator_kev=plan.energy or known.monochromator_kev,
     )
 
 
 def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
-    """Facts for the file that need no plan; the filter is where it stands. DeviceError: a device does not answer."""
+    """Facts for the file that need no plan; filter and energy as they stand. DeviceError: a device does not answer."""
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:
         # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
         source_distance, sdd = instrument.simulated.cone
         pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
+    energy = None if devices.monochromator is None else devices.monochromator.energy()
     return ScanInfo(
         sample=config.sample.name,
         title=config.sample.description,
         pixel_size_mm=pixel_size * config.devices.camera.binning,
-        energy_kev=optics.energy_kev,
+        energy_kev=energy or optics.energy_kev,
+        monochromator_kev=energy,
         distance_mm=distance,
         source_distance_mm=source_distance,
         axis_col=optics.axis_col,
