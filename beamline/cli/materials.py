@@ -41,13 +41,16 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
     """Fit the volume fraction of each material to scans of one sample at several energies, all at once.
 
-    Each SCAN states its energy. Few views an energy are enough: all views together determine the materials. Views of
-    different energies should have different angles. The sample must not move between the scans.
+    Each SCAN states its energy; the folder of a series (`scan.energies`) stands for its scans. Few views an energy are
+    enough: all views together determine the materials. Views of different energies should have different angles. The
+    sample must not move between the scans.
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
     from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
+    from beamline.scan.energies import is_series, scans_in
 
+    files = tuple(scan for path in files for scan in (scans_in(path) if is_series(path) else [path]))
     refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
     table = read_spectra(spectra)
     with events_shown(as_json) as sink:

@@ -120,6 +120,8 @@ class ScanSection(Section):
     """Name of one of the places of devices.filter, where it is before the first frame; null: as it stands."""
     energy: Kev | None = None
     """keV to which devices.monochromator goes before the first frame; null: as it stands."""
+    energies: Annotated[tuple[Kev, ...], Field(min_length=2, max_length=1000)] | None = None
+    """keV of a series: a scan at each, one after the other; each begins a fraction of a step later in angle."""
     return_views: Annotated[int, Field(ge=0, le=100)] = 0
     """Views that are taken a second time on the way back, evenly spread: they tell whether the sample has moved."""
     without_watchdog: Literal["warn", "pause"] = "warn"
@@ -233,15 +235,22 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _energy_can_be_set(self) -> Self:
-        device, energy = self.devices.monochromator, self.scan.energy
-        if energy is None:
+        device, one, several = self.devices.monochromator, self.scan.energy, self.scan.energies
+        if one is not None and several is not None:
+            raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
+        if one is None and several is None:
             return self
+        name, energies = ("scan.energies", several) if several else ("scan.energy", (one or 0.0,))
         if isinstance(device, NoMonochromator):
-            raise ValueError("scan.energy needs a monochromator, and devices.monochromator.kind is none")
+            raise ValueError(f"{name} needs a monochromator, and devices.monochromator.kind is none")
+        if len(set(energies)) < len(energies):
+            raise ValueError("scan.energies has an energy twice; give each once")
+        if several and self.recon.stop_when is not None:
+            raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)
-        if not low <= energy <= high:
+        if beyond := [energy for energy in energies if not low <= energy <= high]:
             raise ValueError(
-                f"scan.energy {energy:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
+                f"{name}: {beyond[0]:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
             )
         return self
 

@@ -122,7 +122,7 @@ def test_the_simulated_beam_has_the_energy_in_a_scan_and_in_tune(tmp_path: Path)
         (("scan.energy=8.3",), r"scan\.energy needs a monochromator, and devices\.monochromator\.kind is none"),
         (
             ("devices.monochromator={kind: simulated, range_kev: [4, 8]}", "scan.energy=8.3"),
-            r"scan\.energy 8\.3 keV is not within devices\.monochromator\.range_kev 4 \.\.\. 8",
+            r"scan\.energy: 8\.3 keV is not within devices\.monochromator\.range_kev 4 \.\.\. 8",
         ),
         (("devices.monochromator={kind: manual}",), r"simulated.*monochromator real"),
     ],
