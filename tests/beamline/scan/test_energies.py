@@ -185,3 +185,16 @@ def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, wor
 def test_documents_of_a_series_are_refused(config: Path, tmp_path: Path) -> None:
     ended = beamline("scan", config, "-o", tmp_path / "runs", "--documents", tmp_path / "d.jsonl")
     assert ended.exit_code == 2 and "leave it out with scan.energies" in ended.stderr
+
+
+def test_a_series_is_a_spectrum(config: Path, tmp_path: Path) -> None:
+    """The mean of a region over the views of each energy has the edge of the grains."""
+    energies = [round(8.33 + 0.002 * n, 4) for n in range(13)]
+    words = ("scan.angles.views=4", f"scan.energies={energies}", "scan.flats.count=2")
+    done = beamline("scan", config, "-o", tmp_path, *(part for word in words for part in ("--set", word)))
+    assert done.exit_code in (0, 7), done.output
+    (series,) = tmp_path.iterdir()
+    found = beamline("xafs", series, "--region", "0:8,8:56", "--json", "-o", tmp_path / "edge.png")
+    assert found.exit_code == 0, found.output
+    said = json.loads(found.stdout.splitlines()[-1])
+    assert said["n_energies"] == 13 and said["edge_kev"] == pytest.approx(8.344, abs=0.002)
