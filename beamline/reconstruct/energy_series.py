@@ -190,7 +190,8 @@ def reconstruct_materials(
     stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps")
     try:
         with stop() as stopping:
-            made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
+            made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on, stop=stopping)
+            early = early or stopping()
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
     facts: dict[str, Any] = {"ended_early": True} if early else {}
