@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
+    from recon.registration import register_energies
     from recon.spectral import EnergyViews, Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
@@ -91,6 +92,7 @@ __all__ = [
     "mlem",
     "project",
     "reconstruct",
+    "register_energies",
     "remove_rings",
     "voxelize",
 ]
@@ -105,6 +107,7 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
+    "register_energies": "recon.registration",
     **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",

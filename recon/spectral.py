@@ -130,6 +130,7 @@ def fit_materials(
     sweeps: int = 20,
     seed: int = 0,
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
+    stop: Callable[[], bool] = lambda: False,
 ) -> Materials:
     """The densities that explain the views of all energies in one least-squares fit with total variation.
 
@@ -148,15 +149,21 @@ def fit_materials(
         sweeps: of about nine steps each, which see all views equally often.
         go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each sweep of a trial of
             weights. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
+        stop: asked many times within a sweep, before the views of an energy in a step, but for the first one. True
+            ends the fit with the volumes before that step.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
-    weights = _weights_by_views(views, grid, seed, go_on) if tv_weight is None else np.full(n, tv_weight)
-    fit, residual = _Fit(views, grid, np.random.default_rng(seed)), 1.0
+    weights = _weights_by_views(views, grid, seed, go_on, stop) if tv_weight is None else np.full(n, tv_weight)
+    fit, residual = _Fit(views, grid, np.random.default_rng(seed), stop), 1.0
     for sweep, residual in enumerate(fit.sweeps(weights, sweeps), 1):
         if not go_on(sweep, residual):
             break
     return Materials(fit.densities(), grid, weights, residual)
+
+
+class _StoppedError(Exception):
+    """A step was given up: somebody asked for the end."""
 
 
 class _Part(NamedTuple):
@@ -184,9 +191,11 @@ class _Fit:
     views: EnergyViews
     grid: Grid
     rng: np.random.Generator
+    stop: Callable[[], bool] = lambda: False
     z: F32 = field(init=False)
     subsets: list[list[_Part]] = field(init=False)
     step: float = field(init=False)
+    _begun: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         views = self.views
@@ -217,10 +226,16 @@ class _Fit:
         self.z = np.zeros((values.size, ny, nx, nz), np.float32)
 
     def descent(self, subset: list[_Part], out: F32) -> float:
-        """Minus the gradient of the views of a subset at z, into `out`. Returns their weighed sum of squares."""
+        """Minus the gradient of the views of a subset at z, into `out`. Returns their weighed sum of squares.
+
+        Raises:
+            _StoppedError: `stop` said so.
+        """
         out[...] = 0
         squares, image = 0.0, np.empty(self.z.shape[1:], np.float32)
         for part in subset:
+            if self._begun and self.stop():
+                raise _StoppedError
             image[...] = 0
             for share, component in zip(self._u[part.energy], self.z, strict=True):
                 combine(1.0, image, float(share), component, image)
@@ -233,7 +248,8 @@ class _Fit:
         return squares
 
     def sweeps(self, weights: F64, n: int) -> Iterator[float]:
-        """n times about nine steps from z, which see all views equally often; gives the residual of each nine."""
+        """n times about nine steps from z, which see all views equally often; gives the residual of each nine. A stop
+        ends it before the step that it was in."""
         _, ny, nx, nz = self.z.shape
         differences, count = difference_weights(self.grid), len(self.subsets)
         prox = [TotalVariationProx((ny, nx, nz), differences, False, _TV_STEPS) for _ in self.z]
@@ -242,7 +258,12 @@ class _Fit:
             squares = 0.0
             order = [number for _ in range(_SUBSETS // count) for number in self.rng.permutation(count)]
             for at, number in enumerate(order):
-                squares += self.descent(self.subsets[number], descent)
+                try:
+                    squares += self.descent(self.subsets[number], descent)
+                except _StoppedError:
+                    nonnegative_mix(self.z, self._back, self._to)  # momentum may have gone below 0
+                    return
+                self._begun = True
                 combine(1.0, self.z, self.step, descent, self.z)
                 for component, near, weight in zip(self.z, prox, weights, strict=True):
                     near(component, float(weight) * self.step / count)
@@ -273,7 +294,9 @@ class _Fit:
         return np.ascontiguousarray(np.einsum("mk,kyxz->mzyx", self._back.astype(np.float32), self.z))
 
 
-def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable[[int, float], bool]) -> F64:
+def _weights_by_views(
+    views: EnergyViews, grid: Grid, seed: int, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+) -> F64:
     """Weights of total variation [component], by one view in eight held out.
 
     First one weight for all components, halved until it predicts worse. The first component, which holds what energies
@@ -286,8 +309,8 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         rows = busiest_rows(views.projections, _ROWS)
         grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
     fit, judge = (
-        _Fit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed))
-        for chosen in (~held_out, held_out)
+        _Fit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), asked)
+        for chosen, asked in ((~held_out, stop), (held_out, lambda: False))
     )
 
     going = True
@@ -297,6 +320,9 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         for residual in fit.sweeps(weights, _TRIAL_SWEEPS):
             if not (going := go_on(0, residual)):
                 return math.inf
+        if stop():
+            going = False
+            return math.inf
         return judge.residual_of(fit.densities())  # not z: an energy's share of the views is another one here
 
     weights = np.full(len(fit.z), _FIRST * fit.steepest())

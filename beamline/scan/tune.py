@@ -133,7 +133,9 @@ def take(
     plan, camera = plan_of(config), instrument.devices.camera
     settings = camera.configure(camera_settings(config, plan.exposure, TriggerSource.SOFTWARE))
     frame_bytes = 2 * math.prod(camera.timing.shape)
-    worked = Timeline(tuple(blocks), 0.0, frame_bytes, 0, 0, 0.0, 0.0, 0.0, (), (), filter=plan.filter)
+    worked = Timeline(
+        tuple(blocks), 0.0, frame_bytes, 0, 0, 0.0, 0.0, 0.0, (), (), filter=plan.filter, energy=plan.energy
+    )
     instrument.watch_moves(stop.refuse_abort)
     acquisition = Acquisition(instrument.devices, worked, settings, plan.settle, instrument.clock, stop, sink)
     try:
