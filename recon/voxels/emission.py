@@ -16,6 +16,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import interleaved
 
+_RANGE = 1e30  # products of a sensitivity and an activity beyond it, or below 1 / it, leave float32
 _LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not seen, and keeps no activity
 
 
@@ -91,30 +92,40 @@ def mlem(
         counts per mm of line, 0 or more; 0 where no line sees a voxel.
 
     Raises:
-        ValueError: no iterations or subsets; counts that are zero everywhere; or a line with counts whose mean is zero
-            whatever the activity.
+        ValueError: no iterations, or other subsets than 1 to the number of views. Counts that are zero everywhere. A
+            line with counts whose mean is zero whatever the activity. Survival so small that float32 overflows.
     """
-    if operator.index(iterations) < 1 or operator.index(subsets) < 1:
-        raise ValueError(f"at least one iteration and subset are needed, got {iterations} and {subsets}")
+    views = emission.geometry.n_views
+    if operator.index(iterations) < 1:
+        raise ValueError(f"iterations must be 1 or more, got {iterations}")
+    if not 1 <= operator.index(subsets) <= views:
+        raise ValueError(f"subsets must be 1 to {views}, a view each at most, got {subsets}")
     if not emission.counts.any():
         raise ValueError("counts are zero everywhere: there is nothing to reconstruct")
     whole = Projector(emission.geometry, grid)
     parts = []
-    for views in interleaved(whole, subsets):
-        projector = whole.subset(views)
+    for some in interleaved(whole, subsets):
+        projector = whole.subset(some)
         if emission.survival is None:
             survival = np.ones(projector.projection_shape, np.float32)
         else:
-            survival = emission.survival[views]
-        background = np.float32(0) if emission.background is None else emission.background[views]
-        parts.append(_Subset(projector, emission.counts[views], survival, background, projector.adjoint(survival)))
+            survival = emission.survival[some]
+        background = np.float32(0) if emission.background is None else emission.background[some]
+        parts.append(_Subset(projector, emission.counts[some], survival, background, projector.adjoint(survival)))
     most = max(float(part.sensitivity.max()) for part in parts)
     if most == 0:
         raise ValueError("no line sees the grid: survival is 0 everywhere, or the lines miss it")
     least = _LEAST * most
     x = np.where(sum(part.sensitivity for part in parts) > least, np.float32(1), np.float32(0))
     seen = sum(float(x.ravel() @ part.sensitivity.ravel()) for part in parts)
-    x *= np.float32(emission.counts.sum(dtype=np.float64) / seen)
+    level = float(emission.counts.sum(dtype=np.float64)) / seen
+    if not (most > 1 / _RANGE and level < _RANGE):
+        highest = 1.0 if emission.survival is None else float(emission.survival.max())
+        raise ValueError(
+            f"survival is {highest:.3g} at most, so that activity would be about {level:.3g} counts per mm, beyond the "
+            "numbers of float32. Expected the share of pairs that a line counts, such as 0.3"
+        )
+    x *= np.float32(level)
     for iteration in range(1, iterations + 1):
         likelihood = 0.0
         for projector, counts, survival, background, sensitivity in parts:

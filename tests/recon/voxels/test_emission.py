@@ -17,7 +17,7 @@ F32 = np.float32
 def toy(seed: int = 0) -> tuple[Emission, Grid, np.ndarray]:
     """16 views of 2 x 7 pixels, Poisson counts; and A as a dense matrix."""
     rng = np.random.default_rng(seed)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 16, endpoint=False), (2, 7), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 16, endpoint=False), (2, 7), pixel_pitch=1.0)
     grid = Grid.matching(geometry)
     activity = rng.uniform(5, 40, grid.shape).astype(F32) * (rng.random(grid.shape) < 0.6)
     shape = (16, 2, 7)
@@ -68,7 +68,7 @@ def test_without_background_each_iteration_keeps_the_counts() -> None:
 
 def phantom() -> tuple[Volume, Volume, Geometry]:
     """Activity 1 in water of radius 24 mm, with a hot rod of 4 and two cold ones, of air and of Teflon."""
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), (1, 64), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), (1, 64), pixel_pitch=1.0)
     grid = Grid.matching(geometry)
     _, y, x = (np.asarray(axis) for axis in np.meshgrid(*grid.coordinates(), indexing="ij"))
     body, hot, air, teflon = (
@@ -122,6 +122,11 @@ def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
         mlem(Emission(0 * emission.counts, emission.geometry), grid)
     with pytest.raises(ValueError, match="no line sees the grid"):
         mlem(Emission(emission.counts, emission.geometry, 0 * emission.counts), grid)
+    with pytest.raises(ValueError, match=r"survival is 1e-38 at most, so that activity would be about .*e\+38"):
+        mlem(Emission(emission.counts, emission.geometry, np.full_like(emission.counts, 1e-38)), grid)
+    for iterations, subsets, said in ((0, 1, "iterations .* got 0"), (1, 17, "1 to 16, .* got 17"), (1, 0, "got 0")):
+        with pytest.raises(ValueError, match=said):
+            mlem(emission, grid, iterations, subsets)
     blind = np.where(np.arange(16)[:, None, None] == 3, 0, np.ones_like(emission.counts))
     with pytest.raises(ValueError, match="lines have counts and the mean 0"):
         mlem(Emission(emission.counts + 1, emission.geometry, blind.astype(F32)), grid)
