@@ -69,7 +69,7 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             raise DataError(
                 f"{path} is binned by {binning}, which does not divide the monitor's cells of {cell} pixels."
             )
-        geometry = Geometry.parallel([angle], source.shape, pixel, axis).binned(binning)
+        geometry = Geometry.parallel([angle], source.shape, pixel_pitch=pixel, axis_col=axis).binned(binning)
         image = project(volume, geometry)[0]
         if terms is not None:
             image += surface(terms, source.shape, binning)

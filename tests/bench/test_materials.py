@@ -51,7 +51,7 @@ def grains() -> F32:
 def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
     fine, n = grains(), len(energies) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(energies)
-    geometry = Geometry.parallel(angles, (ROWS, SIDE), PITCH)
+    geometry = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH)
     oxide, liquid = known("NMC811"), known("electrolyte")
     assert oxide is not None
     assert liquid is not None

@@ -185,7 +185,7 @@ def test_truth_lies_where_a_reconstruction_puts_it() -> None:
     with devices.connect(settings) as instrument:
         instrument.devices.camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
         assert instrument.truth is not None
-        volume = instrument.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), 4.6e-3)))
+        volume = instrument.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), pixel_pitch=4.6e-3)))
     z, y, x = (
         float((volume.data.sum(axis=axes) * at).sum() / volume.data.sum())
         for axes, at in zip(((1, 2), (0, 2), (0, 1)), volume.grid.coordinates(), strict=True)
