@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.special import xlogy
 
 from recon.base.arrays import F32
@@ -17,6 +18,8 @@ from recon.voxels.projector import Projector
 from recon.voxels.sweeps import interleaved
 
 _RANGE = 1e30  # products of a sensitivity and an activity beyond it, or below 1 / it, leave float32
+_SMOOTH = (0.0, 1.5, 1.5)  # views, rows and columns, standard deviation, of the mean that weights follow
+_FEWEST = 0.5  # counts of a line's mean, at least
 _LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not seen, and keeps no activity
 
 
@@ -143,3 +146,22 @@ def mlem(
         if on_iteration is not None and on_iteration(iteration, likelihood):
             break
     return Volume(x, grid)
+
+
+def weighted_lines(emission: Emission) -> tuple[F32, F32]:
+    """Line integrals of the activity and weights [view, row, col] that carry the likelihood of counts to any method.
+
+    To second order about an expected mean λ the negative log-likelihood of y is ½ w (p - p~)², with p~ = (y - b) / s,
+    whatever λ is, and Fisher's w = s² / λ (McCullagh & Nelder 1989, section 2.5). λ is y smoothed by neighbours: the
+    counts of a line alone would weigh its lucky ones least, and lower the sum. Lines of survival 0 weigh nothing.
+    """
+    ones = np.ones_like(emission.counts)
+    survival = ones if emission.survival is None else emission.survival
+    background = 0 * ones if emission.background is None else emission.background
+    seen = survival > 0
+    # Of counts over survival: efficiency and attenuation differ from line to line, activity hardly does.
+    level = gaussian_filter(np.where(seen, emission.counts, 0), _SMOOTH, mode="nearest")
+    shape = gaussian_filter(survival * seen, _SMOOTH, mode="nearest")
+    mean = np.maximum(level * np.divide(survival, shape, out=ones.copy(), where=shape > 0), background)
+    lines = np.divide(emission.counts - background, survival, out=0 * ones, where=seen)
+    return lines, np.divide(survival**2, np.maximum(mean, _FEWEST), out=0 * ones, where=seen)

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.emission import Emission, attenuation_factors, mlem
+from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
 from recon.voxels.projector import Projector
 
 F32 = np.float32
@@ -107,6 +107,37 @@ def test_subsets_reach_in_one_iteration_what_takes_as_many_without() -> None:
     plain, ordered = (mlem(Emission(counts, geometry), activity.grid, n, m).data / 1000 for n, m in ((20, 1), (2, 10)))
     assert np.sqrt(np.mean((plain - ordered) ** 2)) < 0.05
     assert np.sqrt(np.mean((ordered - activity.data) ** 2)) < 0.35
+
+
+def test_weighted_squares_have_the_gradient_and_the_curvature_of_the_likelihood() -> None:
+    """At even counts, whose smoothed mean is their mean: by differences of Σ mean - y log(mean) in float64."""
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 4, endpoint=False), (2, 7))
+    s, b, y = (np.full((4, 2, 7), value, F32) for value in (0.4, 3.0, 23.0))
+    lines, weights = weighted_lines(Emission(y, geometry, s, b))
+
+    def descent(p: float) -> float:
+        return 0.4 * p + 3.0 - 23.0 * np.log(0.4 * p + 3.0)
+
+    at, h = (23.0 - 3.0) / 0.4, 0.01
+    np.testing.assert_allclose(lines, at, rtol=1e-6)
+    assert (descent(at + h) - descent(at - h)) / (2 * h) == pytest.approx(0, abs=1e-6)
+    np.testing.assert_allclose(weights, (descent(at + h) - 2 * descent(at) + descent(at - h)) / h**2, rtol=1e-3)
+
+
+def test_lines_of_few_counts_are_not_lowered_by_their_weights() -> None:
+    """A weight by each line's own count favours the low ones; that of its neighbours does not. Blind lines weigh 0."""
+    geometry, rng = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (16, 32)), np.random.default_rng(0)
+    s = rng.uniform(0.2, 0.6, (40, 16, 32)).astype(F32)
+    s[:, 3] = 0
+    b = np.full_like(s, 2.0)
+    y = rng.poisson(s * 20 + b).astype(F32)
+    lines, weights = weighted_lines(Emission(y, geometry, s, b))
+    assert not weights[:, 3].any() and np.isfinite(lines).all()
+    assert np.average(lines, weights=weights) == pytest.approx(20, rel=0.03)
+    own = s**2 / np.maximum(y, 1)
+    assert np.average(lines, weights=own) < 18
+    rays = lines[weights > 0] - 20
+    assert np.mean(rays**2 * weights[weights > 0]) == pytest.approx(1, abs=0.1)  # inverse variances
 
 
 def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
