@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from recon.splatting.splat import project, voxelize
     from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
-    from recon.voxels.emission import Emission, attenuation_factors, mlem
+    from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
     from recon.voxels.methods.asd_pocs import AsdPocs
     from recon.voxels.methods.cgls import Cgls
     from recon.voxels.methods.fista_tv import FistaTv
@@ -95,6 +95,7 @@ __all__ = [
     "register_energies",
     "remove_rings",
     "voxelize",
+    "weighted_lines",
 ]
 
 _LAZY = {
@@ -111,7 +112,7 @@ _LAZY = {
     **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
-    **dict.fromkeys(("Emission", "attenuation_factors", "mlem"), "recon.voxels.emission"),
+    **dict.fromkeys(("Emission", "attenuation_factors", "mlem", "weighted_lines"), "recon.voxels.emission"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),

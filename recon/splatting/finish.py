@@ -31,7 +31,7 @@ from recon.voxels.held_out_weight import (
 )
 from recon.voxels.iterative import UNITS, solve
 from recon.voxels.noise_balance import EXPLAINED, NoiseBalance
-from recon.voxels.ordered_fista import bregman, ordered_fista
+from recon.voxels.ordered_fista import Subsets, bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
@@ -128,11 +128,12 @@ class _FromModel:
             heavy = None if once else problem.decide("heavy", lambda: bregman_weight(problem, mu, residual))
             if heavy is not None:
                 self.iterations = 2 * SWEEPS
-                return bregman(problem, x, heavy, sweeps=SWEEPS, subsets=SUBSETS, tv_steps=TV_STEPS)
+                return bregman(problem, x, heavy, Subsets.of(problem, SUBSETS), sweeps=SWEEPS, tv_steps=TV_STEPS)
         if self.watch.ended:
             self.iterations = 0
             return x
-        return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=SUBSETS, tv_steps=TV_STEPS)
+        subsets = Subsets.of(problem, SUBSETS)
+        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=TV_STEPS)
 
 
 def ask(

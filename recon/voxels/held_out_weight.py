@@ -16,7 +16,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import median_deviation
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import bregman, ordered_fista
+from recon.voxels.ordered_fista import Subsets, bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
@@ -290,7 +290,7 @@ def residuals_of_rounds(
         return within[0] <= errors[-1] <= within[1] and errors[-1] <= min(errors)
 
     watched = replace(trial.problem, go_on=further)
-    ordered_fista(watched, x, weight, sweeps=_ROUNDS * sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+    ordered_fista(watched, x, weight, trial.subsets, sweeps=_ROUNDS * sweeps, tv_steps=_TV_STEPS)
     return errors
 
 
@@ -299,6 +299,7 @@ class _Trial:
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
         self.problem, self.start, self._unseen = replace(problem, go_on=self._go_on), start, unseen
+        self.subsets = Subsets.of(problem, _SUBSETS)
         self._asked, self._ended = problem.go_on, False
 
     @classmethod
@@ -329,7 +330,6 @@ class _Trial:
                 rng=np.random.default_rng(0),
                 go_on=lambda *_: problem.trial_goes_on(),
                 decide=Decisions(),
-                curvature={},
             )
 
         seen, unseen = split_views(views)
@@ -355,7 +355,7 @@ class _Trial:
             return math.inf
         run, sweeps = (bregman, _AT_ONCE) if twice else (ordered_fista, _SWEEPS)
         problem = replace(self.problem, rng=np.random.default_rng(0))  # the same order of subsets for all
-        x = run(problem, self.start.copy(), weight, sweeps=sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        x = run(problem, self.start.copy(), weight, self.subsets, sweeps=sweeps, tv_steps=_TV_STEPS)
         return math.inf if self._ended else self.error(x)
 
     def error(self, x: F32) -> float:

@@ -52,7 +52,7 @@ def grains() -> F32:
 def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
     fine, n = grains(), len(energies) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(energies)
-    geometry = Geometry.parallel(angles, (ROWS, SIDE), PITCH)
+    geometry = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH)
     oxide, liquid = known("NMC811"), known("electrolyte")
     assert oxide is not None
     assert liquid is not None
@@ -103,7 +103,7 @@ def test_shifts(monkeypatch: pytest.MonkeyPatch) -> None:
     half[0] = 0
     n = len(SIX) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(SIX)
-    geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), PITCH), np.zeros((n, ROWS, SIDE))
+    geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH), np.zeros((n, ROWS, SIDE))
     oxide, liquid = known("NMC811"), known("electrolyte")
     assert oxide is not None and liquid is not None
     materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid

@@ -36,7 +36,7 @@ def grains() -> F32:
 def seen(fine: F32, moves: np.ndarray) -> EnergyViews:
     n = len(SECTIONS) * EACH
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(SECTIONS)
-    geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), PITCH), np.zeros((n, ROWS, SIDE))
+    geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH), np.zeros((n, ROWS, SIDE))
     for e, (x, y, z) in enumerate(moves):
         own = np.flatnonzero(energy == e)
         for volume, mu in zip(fine, SECTIONS[e], strict=True):

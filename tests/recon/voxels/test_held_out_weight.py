@@ -43,7 +43,7 @@ def foam() -> tuple[F32, Geometry, Grid, F32]:
     struts, texture = (gaussian_filter(rng.normal(size=shape), s) for s in (1.5, 0.6))
     _, y, x = np.indices(shape) - 31.5
     truth = np.where((struts > 0.3 * struts.std()) & (np.hypot(x, y) < 29), 0.7 + 0.08 * texture / texture.std(), 0)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
     grid = Grid.matching(geometry)
     clean = Projector(geometry, grid).forward(truth.astype(np.float32))
     scale = 2 / clean.max()
@@ -69,7 +69,7 @@ def test_a_texture_survives(
 def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
-    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
     _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
     truth = (np.hypot(x, y) < 25).astype(np.float32)
     data = Projector(geometry, Grid.matching(geometry)).forward(truth)
@@ -82,7 +82,7 @@ def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
 
 def test_faint_matter_around_metal_is_more_even_than_in_fbp(rng: np.random.Generator) -> None:
     """By its noise alone the scan gets a weight for the metal, whose edges are most of the variation."""
-    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
     _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
     truth = np.where(np.hypot(x, y) < 26, 0.002, 0) + np.where(np.hypot(x - 4, y) < 5, 0.2, 0)
     data = Projector(geometry, Grid.matching(geometry)).forward(truth.astype(np.float32))
@@ -96,8 +96,8 @@ def test_faint_matter_around_metal_is_more_even_than_in_fbp(rng: np.random.Gener
 def cracked() -> tuple[F32, Geometry]:
     """A disc with a straight crack two pixels wide and 0.9 deep, from 80 views of 300 photons a pixel."""
     rng = np.random.default_rng(2)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 80, endpoint=False), (ROWS, COLS), 1.0)
-    fine = Geometry.parallel(geometry.angles, (ROWS, 2 * COLS), 0.5)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 80, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
+    fine = Geometry.parallel(geometry.angles, (ROWS, 2 * COLS), pixel_pitch=0.5)
     _, y, x = (np.indices((ROWS, 2 * COLS, 2 * COLS)) - 63.5) / 2
     truth = np.where((abs(y) < 1) & (abs(x) < 14), 0.1, 1.0) * (np.hypot(x, y) < 27) * 0.028
     clean = Projector(fine, Grid((ROWS, 2 * COLS, 2 * COLS), 0.5, slice_pitch=0.5)).forward(truth.astype(np.float32))
@@ -160,7 +160,7 @@ def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _views() -> Mock:
-    return Mock(**{"projector.geometry": Geometry.parallel(np.linspace(0, 3, 40), (4, 8), 1.0)})
+    return Mock(**{"projector.geometry": Geometry.parallel(np.linspace(0, 3, 40), (4, 8), pixel_pitch=1.0)})
 
 
 @dataclass
@@ -238,7 +238,7 @@ def test_the_weight_of_a_cone_is_left_to_the_noise(coarse_cone: tuple[F32, Geome
 
 def test_one_view_of_eight_is_held_out_and_the_others_are_not() -> None:
     angles = np.random.default_rng(0).permutation(np.linspace(0, np.pi, 80, endpoint=False))
-    seen, unseen = split_views(Geometry.parallel(angles, (4, 8), 1.0))
+    seen, unseen = split_views(Geometry.parallel(angles, (4, 8), pixel_pitch=1.0))
     assert unseen.size == 10 and sorted([*seen, *unseen]) == list(range(80))
     np.testing.assert_allclose(np.diff(np.sort(angles[unseen])), np.pi / 10)
     assert LEAST_VIEWS == 16
@@ -249,7 +249,7 @@ def test_a_slab_is_where_most_matter_is_and_sees_its_own_slices() -> None:
     data[:, 20:30] = 1
     rows = busiest_rows(data, 10)
     assert rows == slice(20, 30)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 3), (40, 8), 0.5)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 3), (40, 8), pixel_pitch=0.5)
     views, box = slab_of(geometry, Grid.matching(geometry), rows.start, rows.stop)
     volume = np.random.default_rng(1).random((40, 8, 8)).astype(np.float32)
     whole = Projector(geometry, Grid.matching(geometry)).forward(volume)
