@@ -15,13 +15,14 @@ import pytest
 import recon
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
+from beamline.projections.steps.rings import Rings
 from beamline.storage.readers.open import open_scan
-from recon.base.choices import Rings
+from recon.base import choices
 from tests.bench.quality_cases import F32
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(1200)]
 
-METHODS: dict[str, tuple[recon.Method, Rings]] = {
+METHODS: dict[str, tuple[recon.Method, choices.Rings]] = {
     "FBP hann": (recon.Fbp(), "none"),
     "FBP hann, vo": (recon.Fbp(), "vo"),
     "fit alone": (recon.R2(finish=0), "none"),
