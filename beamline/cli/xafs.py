@@ -209,7 +209,7 @@ def _charge_map(
     sources: Sequence[str], volume: Path, spectra: Path | None, least: float, target: Path, as_json: bool
 ) -> None:
     """`--volume`: the state-of-charge map, and its picture."""
-    from beamline.core.files import refuse_existing, write_whole
+    from beamline.core.files import refuse_existing, remove, write_whole
     from beamline.reconstruct.charge_map import charge_map, picture
     from beamline.reconstruct.energy_series import read_spectra
     from beamline.storage.volumes.files import write_volume
@@ -223,8 +223,12 @@ def _charge_map(
             refuse_existing(path)
         table = None if spectra is None else read_spectra(spectra)
         found = charge_map(paths, table, least, counting("slices", sink, clock), clock.now())
-        write_volume(volume, found.record)
-        write_whole(target, picture(found))
+        drawn = picture(found)
+        with ExitStack() as undo:
+            write_volume(volume, found.record)
+            undo.callback(remove, volume)
+            write_whole(target, drawn)
+            undo.pop_all()
         sink(Done({"volume": volume, "picture": target, **found.data()}, time=clock.now()))
     if not as_json:
         click.echo("\n".join([*found.lines(), f"written     {volume}, {target}"]))

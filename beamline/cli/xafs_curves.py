@@ -79,6 +79,11 @@ def run_job(
 
             folder = Path(source)
             scans = scans_in(folder) if is_series(folder) else ()
+            if folder.is_dir() and not scans:
+                raise DataError(
+                    f"{folder} is no folder of a series of scans (scan.energies); expected one, a file or a scene. "
+                    "Nothing was written."
+                )
             options = FileOptions(low or 0.0, high or math.inf, job.region, given.around, given.unit, given.quantity)
             series = opened.enter_context(open_series(folder, options, scans))
             n = series.energies.size if isinstance(series, XafsCurve) else series.n

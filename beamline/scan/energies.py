@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beamline.config.load import Config, at_energies, load, resolved_yaml
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
 from beamline.core.files import write_whole
 from beamline.core.stop import StopRequest
@@ -57,8 +57,15 @@ def is_series(folder: Path) -> bool:
 
 
 def scans_in(folder: Path) -> list[Path]:
-    """The scan file of each energy of a series that has one, in the order of the configuration."""
-    return [scan_file(run) for run in _runs(folder, load(folder / CONFIG, environment={})) if run is not None]
+    """The scan file of each energy of a series that has one, in the order of the configuration.
+
+    Raises:
+        DataError: none has one.
+    """
+    found = [scan_file(run) for run in _runs(folder, load(folder / CONFIG, environment={})) if run is not None]
+    if not found:
+        raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
+    return found
 
 
 def run_energies(

@@ -187,6 +187,18 @@ def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, wor
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.parametrize("words", [("xafs",), ("materials", "-o", "out.h5", "--spectra", "spectra.csv")])
+def test_a_series_without_scans_is_refused(
+    config: Path, tmp_path: Path, words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spectra(tmp_path)
+    (tmp_path / "series").mkdir()
+    (tmp_path / "series" / "config.resolved.yaml").write_bytes(config.read_bytes())
+    ended = beamline(*words, "series")
+    assert ended.exit_code == 5 and "series has no scan yet: `beamline scan --resume series`" in ended.stderr
+
+
 def test_documents_of_a_series_are_refused(config: Path, tmp_path: Path) -> None:
     ended = beamline("scan", config, "-o", tmp_path / "runs", "--documents", tmp_path / "d.jsonl")
     assert ended.exit_code == 2 and "leave it out with scan.energies" in ended.stderr
