@@ -57,18 +57,19 @@ def axis_by_views(
         raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
     if not leaves_the_field(projections, geometry):
         return _search(projections, geometry, progress, 1.0, near)
-    tried = [0]
+    tried = 0
 
     def counted(n: int) -> None:
-        tried.append(tried[0] + n)
-        progress(tried[-1])
+        nonlocal tried
+        tried = n
+        progress(n)
 
     with suppress(AxisError):
         found = _search(projections, geometry, counted, 1.0, near)
         if found.confident:
             return found
-    tried[0] = tried[-1]
-    return _search(projections, geometry, counted, _WIDER, near)
+    before = tried
+    return _search(projections, geometry, lambda n: progress(before + n), _WIDER, near)
 
 
 def _search(
@@ -161,8 +162,7 @@ class _Judge:
         moved = (axis_col - self.geometry.axis_col) / self.bin
         views = replace(self._views, axis_col=self._views.axis_col + moved)
         if self._grid is None or not self.accuracy.one_grid:
-            field = Grid.matching(views)
-            self._grid = field if self.width == 1 else field.widened(self.width, views)
+            self._grid = Grid.matching(views).widened(self.width, views)
         grid, method = self._grid, FistaTv(self.accuracy.sweeps, _TV_WEIGHT)
         part = ReconProblem(self.binned[self._seen], views.select(self._seen), grid, DataUse(), 0, "cpu")
         volume = method.run(part, RunControl()).volume

@@ -25,7 +25,7 @@ STEPS = sum(rounds for _, rounds in _LEVELS) + 1
 def register_energies(
     views: EnergyViews, progress: Callable[[int, int], None] = lambda n, most: None
 ) -> tuple[EnergyViews, tuple[Displacement, ...]]:
-    """The views with the sample where it stood in the scan of each energy; a parallel beam.
+    """Correct the geometry of the views by where the sample stood in the scan of each energy; a parallel beam.
 
     The energy with the most views is the reference. A volume of it predicts the others, each scaled by what it absorbs
     in the mean. A shift along x, y and z and a turn about the axis explain the differences (see
@@ -38,7 +38,7 @@ def register_energies(
         ValueError: a cone, whose rays a shift of the sample turns.
     """
     moves: list[Displacement] | None = None
-    done, energies = 0, len(views.cross_sections)
+    done = 0
     height = _ROWS * max(1, math.ceil(views.projections.shape[2] / _LEVELS[-1][0]))
     looked = views.select(_spread(views.energy), busiest_rows(views.projections, height))
     scaled = looked.projections * _strengths(looked)[looked.energy][:, None, None]
@@ -55,21 +55,21 @@ def register_energies(
         if factor == 1:
             break
     assert moves is not None
-    still = [Displacement()] * energies
-    left = [judge(data, geometry, looked.energy, known, at).overall for at in (still, moves)]
+    still = [Displacement()] * len(moves)
+    before, after = (judge(data, geometry, looked.energy, known, at).overall for at in (still, moves))
     progress(STEPS, STEPS)
-    found = moves if left[1] < _HELPS * left[0] else still
+    found = moves if after < _HELPS * before else still
     return replace(views, geometry=displaced(views.geometry, views.energy, found)), tuple(found)
 
 
 def _strengths(views: EnergyViews) -> F64:
-    """[energy] by what its views are multiplied to absorb, in the mean, what those of the first do."""
+    """[energy] factor that makes the mean of its views that of the first energy's."""
     energies = range(len(views.cross_sections))
     means = np.array([views.projections[views.energy == e].mean(dtype=np.float64) for e in energies])
     return np.divide(means[0], means, out=np.ones_like(means), where=means > 0)
 
 
 def _spread(energy: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Views evenly spread, so many of each energy."""
+    """Indices of views that are evenly spread, at most `_VIEWS` of each energy."""
     own = (np.flatnonzero(energy == e) for e in np.unique(energy))
     return np.sort(np.concatenate([at[np.unique(np.linspace(0, at.size - 1, _VIEWS).astype(int))] for at in own]))

@@ -149,8 +149,8 @@ def fit_materials(
         sweeps: of about nine steps each, which see all views equally often.
         go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each sweep of a trial of
             weights. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
-        stop: asked many times within a sweep, before the views of an energy in a step, but for the first one. True
-            ends the fit with the volumes before that step.
+        stop: asked many times within a sweep, from the second step on. True ends the fit with the volumes before the
+            step that it interrupts.
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
@@ -163,7 +163,7 @@ def fit_materials(
 
 
 class _StoppedError(Exception):
-    """A step was given up: somebody asked for the end."""
+    """`stop` interrupted a step."""
 
 
 class _Part(NamedTuple):
@@ -248,8 +248,8 @@ class _Fit:
         return squares
 
     def sweeps(self, weights: F64, n: int) -> Iterator[float]:
-        """n times about nine steps from z, which see all views equally often; gives the residual of each nine. A stop
-        ends it before the step that it was in."""
+        """n times about nine steps from z, which see all views equally often; gives the residual of each nine. After a
+        stop z is that before the step that it interrupts."""
         _, ny, nx, nz = self.z.shape
         differences, count = difference_weights(self.grid), len(self.subsets)
         prox = [TotalVariationProx((ny, nx, nz), differences, False, _TV_STEPS) for _ in self.z]
@@ -309,8 +309,8 @@ def _weights_by_views(
         rows = busiest_rows(views.projections, _ROWS)
         grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
     fit, judge = (
-        _Fit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), asked)
-        for chosen, asked in ((~held_out, stop), (held_out, lambda: False))
+        _Fit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop)
+        for chosen in (~held_out, held_out)
     )
 
     going = True

@@ -19,6 +19,7 @@ from beamline.monitor.checks import CHECKS
 from beamline.page.run_files import watched
 from beamline.page.volume import newest
 from beamline.projections.replay import ScanVerdict, frames_of, replay, verdict
+from beamline.scan.resume import scan_file
 from beamline.scan.run_folder import SCAN
 from beamline.scan.runs import describe
 from beamline.scan.states import State
@@ -32,14 +33,6 @@ from recon.base.volume import Volume
 
 _PATIENCE = 120.0  # real s to wait for the begin of a followed scan
 _POLL = 0.25  # real s
-
-
-def scan_file(path: str | Path) -> Path:
-    """The scan of a path: the file itself, or for the folder of a run the file with all its parts."""
-    path = Path(path)
-    if not (path / SCAN).is_file():
-        return path
-    return path / JOINED if (path / JOINED).is_file() else path / SCAN
 
 
 def monitor(

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from beamline.api.instrument import Say, to_stderr
-from beamline.api.reading import scan_file
 from beamline.core.errors import ConfigError
 from beamline.core.events import Event, VolumeDone, Warned
 from beamline.core.narration import sentence
@@ -22,6 +21,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.result import OutputPaths, report_beside
+from beamline.scan.resume import scan_file
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import ReconRecord

@@ -14,7 +14,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
-from beamline.core.errors import AlarmError, ConfigError, DataError
+from beamline.core.errors import AlarmError, DataError
 from beamline.core.events import Done, Sink
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
@@ -92,12 +92,12 @@ def scan(
         raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
     with json_events(as_json) as json_sink, ExitStack() as held:
         config = None if file is None else load(file, overrides)
-        whole = _series_of(config, run, documents)
-        if whole is not None and not dry:
-            _run_series(whole, output, run, [json_sink], page=page, no_live=no_live, as_json=as_json)
-            return
-        if whole is not None:
-            run, config = None, whole
+        of_energies = _config_of_energies(config, run, documents)
+        if of_energies is not None:
+            if not dry:
+                _run_energies(of_energies, output, run, json_sink, page=page, no_live=no_live, as_json=as_json)
+                return
+            run, config = None, of_energies
         try:
             series = None if run is None else held.enter_context(open_for_resume(run, config))
         except NotJoined:
@@ -129,29 +129,31 @@ def scan(
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
 
 
-def _series_of(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
-    """The configuration of a series of energies; None where it is one scan."""
+def _config_of_energies(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
+    """The configuration of a series of energies: the given one, or that in its folder `run`; None: it is one scan."""
     from beamline.config.load import load
     from beamline.scan.energies import is_series
+    from beamline.scan.resume import require_same_config
     from beamline.scan.run_folder import CONFIG
 
     if run is not None and not is_series(run):
         return None
-    given, config = config, config if run is None else load(run / CONFIG, environment={})
+    if run is not None:
+        if config is not None:
+            require_same_config(run, (run / CONFIG).read_text("utf-8"), config, CONFIG)
+        return load(run / CONFIG, environment={})
     if config is None or config.scan.energies is None:
         return None
-    if given is not None and given != config:
-        raise ConfigError(f"{run} was taken with another configuration: leave CONFIG out. Nothing was changed.")
     if documents is not None:
         raise click.UsageError("--documents tells one scan: leave it out with scan.energies.")
     return config
 
 
-def _run_series(
+def _run_energies(
     config: Config,
     output: Path | None,
     run: Path | None,
-    sinks: list[Sink],
+    json_sink: Sink,
     *,
     page: bool,
     no_live: bool,
@@ -164,12 +166,12 @@ def _run_series(
     stop = StopRequest()
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
         done = run_energies(
-            config, output, [terminal, *sinks, *([beside] if page else [])], stop,
+            config, output, [terminal, json_sink, *([beside] if page else [])], stop,
             lambda one, rest: Commands() if no_live else commands_of(one, rest),
             series=run, ask=lambda request: terminal.ask(request, ask_operator),
         )  # fmt: skip
     data = {"folder": done.folder, "scans": [{"energy_kev": energy, "path": path} for energy, path in done.scans]}
-    sinks[0](Done(data, time=SystemClock().now()))
+    json_sink(Done(data, time=SystemClock().now()))
     if not as_json:
         click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
         click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")

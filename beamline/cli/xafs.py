@@ -15,7 +15,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import POSITIVE, SEED, FiniteRange, parsed, refuse_shared, volume_path
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal, counting, events_shown
-from beamline.cli.xafs_curves import CurveJob, CurveLimits, run_job
+from beamline.cli.xafs_curves import CurveJob, CurveOptions, run_job
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done
 from beamline.core.signals import stop_signals
@@ -27,13 +27,10 @@ if TYPE_CHECKING:
     from beamline.xafs.results import XafsResult
     from beamline.xafs.series import SeriesResult
 
-MOST = 5000
-_SCENES = (".yaml", ".yml", "")
 _OF_SCENES = ("step", "material", "angle", "seed", "charges")
 _OF_FILES = ("regions", "around", "unit", "quantity")
 _OF_MAPS = ("spectra", "least")
-LEAST_SHARE = 0.5
-"""Least sum of volume fractions in a voxel of a map."""
+_LEAST_SUM = 0.5  # of volume fractions in a voxel of a map
 _BOX = "ROW:END,COL:END"
 
 
@@ -105,11 +102,10 @@ def charges_of(value: str) -> tuple[float, ...]:
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Picture (.png), with the table beside it (.csv). Default: the source's stem + _xafs.png, here.",
+    help="Picture (.png), with the table beside it (.csv). Default: the last source's stem + _xafs.png.",
 )
 @click.option(
     "--volume",
-    "chart",
     metavar="PATH",
     callback=parsed(volume_path),
     help="Write a state-of-charge map: the share of the last FILE in the sum of all, which are volume fractions.",
@@ -135,7 +131,7 @@ def xafs(
     unit: str | None,
     quantity: str | None,
     output: Path | None,
-    chart: Path | None,
+    volume: Path | None,
     spectra: Path | None,
     least: float | None,
     as_json: bool,
@@ -159,11 +155,12 @@ def xafs(
     target = output or Path(f"{Path(sources[-1]).stem}_xafs.png")
     if target.suffix.lower() != ".png":
         raise click.BadParameter(f"{str(target)!r} is not a picture; give a .png file", param_hint="--output")
-    if chart is not None:
-        _map(sources, chart, spectra, LEAST_SHARE if least is None else least, target, as_json)
+    if volume is not None:
+        _charge_map(sources, volume, spectra, _LEAST_SUM if least is None else least, target, as_json)
         return
     _refuse_given(_OF_MAPS, "a map of volumes: give --volume PATH, too")
     jobs = [job for source in sources for job in _jobs(source, regions, charges)]
+    options = CurveOptions(low, high, step, material, angle, seed, around, unit, quantity)
     clock, stop = SystemClock(), StopRequest()
     results: list[XafsResult] = []
     with json_events(as_json) as json_sink, ExitStack() as opened:
@@ -172,8 +169,7 @@ def xafs(
         with Terminal(sys.stderr) as terminal:
             sink = json_sink if as_json else terminal
             for job in jobs:
-                limits = CurveLimits(low, high, step, material, angle, seed, around, unit, quantity)
-                run, title = run_job(job, limits, len(jobs) > 1, sink, stop)
+                run, title = run_job(job, options, len(jobs) > 1, sink, stop)
                 try:
                     results.append(_result(title, run))
                 except ScanStopped:
@@ -187,12 +183,13 @@ def xafs(
         else:
             write_both(states.picture(results), states.table(results), target)
             said, data = states.lines(results), states.data(results)
-        data |= {"picture": target, "table": table_beside(target), "stopped": run.stopped or len(results) < len(jobs)}
+        stopped = run.stopped or len(results) < len(jobs)
+        data |= {"picture": target, "table": table_beside(target), "stopped": stopped}
         json_sink(Done(data, time=clock.now()))
     if not as_json:
         click.echo("\n".join([*said, f"written     {target}, {table_beside(target)}"]))
-    if run.stopped or len(results) < len(jobs):
-        n = run.curve.energies.size + run.curve.left_out.size
+    if stopped:
+        n = sum(result.curve.energies.size + result.curve.left_out.size for result in results)
         raise ScanStopped(f"Stopped after {n} energies; picture and table contain them.")
     if without := [result for result in results if not result.edge.found]:
         where = "" if len(jobs) == 1 else f" in {without[0].title}"
@@ -208,27 +205,33 @@ def _jobs(source: str, regions: Sequence[PixelBox], charges: Sequence[float] | N
     return [CurveJob(source, region) for region in regions or (None,)]
 
 
-def _map(sources: Sequence[str], chart: Path, spectra: Path | None, least: float, target: Path, as_json: bool) -> None:
+def _charge_map(
+    sources: Sequence[str], volume: Path, spectra: Path | None, least: float, target: Path, as_json: bool
+) -> None:
     """`--volume`: the state-of-charge map, and its picture."""
-    from beamline.core.files import refuse_existing, write_whole
+    from beamline.core.files import refuse_existing, remove, write_whole
     from beamline.reconstruct.charge_map import charge_map, picture
     from beamline.reconstruct.energy_series import read_spectra
     from beamline.storage.volumes.files import write_volume
 
     _refuse_given((*_OF_FILES, *_OF_SCENES, "low", "high"), "curves, and --volume makes a map")
     paths = [Path(source) for source in sources]
-    refuse_shared({"--volume": chart, "--output": target, **{f"FILE {n}": path for n, path in enumerate(paths, 1)}})
+    refuse_shared({"--volume": volume, "--output": target, **{f"FILE {n}": path for n, path in enumerate(paths, 1)}})
     with events_shown(as_json) as sink:
         clock = SystemClock()
-        for path in (chart, target):
+        for path in (volume, target):
             refuse_existing(path)
         table = None if spectra is None else read_spectra(spectra)
         found = charge_map(paths, table, least, counting("slices", sink, clock), clock.now())
-        write_volume(chart, found.record)
-        write_whole(target, picture(found))
-        sink(Done({"volume": chart, "picture": target, **found.data()}, time=clock.now()))
+        drawn = picture(found)
+        with ExitStack() as undo:
+            write_volume(volume, found.record)
+            undo.callback(remove, volume)
+            write_whole(target, drawn)
+            undo.pop_all()
+        sink(Done({"volume": volume, "picture": target, **found.data()}, time=clock.now()))
     if not as_json:
-        click.echo("\n".join([*found.lines(), f"written     {chart}, {target}"]))
+        click.echo("\n".join([*found.lines(), f"written     {volume}, {target}"]))
 
 
 def _result(title: str, run: SeriesResult) -> XafsResult:

@@ -41,8 +41,8 @@ class CurveJob:
 
 
 @dataclass(frozen=True)
-class CurveLimits:
-    """The options that hold for all curves."""
+class CurveOptions:
+    """The options that hold for all curves, as they were given; None: not given."""
 
     low: float | None
     high: float | None
@@ -56,7 +56,7 @@ class CurveLimits:
 
 
 def run_job(
-    job: CurveJob, given: CurveLimits, several: bool, sink: Sink, stop: StopRequest
+    job: CurveJob, given: CurveOptions, several: bool, sink: Sink, stop: StopRequest
 ) -> tuple[SeriesResult, str]:
     """The curve of a job and its name; a name tells one of several jobs from the others."""
     from beamline.xafs.contrast import XafsCurve
@@ -78,7 +78,12 @@ def run_job(
             from beamline.scan.energies import is_series, scans_in
 
             folder = Path(source)
-            scans = scans_in(folder) if folder.is_dir() and is_series(folder) else ()
+            scans = scans_in(folder) if is_series(folder) else ()
+            if folder.is_dir() and not scans:
+                raise DataError(
+                    f"{folder} is no folder of a series of scans (scan.energies); expected one, a file or a scene. "
+                    "Nothing was written."
+                )
             options = FileOptions(low or 0.0, high or math.inf, job.region, given.around, given.unit, given.quantity)
             series = opened.enter_context(open_series(folder, options, scans))
             n = series.energies.size if isinstance(series, XafsCurve) else series.n

@@ -242,9 +242,11 @@ class Config(Section):
             return self
         name, energies = ("scan.energies", several) if several else ("scan.energy", (one or 0.0,))
         if isinstance(device, NoMonochromator):
-            raise ValueError(f"{name} needs a monochromator, and devices.monochromator.kind is none")
-        if len(set(energies)) < len(energies):
-            raise ValueError("scan.energies has an energy twice; give each once")
+            raise ValueError(
+                f"{name} needs a monochromator, and devices.monochromator.kind is none; name one, or set {name} to null"
+            )
+        if twice := [energy for energy in dict.fromkeys(energies) if energies.count(energy) > 1]:
+            raise ValueError(f"scan.energies has an energy twice, {twice[0]:.7g} keV; give each once")
         if several and self.recon.stop_when is not None:
             raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)

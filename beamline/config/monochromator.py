@@ -29,7 +29,7 @@ class SceneMonochromator(_Monochromator):
 
     kind: Literal["simulated"]
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 1.0
-    """That each move takes."""
+    """Time that each move takes."""
 
 
 class HandMonochromator(_Monochromator):
@@ -51,19 +51,21 @@ class EpicsMonochromator(_Monochromator):
     unit: Literal["keV", "eV"] = "keV"
     """Of pv and status_pv."""
     tolerance_ev: Annotated[float, Field(gt=0, le=1e4)] = 0.5
-    """By which the energy may differ from the one that was asked for."""
+    """Most difference of the energy from the one that was asked for."""
     settle_s: Annotated[float, Field(ge=0, le=1e6)] = 1.0
-    """For which it must stay there."""
+    """Time that it must stay within tolerance_ev before the move has ended."""
     timeout_s: Seconds = 2.0
-    """For an answer of the IOC."""
+    """Longest wait for an answer of the IOC."""
     travel_s: Seconds = 60.0
     """The longest that a move may take."""
 
     def connect(self, clock: Clock) -> PvMonochromator:
         """The device, connected. Nothing moves. Raises DeviceError: it does not answer."""
-        per_kev, tolerance = 1e3 if self.unit == "eV" else 1.0, self.tolerance_ev * 1e-3
-        limits = tolerance, self.settle_s, self.timeout_s, self.travel_s
-        return PvMonochromator(MonochromatorPvs(self.pv, self.status_pv, self.stop_pv, per_kev, *limits), clock)
+        pvs = MonochromatorPvs(
+            self.pv, self.status_pv, self.stop_pv, per_kev=1e3 if self.unit == "eV" else 1.0,
+            tolerance=self.tolerance_ev * 1e-3, settle=self.settle_s, timeout=self.timeout_s, travel=self.travel_s,
+        )  # fmt: skip
+        return PvMonochromator(pvs, clock)
 
     def halt(self, clock: Clock) -> None:
         """Stop it. Raises DeviceError."""

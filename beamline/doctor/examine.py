@@ -137,12 +137,12 @@ def _monochromator(config: MonochromatorConfig, clock: Clock) -> Iterator[Diagno
         yield of_error(name, error, expected)
         return
     low, high = config.range_kev or (0.0, math.inf)
-    if low < energy < high:
+    if energy > 0 and low <= energy <= high:
         yield Diagnosis(name, Grade.OK, f"{energy:.7g} keV.", expected, values={"energy_kev": energy})
     else:
         advice = "Compare devices.monochromator.unit and range_kev with what status_pv shows"
-        found = f"It stands at {energy:.7g} keV."
-        yield Diagnosis(name, Grade.WARNING, found, f"{expected} above {low:g} keV, up to {high:g} keV", advice)
+        legal = f"{expected} above 0 keV" if config.range_kev is None else f"{expected} of {low:g} to {high:g} keV"
+        yield Diagnosis(name, Grade.WARNING, f"It stands at {energy:.7g} keV.", legal, advice)
 
 
 def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:

@@ -54,7 +54,7 @@ class ConnectedDevices:
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None if none is configured.
         frame_memory: of the camera's frames; None for a simulated camera.
-        watch_moves: takes what is called again and again while sample, filter or energy moves; its exception ends that.
+        watch_moves: takes what is called again and again while one of the devices moves; its exception ends that move.
     """
 
     devices: Devices
@@ -94,13 +94,17 @@ def connect(
     with ExitStack() as opened:
         if config.simulation is None:
             clock, simulated, memory = clock or SystemClock(), None, FrameMemory()
-            devices = _instrument(config, clock, ask or ask_operator, check_stop, opened, memory)
+            ask = ask or ask_operator
+            devices = _instrument(config, clock, ask, check_stop, opened, memory)
             if isinstance(chosen := config.devices.sample_mover, StageMover):
                 mover = chosen.connect(clock)
                 opened.callback(mover.close)
                 devices = replace(devices, sample=mover)
-            by = clock, ask or ask_operator, opened
-            devices = replace(devices, filter=_filter(config, *by), monochromator=_monochromator(config, *by))
+            devices = replace(
+                devices,
+                filter=_filter(config, clock, ask, opened),
+                monochromator=_monochromator(config, clock, ask, opened),
+            )
         else:
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)

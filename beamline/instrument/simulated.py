@@ -101,13 +101,13 @@ def simulated_devices(
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
     camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, pixel_pitch=pitch, model=model)
     opened.callback(camera.close)
-    energy: Monochromator | None = None
-    if isinstance(crystal := config.devices.monochromator, SceneMonochromator):
-        energy = SimulatedMonochromator(
-            scene.beam.energy_kev, lambda kev: scene_of(config, kev), camera.show, clock, crystal.settle_s
+    monochromator: Monochromator | None = None
+    if isinstance(section := config.devices.monochromator, SceneMonochromator):
+        monochromator = SimulatedMonochromator(
+            scene.beam.energy_kev, lambda kev: scene_of(config, kev), camera.show, clock, section.settle_s
         )
     known = SimulatedScene(_truth(camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
-    return Devices(stage, camera, shutter, sample, changer, energy), known
+    return Devices(stage, camera, shutter, sample, changer, monochromator), known
 
 
 def _wire(stage: StageSection, clock: Clock, axis: TriggerLine) -> str:

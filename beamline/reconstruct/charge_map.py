@@ -53,11 +53,12 @@ class ChargeMap:
 
     def lines(self) -> list[str]:
         """Sentences for people."""
-        said, (low, high) = self.record.metrics, (self.record.metrics["tenth"], self.record.metrics["nine_tenths"])
+        said = self.record.metrics
         return [
             f"map of      {self.names[-1]} in the sum of {', '.join(self.names)}",
-            f"voxels      {said['share_of_voxels']:.1%} are filled to {self.least:g} or more",
-            f"mean        {said['mean']:.4f}, a tenth of them below {low:.3f}, a tenth above {high:.3f}",
+            f"voxels      {said['filled_share']:.1%} are filled to {self.least:g} or more",
+            f"mean        {said['mean']:.4f}, a tenth of them below {said['percentile_10']:.3f}, a tenth "
+            f"above {said['percentile_90']:.3f}",
         ]
 
 
@@ -87,8 +88,8 @@ def charge_map(
         _refuse_unlike(paths, records, spectra)
         energies = () if spectra is None else tuple(map(_energy_of, records))
         unmix = None if spectra is None else _unmixing(spectra, energies)
-        names = tuple(_name(path, record) for path, record in zip(paths, records, strict=True))
-        names = names if spectra is None else spectra.names
+        own_names = (str(each.parameters.get("material", path.stem)) for path, each in zip(paths, records, strict=True))
+        names = tuple(own_names) if spectra is None else spectra.names
         grid = first.volume.grid
         _refuse_memory(grid)
         found = np.empty(grid.shape, np.float32)
@@ -113,9 +114,9 @@ def charge_map(
         parameters={"method": "share", "volumes": ", ".join(str(path.resolve()) for path in paths), "least": least},
         metrics={
             "mean": float(filled.mean()),
-            "tenth": float(low),
-            "nine_tenths": float(high),
-            "share_of_voxels": filled.size / found.size,
+            "percentile_10": float(low),
+            "percentile_90": float(high),
+            "filled_share": filled.size / found.size,
         },
     )
     return ChargeMap(record, names, energies, least)
@@ -142,12 +143,11 @@ def _unmixing(spectra: Spectra, energies: Sequence[float]) -> NDArray[np.float32
 def _energy_of(record: ReconRecord) -> float:
     with open_scan(record.raw_file) as scan:
         if scan.energy_kev is None:
-            raise ConfigError(f"{record.raw_file} does not state its energy. Nothing was written.")
+            raise ConfigError(
+                f"{record.raw_file} does not state its energy; expected /entry/instrument/beam/incident_energy. "
+                "Nothing was written."
+            )
         return scan.energy_kev
-
-
-def _name(path: Path, record: ReconRecord) -> str:
-    return str(record.parameters.get("material", path.stem))
 
 
 def _refuse_unlike(paths: Sequence[Path], records: Sequence[ReconRecord], spectra: Spectra | None) -> None:
@@ -157,22 +157,30 @@ def _refuse_unlike(paths: Sequence[Path], records: Sequence[ReconRecord], spectr
         apart = np.abs(np.subtract(own.centre, grid.centre)).max() / grid.voxel_size
         alike = math.isclose(own.voxel_size, grid.voxel_size, rel_tol=_GRIDS_ALIKE / max(grid.shape))
         if own.shape != grid.shape or not alike or apart > _GRIDS_ALIKE:
-            raise ConfigError(f"{path} has voxels at other places than {paths[0]}. Nothing was written.")
+            raise ConfigError(
+                f"{path} has voxels at other places than {paths[0]}: {_words(own)}, not {_words(grid)}. Reconstruct "
+                "both with the same --axis, --rows and --bin. Nothing was written."
+            )
         if spectra is None and not record.is_share:
             raise ConfigError(
                 f"{path} holds attenuation and not volume fractions, as `beamline materials` writes them; volumes of "
                 "several energies need --spectra. Nothing was written."
             )
         if spectra is not None and (record.is_share or record.length_unit != "mm"):
-            raise ConfigError(f"{path} is not in 1/mm, as the spectra are. Nothing was written.")
+            unit = "a volume fraction" if record.is_share else f"in 1/{record.length_unit}"
+            raise ConfigError(f"{path} is {unit}; with --spectra volumes in 1/mm are expected. Nothing was written.")
+
+
+def _words(grid: Grid) -> str:
+    return f"{grid.shape} of {grid.voxel_size:.6g} around {tuple(round(float(at), 6) for at in grid.centre)}"
 
 
 def _refuse_memory(grid: Grid) -> None:
     needs = 4 * (2 * math.prod(grid.shape) + 4 * _SLAB * math.prod(grid.shape[1:]))
     if needs > (may_use := SHARE * free_memory()):
         raise ConfigError(
-            f"A map of {grid.shape} voxels needs {size(needs)} of memory; {size(may_use)} may be used. Nothing was "
-            "written."
+            f"A map of {grid.shape} voxels needs {size(needs)} of memory; {size(may_use)} may be used; take volumes of "
+            "fewer rows. Nothing was written."
         )
 
 

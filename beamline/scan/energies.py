@@ -11,17 +11,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beamline.config.load import Config, at_energies, load, resolved_yaml
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
+from beamline.core.files import write_whole
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
 from beamline.instrument.simulated import clock_of
 from beamline.scan.live_process import Commands
 from beamline.scan.preflight import dry_run, refuse_violations
-from beamline.scan.resume import NoFrame, NothingMissing, NotJoined, ResumableRun, open_for_resume, recover_run
+from beamline.scan.resume import (
+    NoFrame,
+    NothingMissing,
+    NotJoined,
+    ResumableRun,
+    open_for_resume,
+    recover_run,
+    scan_file,
+)
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import CONFIG, SCAN, create_run_folder
-from beamline.storage.parts import JOINED
 from drivers.base.clock import SystemClock
 from drivers.manual import Ask
 
@@ -49,8 +57,15 @@ def is_series(folder: Path) -> bool:
 
 
 def scans_in(folder: Path) -> list[Path]:
-    """The scan file of each energy of a series that has one, in the order of the configuration."""
-    return [_file_of(run) for run in _runs(folder, load(folder / CONFIG, environment={})) if run is not None]
+    """The scan file of each energy of a series that has one, in the order of the configuration.
+
+    Raises:
+        DataError: none has one.
+    """
+    found = [scan_file(run) for run in _runs(folder, load(folder / CONFIG, environment={})) if run is not None]
+    if not found:
+        raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
+    return found
 
 
 def run_energies(
@@ -77,10 +92,12 @@ def run_energies(
         ConfigError: a limit is violated at one of the energies; nothing has moved.
         What `run_scan` raises: the scans before it are complete, and a warning names the folder that can go on.
     """
-    refuse_violations(dry_run(config, series or place).timeline)
     each = at_energies(config)
     with ExitStack() as held:
         jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
+        whole = {one.scan.energy for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)}
+        if len(whole) < len(each):
+            refuse_violations(dry_run(config, series or place, whole=whole).timeline)
         last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
         clock = None if config.simulation is None else clock_of(config.simulation.clock, not_before=last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
@@ -93,8 +110,12 @@ def run_energies(
                 scans.append((energy, job))
                 continue
             _tell(StateEntered("energies", f"Energy {n} of {len(each)}: {energy:.7g} keV"), sinks)
-            how = commands(one, job)
+            for said in job.left_out if job else ():
+                _tell(Warned(said), sinks)
             try:
+                how = commands(one, job)
+                if how.remark:
+                    _tell(StateEntered("energies", how.remark), sinks)
                 taken = run_scan(
                     one, job or folder, [_but_done(sinks)], stop,
                     live=how.live, afterwards=how.afterwards, instrument=instrument,
@@ -109,7 +130,7 @@ def run_energies(
 
 def _new_folder(config: Config, place: Path) -> Path:
     folder = create_run_folder(place, f"{config.sample.name}_energies", SystemClock().now())
-    (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
+    write_whole(folder / CONFIG, resolved_yaml(config))  # what --resume goes by
     return folder
 
 
@@ -135,11 +156,7 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
         recover_run(run)
     except NothingMissing:
         pass
-    return _file_of(run)
-
-
-def _file_of(run: Path) -> Path:
-    return run / (JOINED if (run / JOINED).is_file() else SCAN)
+    return scan_file(run)
 
 
 def _but_done(sinks: Sequence[Sink]) -> Sink:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,8 @@ from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
-from beamline.plan.timeline import clock, work_out
 from beamline.plan.timeline import describe as describe_timeline
+from beamline.plan.timeline import duration_text, work_out
 from beamline.scan.live_process import live_need
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
@@ -42,11 +42,19 @@ def all_of(plan: ScanPlan) -> ScanPlan:
     return plan
 
 
+class EnergyNeeds(NamedTuple):
+    """What the scan of an energy (keV) needs: s and bytes."""
+
+    kev: float
+    duration: float
+    total_bytes: int
+
+
 @dataclass(frozen=True, eq=False)
 class DryRun:
     """A scan worked out without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
 
-    Of a series of energies it is the first scan; `series` has the energy (keV), s and bytes of each.
+    Of a series of energies it is the first scan; `energies` has what each needs.
     """
 
     plan: ScanPlan
@@ -54,16 +62,21 @@ class DryRun:
     stage: StageLimits
     camera: CameraTiming
     free_bytes: int
-    series: tuple[tuple[float, float, int], ...] = ()
+    energies: tuple[EnergyNeeds, ...] = ()
+
+    @property
+    def total_bytes(self) -> int:
+        """Of the files of all scans."""
+        return sum(need.total_bytes for need in self.energies) if self.energies else self.timeline.total_bytes
 
     def lines(self) -> list[str]:
         """Lines of text; the violations come last."""
         lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
-        if self.series:
-            energies, seconds, n_bytes = zip(*self.series, strict=True)
+        if each := self.energies:
+            seconds = sum(need.duration for need in each)
             said = (
-                f"{len(energies)}, {energies[0]:.7g} to {energies[-1]:.7g} keV, a scan like this of each: "
-                f"{clock(sum(seconds))} and {size(sum(n_bytes))} in all (without the monochromator's moves)"
+                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
+                f"{duration_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
             )
             lines.insert(len(lines) - len(self.timeline.violations), f"{'energies':<10}{said}")
         return lines
@@ -84,7 +97,7 @@ class DryRun:
             "blur_px": worked.blur_px,
             "skew_px": worked.skew_px,
             "min_period": self.camera.min_period,
-            "energies": [dict(zip(("kev", "duration", "total_bytes"), one, strict=True)) for one in self.series],
+            "energies": [need._asdict() for need in self.energies],
             "blocks": [
                 {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.left}
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
@@ -92,18 +105,24 @@ class DryRun:
         }
 
 
-def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = all_of) -> DryRun:
+def dry_run(
+    settings: Config,
+    runs: Path | None = None,
+    remaining: Remaining = all_of,
+    whole: Collection[float | None] = (),
+) -> DryRun:
     """Work out a configuration without devices.
 
     Args:
         runs: where the file would be, for the free disk; the configured folder unless given.
         remaining: the part of the plan that is still to be taken.
+        whole: energies (keV) of a series that were taken already; not all of them.
 
     Raises:
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
             here: they are the timeline's violations.
     """
-    each = at_energies(settings)
+    each = [one for one in at_energies(settings) if one.scan.energy not in whole]
     if len(each) > 1:  # a scene is read at both ends of the range
         connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
     stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
@@ -113,18 +132,21 @@ def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = a
         DryRun(plan, _worked(one, plan, stage, to_counts, camera, free), stage, camera, free)
         for one, plan in zip(each, plans, strict=True)
     ]
-    return worked[0] if settings.scan.energies is None else _series(worked)
+    return worked[0] if settings.scan.energies is None else _of_energies(worked)
 
 
-def _series(each: Sequence[DryRun]) -> DryRun:
+def _of_energies(each: Sequence[DryRun]) -> DryRun:
     """The first of several scans, with the violations of all of them."""
-    series = tuple((one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
-    first, needed = each[0], sum(n_bytes for _, _, n_bytes in series)
+    needs = (EnergyNeeds(one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
+    found = replace(each[0], energies=tuple(needs))
     violations = dict.fromkeys(said for one in each for said in one.timeline.violations)
-    if needed * ROOM > first.free_bytes:
-        said = f"{len(each)} energies need {size(needed)} and a tenth more, the disk has {size(first.free_bytes)} free"
+    if found.total_bytes * ROOM > found.free_bytes:
+        said = (
+            f"{len(each)} energies need {size(found.total_bytes)} and a tenth more, the disk has "
+            f"{size(found.free_bytes)} free; free some, choose another storage.folder, or name fewer energies"
+        )
         violations[said] = None
-    return replace(first, timeline=replace(first.timeline, violations=tuple(violations)), series=series)
+    return replace(found, timeline=replace(found.timeline, violations=tuple(violations)))
 
 
 def _worked(

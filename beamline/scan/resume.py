@@ -43,6 +43,14 @@ _IDENTITY = (  # facts about a device that stay the same from scan to scan and d
 )  # fmt: skip
 
 
+def scan_file(path: str | Path) -> Path:
+    """The scan of a path: the file itself, or for the folder of a run the file with all its parts."""
+    path = Path(path)
+    if not (path / SCAN).is_file():
+        return path
+    return path / JOINED if (path / JOINED).is_file() else path / SCAN
+
+
 @dataclass(frozen=True)
 class ResumableRun:
     """A run that can go on.
@@ -153,7 +161,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 raise DataError(f"{part} is no scan of this program: it has no {layout.COMMITTED}. {_UNTOUCHED}")
             for other in (config, given):
                 if other is not None:
-                    _require_same_config(run, file["/entry/record/config"].asstr()[()], resolved_yaml(other))
+                    require_same_config(run, file["/entry/record/config"].asstr()[()], other)
             if not (angles := views_planned(file)):
                 raise DataError(f"{part} does not hold its plan: its views are not known. {_UNTOUCHED}")
             planned = angles
@@ -193,13 +201,13 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
     return files, left_out
 
 
-def _require_same_config(run: Path, stored: str, other: str) -> None:
-    """Refuse another configuration; the first line of each is the version of the program."""
-    pairs = zip(stored.splitlines()[1:], other.splitlines()[1:], strict=False)
-    differ = next(((a.strip(), b.strip()) for a, b in pairs if a != b), None)
-    if differ is not None or len(stored.splitlines()) != len(other.splitlines()):
+def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:
+    """Refuse another configuration than that in a file of the run, whose first line is the version of the program."""
+    before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
+    differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
+    if differ is not None or len(before) != len(now):
         said = " `{}`, not `{}`,".format(*differ) if differ else ""
-        raise ConfigError(f"{run} was taken with another configuration:{said} in its {SCAN}. {_UNTOUCHED}")
+        raise ConfigError(f"{run} was taken with another configuration:{said} in its {name}. {_UNTOUCHED}")
 
 
 def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> None:

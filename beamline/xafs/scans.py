@@ -34,11 +34,15 @@ class ScanRadiographs:
         for path in scans:
             with open_scan(path) as source:
                 if source.energy_kev is None:
-                    raise DataError(f"{path} does not state its energy. Nothing was written.")
+                    raise DataError(
+                        f"{path} does not state its energy; expected /entry/instrument/beam/incident_energy. "
+                        "Nothing was written."
+                    )
                 energies.append(source.energy_kev)
                 shapes.add(source.shape)
         if len(shapes) != 1:
-            raise DataError(f"The scans have frames of {len(shapes)} sizes; expected one. Nothing was written.")
+            sizes = ", ".join(f"{rows} x {cols}" for rows, cols in sorted(shapes))
+            raise DataError(f"The scans have frames of {sizes} pixels; expected one size. Nothing was written.")
         self.energies, (self.shape,) = np.array(energies), shapes
 
     def line_integrals(self, which: Sequence[int], part: FramePart = EVERYTHING) -> Iterator[tuple[float, Reals]]:

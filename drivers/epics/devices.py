@@ -162,10 +162,10 @@ class MonochromatorPvs:
         status_pv: where the energy itself is read.
         stop_pv: takes a 1 that stops it; None: it cannot be stopped.
         per_kev: the number that they show at 1 keV; 1000 where they are in eV.
-        tolerance: keV by which the energy may differ from the one that was asked for.
-        settle: s for which it must stay there.
+        tolerance: keV, most difference of the energy from the one that was asked for.
+        settle: s that it must stay within the tolerance.
         timeout: s, for each answer.
-        travel: s that the status may take to follow.
+        travel: s that a move may take, at most.
     """
 
     pv: str
@@ -179,7 +179,7 @@ class MonochromatorPvs:
 
 
 class PvMonochromator:
-    """Implements `drivers.base.protocols.Monochromator`. A move ends when the status has been there for a while.
+    """Implements `drivers.base.protocols.Monochromator`. A move ends when the status has stayed there for `settle`.
 
     Raises:
         DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.

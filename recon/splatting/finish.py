@@ -7,6 +7,7 @@ ends, they are in its residual. On voxels a few sweeps over the views bring them
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -73,34 +74,41 @@ class _Watch:
         return self.asked()
 
 
-class Asked(NamedTuple):
-    """What a trial early in a fit tells.
+class FinishTrial(NamedTuple):
+    """What a trial of the finish, early in a fit, tells.
 
     Attributes:
-        worth: further steps are.
+        steps_gain: further steps of the fit gain more than the finish makes up for.
         weight: of total variation that views held out prefer, in the units of the data.
-        residual: of these views with it, from FBP.
+        residual: of these views after total variation with this weight, from FBP.
     """
 
-    worth: bool
+    steps_gain: bool
     weight: float
     residual: float
 
+    @classmethod
+    def of(cls, values: Iterable[float]) -> FinishTrial:
+        """From its three numbers, as a decision or a checkpoint keeps them."""
+        steps_gain, weight, residual = values
+        return cls(bool(steps_gain), float(weight), float(residual))
+
 
 @dataclass
-class _Ask:
+class _TryFinish:
     """The trial as an iterative method of `recon.voxels.iterative.solve`; the volume stays as it is."""
 
     iterations: int = 1
-    found: Asked | None = None
+    found: FinishTrial | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         preferred = preferred_weight(problem, NoiseBalance.of(problem, x, True).first)
         if preferred is not None:
             low, high = (share * preferred.residual for share in _AS_WELL)
             left = residuals_of_rounds(problem, x, preferred.weight, SWEEPS, (low, high))
-            worth = not left or not low <= left[-1] <= high
-            self.found = Asked(worth, math.ldexp(preferred.weight, _power(problem)), preferred.residual)
+            steps_gain = not left or not low <= left[-1] <= high
+            weight = math.ldexp(preferred.weight, _power(problem))
+            self.found = FinishTrial(steps_gain, weight, preferred.residual)
         return x
 
 
@@ -113,18 +121,18 @@ class _FromModel:
     by_content: bool
     watch: _Watch
     unmodelled: float | None = None
-    asked: Asked | None = None
+    trial: FinishTrial | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        known = None if self.asked is None else math.ldexp(self.asked.weight, -_power(problem))
+        known = None if self.trial is None else math.ldexp(self.trial.weight, -_power(problem))
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled, known=known)
         if self.by_content and not (self.watch.ended or isinstance(weight, NoiseBalance)):
-            mu, steadily = weight, self.asked is None or self.asked.worth
+            mu, steadily = weight, self.trial is None or self.trial.steps_gain
             self.iterations = problem.decide(
                 "sweeps", lambda: preferred_sweeps(problem, x, mu, SWEEPS, steadily=steadily)
             )
             once = self.iterations > SWEEPS or self.watch.ended
-            residual = None if self.asked is None else self.asked.residual
+            residual = None if self.trial is None else self.trial.residual
             heavy = None if once else problem.decide("heavy", lambda: bregman_weight(problem, mu, residual))
             if heavy is not None:
                 self.iterations = 2 * SWEEPS
@@ -136,10 +144,10 @@ class _FromModel:
         return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=TV_STEPS)
 
 
-def ask(
+def try_finish(
     volume: Volume, gaussians: Gaussians, problem: ReconProblem, settings: FitSettings, control: RunControl
-) -> Asked | None:
-    """Whether a fit that has begun is worth its further steps; arguments as of `finish`. None: nothing can be held out.
+) -> FinishTrial | None:
+    """Whether further steps of a fit gain anything; arguments as of `finish`. None: no views can be held out.
 
     Sixteen rows are refined by the sweeps of a finish. They may predict views held out no better than total variation
     does from FBP, although the fit knows these views. Then the finish makes up for what more steps would gain.
@@ -148,7 +156,7 @@ def ask(
     if prepared is None:
         return None
     data, known, _ = prepared
-    method, watch = _Ask(), _Watch(control, problem.geometry.n_views)
+    method, watch = _TryFinish(), _Watch(control, problem.geometry.n_views)
     start = Volume(np.maximum(volume.data, 0), volume.grid)
     projector = Projector(problem.geometry, volume.grid)
     solve(method, projector, data, weight=known, start=start, on_trial=watch.trial, decide=Decisions(problem.seed))
@@ -170,7 +178,7 @@ def finish(
     settings: FitSettings | None = None,
     control: RunControl | None = None,
     nonnegative: bool = True,
-    asked: Asked | None = None,
+    trial: FinishTrial | None = None,
 ) -> Finished:
     """The volume after `sweeps` over all views, starting from the volume of a fit.
 
@@ -204,7 +212,7 @@ def finish(
             too.
 
         nonnegative: voxels below zero are clipped.
-        asked: what `ask` found during the fit; its weight is not sought again.
+        trial: what `try_finish` found during the fit; its weight is not sought again.
 
     Raises:
         ValueError: for shapes that disagree, or no sweeps.
@@ -221,7 +229,7 @@ def finish(
     watch = _Watch(control, problem.geometry.n_views)
 
     def refined(views: F32, unmodelled: float | None = None) -> Finished:
-        method = _FromModel(SWEEPS if sweeps is None else sweeps, sweeps is None, watch, unmodelled, asked)
+        method = _FromModel(SWEEPS if sweeps is None else sweeps, sweeps is None, watch, unmodelled, trial)
         refined = solve(
             method,
             projector,
@@ -273,7 +281,7 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
 
 
 def _power(problem: VoxelProblem) -> int:
-    """Of two, in a weight of total variation in the units of the data over one in those of the problem."""
+    """n, where a weight of total variation in the units of the data is 2**n times that in those of the problem."""
     length, integral, rays = problem.decide.made[UNITS][-1]
     return int(length + integral + (0 if problem.weight is None else rays))
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.base.choices import DEFAULT_STEPS as DEFAULT_STEPS
 from recon.base.choices import SHORT_STEPS as SHORT_STEPS
-from recon.splatting.finish import Asked
+from recon.splatting.finish import FinishTrial
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem
 
@@ -21,9 +21,9 @@ from recon.splatting.problem import FitProblem
 # at 1.3 0.1 dB (docs/notes/exploration.md).
 _LOOKED_AT, _NEAR_NOISE = 100, 1.5
 
-ASKED_AT = 50
-"""Step at which a trial asks whether a fit is worth its further steps, see `finish.ask`."""
-_ENDED_AT = 100  # where it is not; after 50 in all a thorax of 90 views loses 0.14 dB, after 100 nothing
+TRIAL_AT = 50
+"""Step at which a trial tells whether further steps gain anything, see `finish.try_finish`."""
+_ENDED_AT = 100  # where they do not; after 50 in all a thorax of 90 views loses 0.14 dB, after 100 nothing
 
 
 @dataclass(eq=False)
@@ -35,14 +35,14 @@ class Schedule:
         seconds: end it, too.
         by_content: after 100 steps it may be shortened, see `look`.
         bend: step and fraction after which the fraction rises evenly to 1.
-        asked: what the trial at `ASKED_AT` told; None: it was not made, or held out nothing.
+        trial: of the finish at `TRIAL_AT`; None: it was not made, or could hold out no views.
     """
 
     steps: int | None
     seconds: float | None = None
     by_content: bool = False
     bend: tuple[int, float] = (0, 0.0)
-    asked: Asked | None = None
+    trial: FinishTrial | None = None
 
     @classmethod
     def resumed(cls, planned: Schedule, checkpoint: Mapping[str, NDArray[Any]]) -> Schedule:
@@ -50,16 +50,15 @@ class Schedule:
         if not planned.by_content or "schedule" not in checkpoint:
             return planned
         steps, at, fraction = checkpoint["schedule"]
-        worth, *told = checkpoint.get("asked", (True,))
-        asked = Asked(bool(worth), *map(float, told)) if told else None
-        return cls(int(steps), planned.seconds, planned.by_content, (int(at), float(fraction)), asked)
+        trial = FinishTrial.of(checkpoint["trial"]) if "trial" in checkpoint else None
+        return cls(int(steps), planned.seconds, planned.by_content, (int(at), float(fraction)), trial)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Its arrays in a checkpoint."""
         if not self.by_content:
             return {}
-        asked = {} if self.asked is None else {"asked": np.array(self.asked, np.float64)}
-        return {"schedule": np.array([self.steps or 0, *self.bend]), **asked}
+        trial = {} if self.trial is None else {"trial": np.array(self.trial, np.float64)}
+        return {"schedule": np.array([self.steps or 0, *self.bend]), **trial}
 
     def fraction(self, step: int, spent: float) -> float:
         """How far the fit has come after so many steps and seconds, 0..1."""
@@ -74,10 +73,10 @@ class Schedule:
         if residual_over_noise(state, problem) < _NEAR_NOISE:
             self._shorten(state.step, SHORT_STEPS)
 
-    def told(self, asked: Asked | None, step: int) -> None:
-        """Keep what the trial told, and shorten the fit where it is not worth more steps."""
-        self.asked = asked
-        if asked is not None and not asked.worth:
+    def after_trial(self, trial: FinishTrial | None, step: int) -> None:
+        """Keep the trial, and shorten the fit where further steps gain nothing."""
+        self.trial = trial
+        if trial is not None and not trial.steps_gain:
             self._shorten(step, _ENDED_AT)
 
     def _shorten(self, step: int, steps: int) -> None:

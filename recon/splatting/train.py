@@ -24,7 +24,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
-from recon.splatting.finish import Asked, ask, finish
+from recon.splatting.finish import FinishTrial, finish, try_finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
@@ -38,7 +38,7 @@ from recon.splatting.in_time import (
 from recon.splatting.initialise import default_count, leaves_the_field, mean_change, place, sweeps_of_start
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, binned_geometry, coarser
-from recon.splatting.schedule import ASKED_AT, Schedule
+from recon.splatting.schedule import TRIAL_AT, Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.splatting.splat import voxelize
 from recon.voxels.projector import data_residual
@@ -147,7 +147,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
     schedule = Schedule(method.planned_steps, seconds, by_content)
     schedule = Schedule.resumed(schedule, control.resume or {})
-    asks = by_content and method.finish is None and not (wider or method.early_stop or seen.is_cone)
+    tries_finish = by_content and method.finish is None and not (wider or method.early_stop or seen.is_cone)
     fitted = replace(problem, projections=data[used], geometry=told.select(used), use=DataUse(known))
     history: list[Progress] = []
 
@@ -155,8 +155,8 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         model = turned_by_rows(fit.gaussians_of(state, backend), told, 1)
         return Volume(voxelize(model, problem.grid, truncation=settings.truncation).numpy(), problem.grid), model
 
-    def asked() -> list[float] | None:
-        found = ask(*of_model(), fitted, settings, control)
+    def trial() -> list[float] | None:
+        found = try_finish(*of_model(), fitted, settings, control)
         return None if found is None else list(found)
 
     def report(at: float) -> None:
@@ -172,9 +172,9 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     fit_begin = reported = saved = now()
     done = 0
     while schedule.steps is None or state.step < schedule.steps:
-        if asks and state.step == ASKED_AT and schedule.asked is None:
-            answer = decide("fit", asked)
-            schedule.told(None if answer is None else Asked(bool(answer[0]), *answer[1:]), state.step)
+        if tries_finish and state.step == TRIAL_AT and schedule.trial is None:
+            found = decide("fit", trial)
+            schedule.after_trial(None if found is None else FinishTrial.of(found), state.step)
         spent = now() - fit_begin
         if schedule.seconds is not None and spent >= schedule.seconds and done > 0:
             break
@@ -215,7 +215,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
             control = replace(control, should_stop=_until(control, end))
         control = replace(control, stop_trials=None if trials else lambda: True)
         finished, sweeps = finish(
-            volume, model, fitted, wanted, settings, control, not method.allow_negative, schedule.asked
+            volume, model, fitted, wanted, settings, control, not method.allow_negative, schedule.trial
         )
         if kept_back.size and _worse(finished, volume, data[kept_back], told.select(kept_back)):
             sweeps = 0

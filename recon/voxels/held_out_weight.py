@@ -254,7 +254,8 @@ def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: i
     A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24). It leaves
     others nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Each round of `residuals_of_rounds` has
     to bring the others nearer, and all by one per cent, which parts the two (docs/notes/exploration.md). Where slices
-    are not those of rows: `sweeps`. Not `steadily`: of a fit that was ended early, the second round alone may do so.
+    are not those of rows: `sweeps`. Without `steadily`, for a fit that was ended early, any round may bring the one per
+    cent, and the last ones may lose some of it.
     """
     errors = residuals_of_rounds(problem, start, weight, sweeps)
     least = min(errors, default=math.inf)
@@ -269,8 +270,8 @@ def residuals_of_rounds(
 ) -> list[float]:
     """What sixteen rows, refined from seven of eight views in three rounds of `sweeps`, leave of the others after each.
 
-    They end after a round that takes them farther away, or leaves a residual that is not `within`. Empty where slices
-    are not those of rows.
+    A round that takes them farther away, or leaves a residual that is not `within` these bounds, is the last. Empty
+    where slices are not those of rows.
     """
     geometry, grid = problem.projector.geometry, problem.projector.grid
     rows = Grid.matching(geometry)

@@ -99,8 +99,8 @@ class SimulatedOrcaQuest:
         return self._scene
 
     def show(self, scene: Scene) -> None:
-        """Its sample and its beam stand here from now on, with the effects that there are. Frames that were not taken
-        yet show them, too."""
+        """Sample and beam become those of `scene`, the effects stay. Exposed frames that were not read yet show them,
+        too."""
         with self._lock:
             self._scene = replace(self._scene, sample=scene.sample, beam=scene.beam)
 

@@ -79,7 +79,7 @@ class CameraView:
         )
 
     def shot(self, frame: Exposed) -> Shot:
-        """Of a scene without effects of motion in the middle of its exposure, where a reconstruction takes it to be."""
+        """Without effects of motion the angle is that of the middle of the exposure, as a reconstruction assumes."""
         middle = frame.time + self.settings.exposure / 2
         turned = 0.0 if self.scene.chain.moves else self.angle_at(middle) - self.angle_at(frame.time)
         return Shot(

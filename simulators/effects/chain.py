@@ -112,7 +112,7 @@ class Chain:
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
-        """Of an exposure; without blur all of it is seen in its middle, where a reconstruction takes it to be."""
+        """Of an exposure. Without blur there is one, the middle of the exposure, as a reconstruction assumes."""
         moments = Moments.once(shot.detector.shape[0], shot.exposure / 2)
         for effect in self.effects:
             if isinstance(effect, SamplingEffect):

@@ -28,7 +28,7 @@ class Shot:
         detector: the frame's pixels (after ROI and binning).
         exposure: s.
         time: s since the Unix epoch, at the trigger.
-        angle: true angle of the stage where a frame without effects of motion is exposed, radians.
+        angle: radians, true angle of the stage at which a frame without effects of motion shows the sample.
         angle_at: true angle of the stage in radians at a time in s; called by effects of motion only.
         elapsed: s since the camera was connected; the time of all drifts.
         row_period: s by which each row starts later than the one above.

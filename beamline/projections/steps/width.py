@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
 
 _MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail
-TURNED = "middle_of_exposure_deg"
-"""Parameter of a volume: from the angle in the file to that of the view, where the arc is too short to be modelled."""
 _LEAST_PX = 1.0  # at the edge of the field; `auto` models a motion from there on
+TO_MIDDLE = "middle_of_exposure_deg"
+"""Parameter of a volume: angle of a view less that in the file, where the arc is too short to be modelled."""
 
 
 class _Motion(NamedTuple):
@@ -124,7 +124,7 @@ class Width:
                 motion = _Motion(told.arc, 0.0 if bent else told.skew)
             elif told.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
                 geometry = replace(geometry, angles=geometry.angles + told.arc / 2)
-                parameters[TURNED] = math.degrees(told.arc / 2)
+                parameters[TO_MIDDLE] = math.degrees(told.arc / 2)
         if not (width or any(motion)):
             return geometry, StepDone(parameters=parameters)
         first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2

@@ -165,11 +165,23 @@ def test_what_has_no_map_is_refused_in_one_line(
     assert not list(tmp_path.glob("map*"))
 
 
+def test_no_map_stays_where_its_picture_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [fraction(tmp_path / f"{name}.h5", np.full((4, 4, 4), 0.5), Grid((4, 4, 4), 0.01)) for name in "ab"]
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("beamline.core.files.write_whole", full)
+    done = beamline("xafs", *files, "--volume", tmp_path / "map.h5", "-o", tmp_path / "map.png")
+    assert done.exit_code != 0 and not list(tmp_path.glob("map*"))
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
         (("edge_scan", "--states", "0,2", "--from", "8.32", "--to", "8.38"), "no states of charge"),
         (("mu.csv", "--states", "0,1"), "--states is for scenes"),
+        ((".",), "no folder of a series of scans"),
         (("mu.csv", "--least", "0.4"), "--least is for a map"),
         (("edge_scan", "--states", "0,1", "--material", "graphite", "--from", "8.32", "--to", "8.38"), "graphite"),
     ],

@@ -145,6 +145,8 @@ def test_a_series_that_was_stopped_goes_on(
             assert (kinds == FrameKind.PROJECTION).sum() == VIEWS
     assert all(digests(series)[name] == before[name] for name in whole)
     assert beamline("scan", "--resume", series, "--json").exit_code == 0  # nothing is missing
+    other = beamline("scan", config, "--set", "scan.energies=[8.3, 8.4]", "--resume", series)
+    assert other.exit_code == 2 and "`- 8.32`, not `- 8.3`" in other.stderr.replace("\n", " ")
 
 
 def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
@@ -156,6 +158,9 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
         4 * one["duration"], rel=0.03
     )  # each begins later in angle
     assert needs(dry_run(load(config)), 0).file_bytes == pytest.approx(1.1 * 4 * one["total_bytes"], rel=1e-3)
+    rest = dry_run(load(config), whole=ENERGIES[:3])
+    assert [need.kev for need in rest.energies] == [ENERGIES[3]]
+    assert rest.total_bytes == one["total_bytes"]  # the disk needs no room for those that were taken
     told = beamline("scan", config, "--dry-run", "-o", tmp_path / "none")
     assert "energies  4, 8.32 to 8.352 keV, a scan like this of each" in told.stdout
     assert told.exit_code == 0 and not (tmp_path / "none").exists()
@@ -180,6 +185,18 @@ def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, wor
     (line,) = ended.stderr.strip().splitlines()
     assert said in line
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("words", [("xafs",), ("materials", "-o", "out.h5", "--spectra", "spectra.csv")])
+def test_a_series_without_scans_is_refused(
+    config: Path, tmp_path: Path, words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spectra(tmp_path)
+    (tmp_path / "series").mkdir()
+    (tmp_path / "series" / "config.resolved.yaml").write_bytes(config.read_bytes())
+    ended = beamline(*words, "series")
+    assert ended.exit_code == 5 and "series has no scan yet: `beamline scan --resume series`" in ended.stderr
 
 
 def test_documents_of_a_series_are_refused(config: Path, tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import recon
 from recon.base.decisions import Decisions
 from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
-from recon.splatting.finish import Asked
+from recon.splatting.finish import FinishTrial
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.schedule import ASKED_AT, DEFAULT_STEPS, SHORT_STEPS, Schedule, residual_over_noise
+from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS, TRIAL_AT, Schedule, residual_over_noise
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.held_out_weight import Preferred
@@ -62,12 +62,12 @@ def test_a_shortened_fit_goes_on_from_its_rates_to_the_last_ones() -> None:
 
 def test_a_fit_that_is_not_worth_its_steps_ends_after_a_hundred() -> None:
     schedule = Schedule(DEFAULT_STEPS, by_content=True)
-    schedule.told(Asked(True, 2.0, 0.5), ASKED_AT)
+    schedule.after_trial(FinishTrial(True, 2.0, 0.5), TRIAL_AT)
     assert schedule.steps == DEFAULT_STEPS
-    schedule.told(Asked(False, 2.0, 0.5), ASKED_AT)
+    schedule.after_trial(FinishTrial(False, 2.0, 0.5), TRIAL_AT)
     assert schedule.steps == 100
-    after = [schedule.fraction(step, 0.0) for step in range(ASKED_AT, 101)]
-    assert after[0] == ASKED_AT / DEFAULT_STEPS and after[-1] == 1.0 and (np.diff(after) > 0).all()
+    after = [schedule.fraction(step, 0.0) for step in range(TRIAL_AT, 101)]
+    assert after[0] == TRIAL_AT / DEFAULT_STEPS and after[-1] == 1.0 and (np.diff(after) > 0).all()
     assert vars(Schedule.resumed(Schedule(DEFAULT_STEPS, by_content=True), schedule.arrays())) == vars(schedule)
 
 
