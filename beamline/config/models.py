@@ -243,8 +243,8 @@ class Config(Section):
         name, energies = ("scan.energies", several) if several else ("scan.energy", (one or 0.0,))
         if isinstance(device, NoMonochromator):
             raise ValueError(f"{name} needs a monochromator, and devices.monochromator.kind is none")
-        if len(set(energies)) < len(energies):
-            raise ValueError("scan.energies has an energy twice; give each once")
+        if len({f"{energy:.7g}" for energy in energies}) < len(energies):  # as the names of run folders
+            raise ValueError("scan.energies has an energy twice, to seven digits; give each once")
         if several and self.recon.stop_when is not None:
             raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)

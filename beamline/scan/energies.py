@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from beamline.config.load import Config, at_energies, load, resolved_yaml
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
@@ -135,6 +135,8 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
         recover_run(run)
     except NothingMissing:
         pass
+    except DataError as error:
+        raise DataError(f"{error} If {run} cannot be recovered, move it away: --resume then takes it anew.") from None
     return _file_of(run)
 
 
