@@ -245,8 +245,9 @@ class Config(Section):
             raise ValueError(
                 f"{name} needs a monochromator, and devices.monochromator.kind is none; name one, or set {name} to null"
             )
-        if twice := [energy for energy in dict.fromkeys(energies) if energies.count(energy) > 1]:
-            raise ValueError(f"scan.energies has an energy twice, {twice[0]:.7g} keV; give each once")
+        texts = [f"{energy:.7g}" for energy in energies]  # as the names of run folders
+        if twice := [text for text in texts if texts.count(text) > 1]:
+            raise ValueError(f"scan.energies has an energy twice, to seven digits: {twice[0]} keV; give each once")
         if several and self.recon.stop_when is not None:
             raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
         low, high = device.range_kev or (0.0, math.inf)

@@ -156,6 +156,8 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
         recover_run(run)
     except NothingMissing:
         pass
+    except DataError as error:
+        raise DataError(f"{error} If {run} cannot be recovered, move it away: --resume then takes it anew.") from None
     return scan_file(run)
 
 

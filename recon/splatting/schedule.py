@@ -46,11 +46,11 @@ class Schedule:
 
     @classmethod
     def resumed(cls, planned: Schedule, checkpoint: Mapping[str, NDArray[Any]]) -> Schedule:
-        """The schedule of a checkpoint; the planned one if it holds none."""
+        """The schedule of a checkpoint; the planned one if it holds none. ValueError: it is none."""
         if not planned.by_content or "schedule" not in checkpoint:
             return planned
-        steps, at, fraction = checkpoint["schedule"]
-        trial = FinishTrial.of(checkpoint["trial"]) if "trial" in checkpoint else None
+        steps, at, fraction = _three(checkpoint, "schedule")
+        trial = FinishTrial.of(_three(checkpoint, "trial")) if "trial" in checkpoint else None
         return cls(int(steps), planned.seconds, planned.by_content, (int(at), float(fraction)), trial)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -81,6 +81,13 @@ class Schedule:
 
     def _shorten(self, step: int, steps: int) -> None:
         self.bend, self.steps = (step, self.fraction(step, 0.0)), steps
+
+
+def _three(checkpoint: Mapping[str, NDArray[Any]], name: str) -> tuple[float, float, float]:
+    values = np.asarray(checkpoint[name], np.float64)
+    if values.shape != (3,) or not (np.isfinite(values) & (values >= 0)).all():
+        raise ValueError(f"{name} of the checkpoint is {values.tolist()}, expected three numbers of 0 or more")
+    return float(values[0]), float(values[1]), float(values[2])
 
 
 def residual_over_noise(state: FitState, problem: FitProblem) -> float:

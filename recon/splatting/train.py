@@ -175,6 +175,9 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         if tries_finish and state.step == TRIAL_AT and schedule.trial is None:
             found = decide("fit", trial)
             schedule.after_trial(None if found is None else FinishTrial.of(found), state.step)
+        # Before a further step: a fit that was left during its trial makes it again.
+        if (done or state.step == TRIAL_AT) and control.should_stop is not None and control.should_stop():
+            break
         spent = now() - fit_begin
         if schedule.seconds is not None and spent >= schedule.seconds and done > 0:
             break
@@ -196,8 +199,6 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         if control.on_checkpoint is not None and now() - saved >= control.checkpoint_every:
             control.on_checkpoint(arrays_of(state, backend) | tracker.arrays() | schedule.arrays())
             saved = now()  # the time that saving takes must not crowd out the fit
-        if control.should_stop is not None and control.should_stop():
-            break
         if method.early_stop and state.step - tracker.best_step > max(6 * _LOOK, _PATIENCE * (schedule.steps or 0)):
             break
     tracker.look(state, method.early_stop)

@@ -154,6 +154,9 @@ def weighted_lines(emission: Emission) -> tuple[F32, F32]:
     To second order about an expected mean λ the negative log-likelihood of y is ½ w (p - p~)², with p~ = (y - b) / s,
     whatever λ is, and Fisher's w = s² / λ (McCullagh & Nelder 1989, section 2.5). λ is y smoothed by neighbours: the
     counts of a line alone would weigh its lucky ones least, and lower the sum. Lines of survival 0 weigh nothing.
+
+    Raises:
+        ValueError: survival that is so small or large that lines or weights are beyond float32.
     """
     ones = np.ones_like(emission.counts)
     survival = ones if emission.survival is None else emission.survival
@@ -163,5 +166,10 @@ def weighted_lines(emission: Emission) -> tuple[F32, F32]:
     level = gaussian_filter(np.where(seen, emission.counts, 0), _SMOOTH, mode="nearest")
     shape = gaussian_filter(survival * seen, _SMOOTH, mode="nearest")
     mean = np.maximum(level * np.divide(survival, shape, out=ones.copy(), where=shape > 0), background)
-    lines = np.divide(emission.counts - background, survival, out=0 * ones, where=seen)
-    return lines, np.divide(survival**2, np.maximum(mean, _FEWEST), out=0 * ones, where=seen)
+    with np.errstate(over="ignore"):
+        lines = np.divide(emission.counts - background, survival, out=0 * ones, where=seen)
+        weights = np.divide(survival**2, np.maximum(mean, _FEWEST), out=0 * ones, where=seen)
+    if not (np.isfinite(lines).all() and np.isfinite(weights).all() and weights.any() == seen.any()):
+        low, high = survival[seen].min(), survival.max()
+        raise ValueError(f"survival from {low:.3g} to {high:.3g} gives lines or weights that float32 cannot hold")
+    return lines, weights

@@ -149,6 +149,21 @@ def test_a_series_that_was_stopped_goes_on(
     assert other.exit_code == 2 and "`- 8.32`, not `- 8.3`" in other.stderr.replace("\n", " ")
 
 
+def test_a_scan_that_cannot_be_read_is_moved_away_and_taken_anew(config: Path, tmp_path: Path) -> None:
+    """A writer that dies before its first frame leaves a file that nothing recovers."""
+    words = ("--set", "scan.energies=[8.32, 8.345]")
+    assert beamline("scan", config, "-o", tmp_path, *words).exit_code == 0
+    (series,) = tmp_path.iterdir()
+    broken = sorted(series.glob("*/scan.h5"))[1]
+    broken.write_bytes(broken.read_bytes()[:4000])
+    ended = beamline("scan", "--resume", series)
+    said = " ".join(ended.stderr.split())
+    assert ended.exit_code == 5 and f"{broken.parent} cannot be recovered, move it away" in said, said
+    broken.parent.rename(tmp_path / "away")
+    done = beamline("scan", "--resume", series, "--json")
+    assert done.exit_code == 0 and len(json.loads(done.stdout.splitlines()[-1])["scans"]) == 2, done.output
+
+
 def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
     one = json.loads(beamline("check", config, "--json", "--set", "scan.energies=null").stdout)
     all_ = json.loads(beamline("check", config, "--json").stdout)
@@ -170,6 +185,7 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
     ("words", "said"),
     [
         (("scan.energies=[8.3, 8.3]",), "has an energy twice"),
+        (("scan.energies=[8.3, 8.30000000001]",), "has an energy twice, to seven digits"),
         (("scan.energy=8.3",), "exclude each other"),
         (("devices.monochromator={kind: none}",), "scan.energies needs a monochromator"),
         (("devices.monochromator={kind: simulated, range_kev: [8, 8.35]}",), "8.352 keV is not within"),

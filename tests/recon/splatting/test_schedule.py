@@ -112,6 +112,32 @@ def test_a_fit_taken_up_again_is_shortened_as_the_one_that_was_not_left() -> Non
         np.testing.assert_array_equal(resumed.volume.data, whole.volume.data)
 
 
+def test_a_fit_that_is_left_during_its_trial_asks_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was left at step 51 without the answer, and took all 400 steps instead of 100."""
+    left: list[bool] = []
+    monkeypatch.setattr("recon.splatting.finish.residuals_of_rounds", lambda *_: [0.99])
+
+    def search(problem: VoxelProblem, first: float) -> Preferred:
+        left.append(True)
+        problem.trial_goes_on()
+        return Preferred(first, 1.0)
+
+    monkeypatch.setattr("recon.splatting.finish.preferred_weight", search)
+    part = recon.reconstruct(CLEAN + 0.01 * NOISE, VIEWS, TINY, control=recon.RunControl(lambda: bool(left)))
+    assert part.settings["steps"] == TRIAL_AT
+    again = recon.reconstruct(CLEAN + 0.01 * NOISE, VIEWS, TINY, control=recon.RunControl(resume=part.checkpoint))
+    assert again.settings["steps"] == 100 and len(left) == 2
+
+
+@pytest.mark.parametrize("trial", [[], [1.0, 2.0], [1.0, np.nan, 1.0], [0.0, -1.0, 1.0], [1.0] * 5])
+def test_a_checkpoint_whose_trial_is_none_is_refused(trial: list[float]) -> None:
+    with pytest.raises(ValueError, match="trial of the checkpoint is"):
+        Schedule.resumed(
+            Schedule(DEFAULT_STEPS, by_content=True),
+            {"schedule": np.array([400.0, 0.0, 0.0]), "trial": np.array(trial)},
+        )
+
+
 def test_the_residual_is_measured_in_the_noise_of_a_pixel() -> None:
     """By numpy, for a model that explains the views but for their noise."""
     problem = fit.problem_of(CLEAN + 0.02 * NOISE, VIEWS, GRID, 0.05, FitSettings(kernel=Kernel.GAUSSIAN))

@@ -161,3 +161,11 @@ def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
     blind = np.where(np.arange(16)[:, None, None] == 3, 0, np.ones_like(emission.counts))
     with pytest.raises(ValueError, match="lines have counts and the mean 0"):
         mlem(Emission(emission.counts + 1, emission.geometry, blind.astype(F32)), grid)
+
+
+@pytest.mark.parametrize("survival", [1e-38, 1e-30, 1e30])
+def test_lines_of_a_survival_that_float32_cannot_hold_are_refused(survival: float) -> None:
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 4, endpoint=False), (1, 8))
+    counts = np.full((4, 1, 8), 5, np.float32)
+    with pytest.raises(ValueError, match="float32 cannot hold"):
+        weighted_lines(Emission(counts, geometry, np.full_like(counts, survival)))
