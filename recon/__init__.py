@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
+    from recon.series import Series, TimedViews, fit_series
     from recon.spectral import EnergyViews, Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
@@ -79,8 +80,10 @@ __all__ = [
     "RunControl",
     "Sart",
     "SaxNerf",
+    "Series",
     "Sirt",
     "StreamingFit",
+    "TimedViews",
     "Volume",
     "WithoutRings",
     "attenuation_factors",
@@ -88,6 +91,7 @@ __all__ = [
     "correct",
     "find_axis",
     "fit_materials",
+    "fit_series",
     "mlem",
     "project",
     "reconstruct",
@@ -105,6 +109,7 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
+    **dict.fromkeys(("Series", "TimedViews", "fit_series"), "recon.series"),
     **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",

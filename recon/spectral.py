@@ -21,6 +21,7 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
 from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
+from recon.voxels.motion import Motion, moved, moved_back
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.tv import TotalVariationProx, difference_weights
@@ -29,8 +30,10 @@ from recon.voxels.voxel_problem import Momentum, largest_eigenvalue
 _SUBSETS, _TV_STEPS = 9, 3
 _ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _FIRST = 0.1  # the first weight, over the largest gradient at zero
+_ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
 _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
+_ROUNDS = 6  # of power iteration
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
 _LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
 _NOTHING = 1e-20  # singular value of materials that attenuate nothing
@@ -151,12 +154,19 @@ def fit_materials(
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
-    weights = _weights_by_views(views, grid, seed, go_on) if tv_weight is None else np.full(n, tv_weight)
-    fit, residual = _Fit(views, grid, np.random.default_rng(seed)), 1.0
+    weights = weights_by_views(views, grid, seed, go_on) if tv_weight is None else np.full(n, tv_weight)
+    fit = EnergyFit(views, grid, np.random.default_rng(seed))
+    densities, residual = fitted(fit, weights, sweeps, go_on)
+    return Materials(densities, grid, weights, residual)
+
+
+def fitted(fit: EnergyFit, weights: F64, sweeps: int, go_on: Callable[[int, float], bool]) -> tuple[F32, float]:
+    """Densities and residual after so many sweeps, or when `go_on` ends them."""
+    residual = 1.0
     for sweep, residual in enumerate(fit.sweeps(weights, sweeps), 1):
         if not go_on(sweep, residual):
             break
-    return Materials(fit.densities(), grid, weights, residual)
+    return fit.densities(), residual
 
 
 class _Part(NamedTuple):
@@ -169,10 +179,11 @@ class _Part(NamedTuple):
 
 
 @dataclass(eq=False)
-class _Fit:
+class EnergyFit:
     """The volumes of `fit_materials`, and its steps.
 
     Attributes:
+        motion: of the volume at each energy; None: it does not move.
         z: float32 [component, y, x, z].
         subsets: of the views; each has all energies.
         _to, _back: from densities to components, and back.
@@ -184,6 +195,7 @@ class _Fit:
     views: EnergyViews
     grid: Grid
     rng: np.random.Generator
+    motion: Motion | None = None
     z: F32 = field(init=False)
     subsets: list[list[_Part]] = field(init=False)
     step: float = field(init=False)
@@ -210,11 +222,37 @@ class _Fit:
                     if at.size
                 ]
             )
+        nz, ny, nx = self.grid.shape
+        self.z = np.zeros((values.size, ny, nx, nz), np.float32)
+        if self.motion is not None:
+            self.move(self.motion)
+            return
         largest = np.flatnonzero(subset == np.argmax(np.bincount(subset)))
         heights = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
         self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
-        nz, ny, nx = self.grid.shape
-        self.z = np.zeros((values.size, ny, nx, nz), np.float32)
+
+    def move(self, motion: Motion) -> None:
+        """Let the volume move so from here on."""
+        self.motion = motion
+        self.step = 1 / self._curvature(max(self.subsets, key=lambda subset: sum(len(part.data) for part in subset)))
+
+    def _curvature(self, subset: list[_Part]) -> float:
+        """As `largest_eigenvalue`, of a volume that moves."""
+        x, bound = np.ones(self.z.shape[1:], np.float32), math.inf
+        for _ in range(_ROUNDS):
+            product = np.zeros_like(x)
+            for part in subset:
+                u = None if self.motion is None else self.motion.at(part.energy)
+                lines = part.projector.forward_lines(moved(x, u))
+                lines *= np.float32((self._u[part.energy] ** 2).sum())
+                product += moved_back(part.projector.adjoint_lines(_weighed(lines, part)), u)
+            bound = min(bound, float(np.divide(product, x, out=np.zeros_like(x), where=x > 0).max()))
+            x = product / product.max()
+        return bound
+
+    def image(self, energy: int) -> F32:
+        """The volume [y, x, z] at an energy, before it moves."""
+        return np.tensordot(self._u[energy].astype(np.float32), self.z, 1)
 
     def descent(self, subset: list[_Part], out: F32) -> float:
         """Minus the gradient of the views of a subset at z, into `out`. Returns their weighed sum of squares."""
@@ -224,12 +262,13 @@ class _Fit:
             image[...] = 0
             for share, component in zip(self._u[part.energy], self.z, strict=True):
                 combine(1.0, image, float(share), component, image)
-            residual = part.data - part.projector.forward_lines(image)
-            weighted = residual if part.weight is None else part.weight * residual
+            u = None if self.motion is None else self.motion.at(part.energy)
+            residual = part.data - part.projector.forward_lines(moved(image, u))
+            weighted = _weighed(residual, part)
             squares += float(np.vdot(residual, weighted))
-            part.projector.adjoint_lines(weighted, image)
+            back = moved_back(part.projector.adjoint_lines(weighted, image), u)
             for share, component in zip(self._u[part.energy], out, strict=True):
-                combine(1.0, component, float(share), image, component)
+                combine(1.0, component, float(share), back, component)
         return squares
 
     def sweeps(self, weights: F64, n: int) -> Iterator[float]:
@@ -273,12 +312,21 @@ class _Fit:
         return np.ascontiguousarray(np.einsum("mk,kyxz->mzyx", self._back.astype(np.float32), self.z))
 
 
-def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable[[int, float], bool]) -> F64:
+def _weighed(lines: F32, part: _Part) -> F32:
+    return lines if part.weight is None else part.weight * lines
+
+
+def weights_by_views(
+    views: EnergyViews, grid: Grid, seed: int, go_on: Callable[[int, float], bool], *, alike: bool = False
+) -> F64:
     """Weights of total variation [component], by one view in eight held out.
 
     First one weight for all components, halved until it predicts worse. The first component, which holds what energies
     have in common, keeps the best one. The others hold differences: less structure, and the same noise. So they get the
     heaviest weight that predicts within 1 % of the best.
+
+    Args:
+        alike: all components keep one weight.
     """
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     rows = slice(None)
@@ -286,7 +334,7 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         rows = busiest_rows(views.projections, _ROWS)
         grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
     fit, judge = (
-        _Fit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed))
+        EnergyFit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed))
         for chosen in (~held_out, held_out)
     )
 
@@ -294,7 +342,7 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
 
     def left(weights: F64) -> float:
         nonlocal going
-        for residual in fit.sweeps(weights, _TRIAL_SWEEPS):
+        for residual in fit.sweeps(weights, (_ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS):
             if not (going := go_on(0, residual)):
                 return math.inf
         return judge.residual_of(fit.densities())  # not z: an energy's share of the views is another one here
@@ -309,7 +357,7 @@ def _weights_by_views(views: EnergyViews, grid: Grid, seed: int, go_on: Callable
         if worse == 2:
             break
         weights = weights / 2
-    heavier = np.r_[1.0, np.full(len(weights) - 1, 2.0)]
+    heavier = np.r_[2.0 if alike else 1.0, np.full(len(weights) - 1, 2.0)]
     ladder = [best * heavier**octave for octave in range(_HEAVIER)]
     residuals: list[float] = []
     for weights in ladder:
