@@ -1,4 +1,4 @@
-"""Manual shutter, sample mover and filter: asks an operator to act and keeps the state that was confirmed."""
+"""Manual devices, from shutter to monochromator: asks an operator to act and keeps the state that was confirmed."""
 
 from __future__ import annotations
 
@@ -71,3 +71,21 @@ class ManualFilter:
 
     def place(self) -> str | None:
         return self._place
+
+
+class ManualMonochromator:
+    """Implements `drivers.base.protocols.Monochromator` by asking the operator; the first energy is not known."""
+
+    def __init__(self, ask: Ask, name: str = "monochromator") -> None:
+        self.name = name
+        self._ask = ask
+        self._energy: float | None = None
+
+    def move_to(self, energy: float) -> None:
+        if energy != self._energy:
+            self._energy = None  # whoever does not confirm may have turned it
+            self._ask(f"Set the monochromator to {energy:.7g} keV.")
+            self._energy = energy
+
+    def energy(self) -> float | None:
+        return self._energy

@@ -24,14 +24,16 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_by_views import axis_by_views
+    from recon.energy_fit import EnergyViews
     from recon.fields.methods import NAF, IntraTomo, SaxNerf
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
     from recon.prep.counts import Counts
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
+    from recon.registration import register_energies
     from recon.series import Series, TimedViews, fit_series
-    from recon.spectral import EnergyViews, Materials, fit_materials
+    from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
     from recon.splatting.r2 import R2
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
     from recon.splatting.splat import project, voxelize
     from recon.splatting.stream import StreamingFit
     from recon.voxels.direct import Fbp
-    from recon.voxels.emission import Emission, attenuation_factors, mlem
+    from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
     from recon.voxels.methods.asd_pocs import AsdPocs
     from recon.voxels.methods.cgls import Cgls
     from recon.voxels.methods.fista_tv import FistaTv
@@ -95,8 +97,10 @@ __all__ = [
     "mlem",
     "project",
     "reconstruct",
+    "register_energies",
     "remove_rings",
     "voxelize",
+    "weighted_lines",
 ]
 
 _LAZY = {
@@ -109,11 +113,13 @@ _LAZY = {
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.prep.rings"),
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
+    "register_energies": "recon.registration",
     **dict.fromkeys(("Series", "TimedViews", "fit_series"), "recon.series"),
-    **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
+    "EnergyViews": "recon.energy_fit",
+    **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
-    **dict.fromkeys(("Emission", "attenuation_factors", "mlem"), "recon.voxels.emission"),
+    **dict.fromkeys(("Emission", "attenuation_factors", "mlem", "weighted_lines"), "recon.voxels.emission"),
     "Projector": "recon.voxels.projector",
     "StreamingFit": "recon.splatting.stream",
     **dict.fromkeys(("project", "voxelize"), "recon.splatting.splat"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem, RunControl
 from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
+from recon.splatting.initialise import leaves_the_field
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 
@@ -22,6 +24,7 @@ _LEAST_VIEWS = 12
 _ONE_IN = 3  # views held out
 _WIDEST = 0.1875  # of the columns to either side of the start
 _TV_WEIGHT = 3e-3  # any weight that keeps noise out of the volume shows the same axis
+_WIDER = 2.0  # A box this wide takes the matter around the field. In the field alone it would hide the axis.
 _STEPS = 8  # of the parabola's middle towards its vertex, at most
 _BETTER = 0.98  # of the residual at the start: what another axis has to leave
 _CLEAR = 0.1  # of the typical residual that the best axis has to take away
@@ -33,7 +36,8 @@ def axis_by_views(
     """The column by which a volume of two thirds of the views leaves least of the others.
 
     The residual has one minimum for some tenths of the detector's width. A coarse search halves its step around the
-    best candidate. A parabola through three candidates on finer pixels ends it.
+    best candidate. A parabola through three candidates on finer pixels ends it. If no candidate is clearly the best,
+    a sample wider than the field is searched again, in a box of twice the field's width.
 
     Args:
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
@@ -51,9 +55,29 @@ def axis_by_views(
     """
     if geometry.n_views < _LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
+    if not leaves_the_field(projections, geometry):
+        return _search(projections, geometry, progress, 1.0, near)
+    tried = [0]
+
+    def counted(n: int) -> None:
+        tried.append(tried[0] + n)
+        progress(tried[-1])
+
+    with suppress(AxisError):
+        found = _search(projections, geometry, counted, 1.0, near)
+        if found.confident:
+            return found
+    tried[0] = tried[-1]
+    return _search(projections, geometry, counted, _WIDER, near)
+
+
+def _search(
+    projections: F32, geometry: Geometry, progress: Callable[[int], None], width: float, near: bool
+) -> AxisEstimate:
+    """`axis_by_views` in a box of `width` times the field's."""
     cols = geometry.detector_shape[1]
-    coarse = _Judge(projections, geometry, _COARSE, progress)
-    fine = _Judge(projections, geometry, _FINE, progress, others=coarse)
+    coarse = _Judge(projections, geometry, _COARSE, progress, width)
+    fine = _Judge(projections, geometry, _FINE, progress, width, others=coarse)
     start, half = geometry.axis_col, 0.5 * fine.bin
     step = _WIDEST / 3 * cols
     best = min((start + n * step for n in range(-3, 4)), key=coarse)
@@ -110,6 +134,7 @@ class _Judge:
     geometry: Geometry
     accuracy: _Accuracy
     progress: Callable[[int], None]
+    width: float
     others: _Judge | None = None
     found: dict[float, float] = field(default_factory=dict)
     _grid: Grid | None = None
@@ -136,7 +161,8 @@ class _Judge:
         moved = (axis_col - self.geometry.axis_col) / self.bin
         views = replace(self._views, axis_col=self._views.axis_col + moved)
         if self._grid is None or not self.accuracy.one_grid:
-            self._grid = Grid.matching(views)
+            field = Grid.matching(views)
+            self._grid = field if self.width == 1 else field.widened(self.width, views)
         grid, method = self._grid, FistaTv(self.accuracy.sweeps, _TV_WEIGHT)
         part = ReconProblem(self.binned[self._seen], views.select(self._seen), grid, DataUse(), 0, "cpu")
         volume = method.run(part, RunControl()).volume

@@ -13,7 +13,7 @@ import numpy as np
 
 from recon.base.arrays import F32, F64
 from recon.base.volume import Grid
-from recon.spectral import EnergyFit, EnergyViews
+from recon.energy_fit import EnergyFit, EnergyViews
 from recon.voxels.motion import Motion, Seen, improved
 from recon.voxels.projector import Projector, projection_lines
 
@@ -69,7 +69,7 @@ def _binned(views: EnergyViews, n: int) -> EnergyViews:
     if views.weight is None:
         return replace(views, projections=mean(views.projections), geometry=geometry)
     weight = mean(views.weight)
-    data: F32 = mean(views.projections * views.weight) / np.maximum(weight, np.float32(1e-6))
+    data = np.divide(mean(views.projections * views.weight), np.maximum(weight, np.float32(1e-6)), dtype=np.float32)
     return replace(views, projections=data, geometry=geometry, weight=weight)
 
 

@@ -6,6 +6,7 @@ determine the volumes of all times in one fit, with total variation of what they
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -15,14 +16,17 @@ from numpy.typing import ArrayLike
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import learnt_motion
-from recon.spectral import EnergyFit, EnergyViews, fitted, weights_by_views
+from recon.spectral import weights_by_views
 from recon.voxels.held_out_weight import ONE_IN
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import volume_lines, volume_slices
 
-_MOMENTS = 4  # from one knot to the next: views of a moment count as simultaneous
-_LEAST_VIEWS = 12  # of each volume: views held out must see it, too
+_MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
+_MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
+_LEAST_VIEWS = 12  # for each volume: views held out must see it, too
+_LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,40 +119,50 @@ def fit_series(
         grid: of the volumes, with the motion as `Grid.matching`; None: as the geometry has it.
         motion: learn how the sample moves, too. It helps a sample that settles; one that only changes its densities
             gets motions that are not there.
-        tv_weight: μ of all components; None: the one with which views held out are predicted best.
+        tv_weight: μ of all components, so that a sample that does not change has the weight of one volume of all views;
+            None: the one with which views held out are predicted best.
 
     Raises:
-        ValueError: fewer than twelve views a volume, or times with too few views to tell the volumes apart.
+        ValueError: fewer than twelve views a volume, or fewer than six that are nearer to it than to any other.
     """
     n = views.geometry.n_views
     if not 2 <= knots <= n // _LEAST_VIEWS:
         raise ValueError(
             f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
         )
-    first, last = views.span
-    times = np.linspace(first, last, knots)
-    # Moments of equal numbers of views, not of equal times: of each, one is held out.
-    moments = min(_MOMENTS * (knots - 1), n // ONE_IN)
-    order = np.argsort(views.times, kind="stable")
-    moment = np.empty(n, np.intp)
-    moment[order] = np.arange(n) * moments // n
-    shares = np.zeros((moments, knots))
-    np.add.at(shares, moment, hats(views.times, times))
-    shares /= np.bincount(moment, minlength=moments)[:, None]
-    try:
-        energies = EnergyViews(views.projections, views.geometry, moment, shares, views.weight)
-    except ValueError as error:
-        if "apart" not in str(error):
-            raise
-        raise ValueError(f"{n} views at these times do not tell {knots} volumes apart: ask for fewer") from None
+    times = np.linspace(*views.span, knots)
+    near = (hats(views.times, times) > 0.5).sum(0)
+    if near.min() < _LEAST_NEAR:
+        k = int(near.argmin())
+        raise ValueError(
+            f"volume {k + 1} of {knots}, at time {times[k]:g}, has {near[k]} views within {np.diff(times)[0] / 2:g}, "
+            f"expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views before and after a gap apart"
+        )
+    energies, past = _of_moments(views, times, _MOMENTS * (knots - 1))
     grid = grid or Grid.matching(views.geometry)
-    weights = (
-        weights_by_views(energies, grid, seed, go_on, alike=True) if tv_weight is None else np.full(knots, tv_weight)
-    )
+    if tv_weight is None:
+        weights = weights_by_views(energies, grid, seed, go_on, alike=True)
+    else:
+        weights = np.full(knots, tv_weight / math.sqrt(past.size))
     moves = None
     if motion:
-        past = np.bincount(moment, (views.times - first) / (last - first)) / np.bincount(moment)
-        moves = learnt_motion(energies, past, weights, go_on)
+        coarse, coarse_past = _of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
+        moves = learnt_motion(coarse, coarse_past, weights * math.sqrt(past.size / coarse_past.size), go_on)
+        moves = moves and moves.on(moves.shape, past)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), moves)
     volumes, residual = fitted(fit, weights, sweeps, go_on)
     return Series(times, volumes, grid, residual, moves)
+
+
+def _of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
+    """The views as of so many moments at most, of equal numbers of views; and the moments within the scan, 0 ... 1."""
+    n = views.geometry.n_views
+    moments = min(most, n)
+    moment = np.empty(n, np.intp)
+    moment[np.argsort(views.times, kind="stable")] = np.arange(n) * moments // n
+    at = np.bincount(moment, views.times) / np.bincount(moment)
+    shares = np.zeros((moments, times.size))
+    np.add.at(shares, moment, hats(views.times, times))
+    shares /= np.bincount(moment)[:, None]
+    past = (at - times[0]) / np.ptp(times)
+    return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past

@@ -30,7 +30,7 @@ from recon.base.method import (
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 
-VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 24), 0.5)
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 24), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
 BOX = slice(1, 5), slice(8, 15), slice(6, 13)  # voxels of matter
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from beamline.config.load import Config, changed, load, override_of
+from beamline.config.monochromator import NoMonochromator
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event, ReconDone, RunDone, ScanDone
 from beamline.core.narration import sentence
@@ -120,7 +121,7 @@ class Instrument:
 
         Args:
             sample: name of the sample, in the file and in the folder's name; None: the configured one.
-            energy_kev: of the beam, written to the file. It moves no monochromator.
+            energy_kev: of the beam, written to the file. The configured monochromator goes there, if there is one.
             set: other values of the configuration for this scan only, such as {"scan.angles.views": 90}.
             output: folder for the folders of runs; None: `storage.folder`.
             live: False: without a reconstruction, even where `recon.live` is on.
@@ -147,7 +148,8 @@ class Instrument:
     def _config_of(self, sample: str | None, energy_kev: float | None, set: Mapping[str, object]) -> Config:
         if not self._open:
             raise ConfigError("the instrument was closed: connect to it again. Nothing was started.")
-        named = {"sample.name": sample, "optics.energy_kev": energy_kev}
+        moved = not isinstance(self.config.devices.monochromator, NoMonochromator)
+        named = {"sample.name": sample, "scan.energy" if moved else "optics.energy_kev": energy_kev}
         wanted = {**set, **{key: value for key, value in named.items() if value is not None}}
         config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
         if _of_devices(config) != _of_devices(self.config):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -35,29 +36,39 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "-o", "--output", metavar="PATH.h5", type=_FILE, required=True, help="_NAME joins its stem for each material."
 )
+@click.option("--register", is_flag=True, help="Find how the sample stood in each scan, by shift and turn; correct it.")
 @selection_options
 @heading(OUTPUT)
 @json_option
-def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
+def materials(
+    files: tuple[Path, ...], spectra: Path, output: Path, register: bool, as_json: bool, **values: Any
+) -> None:
     """Fit the volume fraction of each material to scans of one sample at several energies, all at once.
 
-    Each SCAN states its energy. Few views an energy are enough: all views together determine the materials. Views of
-    different energies should have different angles. The sample must not move between the scans.
+    Each SCAN states its energy; the folder of a series (`scan.energies`) stands for its scans. Few views an energy are
+    enough: all views together determine the materials. Views of different energies should have different angles. The
+    sample must not move between the scans, or --register finds how it did.
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
     from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
+    from beamline.scan.energies import is_series, scans_in
 
+    files = tuple(scan for path in files for scan in (scans_in(path) if is_series(path) else [path]))
     refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
     table = read_spectra(spectra)
     with events_shown(as_json) as sink:
         clock = SystemClock()
         made = reconstruct_materials(
             [chosen(path, 0, values) for path in files], table, output, sink, clock,
-            lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False),
+            lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False), register,
         )  # fmt: skip
-        sink(Done({"outputs": made.outputs, "residual": made.residual, "stopped": made.early}, time=clock.now()))
+        data = {"outputs": made.outputs, "residual": made.residual, "stopped": made.early, "displacements": made.moves}
+        sink(Done(data, time=clock.now()))
     if not as_json:
         click.echo("\n".join(f"{name:<20}{path}" for name, path in made.outputs.items()))
+        for path, move in zip(files, made.moves, strict=False):
+            at = ", ".join(f"{1e3 * value:+.2f}" for value in (move.x, move.y, move.z))
+            click.echo(f"{'displaced':<20}{at} µm along x, y, z and {math.degrees(move.turn):+.3f}°: {path}")
     if made.early:
         raise ScanStopped("The fit was stopped; the volumes are those reached so far.")

@@ -14,7 +14,7 @@ from beamline.cli.json_output import json_events
 from beamline.cli.options import json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.cli.watch import PageBeside
-from beamline.core.errors import AlarmError, DataError
+from beamline.core.errors import AlarmError, ConfigError, DataError
 from beamline.core.events import Done, Sink
 from beamline.core.signals import stop_signals
 from beamline.core.stop import StopRequest
@@ -70,6 +70,8 @@ def scan(
 ) -> None:
     """Run the scan in CONFIG, or go on with one that ended early (--resume RUN).
 
+    With `scan.energies` it is a series: a scan of each energy, in one folder, which --resume takes too.
+
     Each run has a folder of its own, named by UTC time and sample. The first Ctrl-C, SIGTERM or a terminal that is
     closed stops the scan cleanly; the second Ctrl-C aborts it. The file is readable in either case.
 
@@ -90,6 +92,12 @@ def scan(
         raise click.UsageError("--documents tells whole scans: leave it out with --resume.")
     with json_events(as_json) as json_sink, ExitStack() as held:
         config = None if file is None else load(file, overrides)
+        whole = _series_of(config, run, documents)
+        if whole is not None and not dry:
+            _run_series(whole, output, run, [json_sink], page=page, no_live=no_live, as_json=as_json)
+            return
+        if whole is not None:
+            run, config = None, whole
         try:
             series = None if run is None else held.enter_context(open_for_resume(run, config))
         except NotJoined:
@@ -119,6 +127,54 @@ def scan(
         click.echo(_results(result))
     if faults := _faults(result):
         raise AlarmError(f"The scan is complete, but {' '.join(faults)} Look at {result.path.parent}.")
+
+
+def _series_of(config: Config | None, run: Path | None, documents: str | None) -> Config | None:
+    """The configuration of a series of energies; None where it is one scan."""
+    from beamline.config.load import load
+    from beamline.scan.energies import is_series
+    from beamline.scan.run_folder import CONFIG
+
+    if run is not None and not is_series(run):
+        return None
+    given, config = config, config if run is None else load(run / CONFIG, environment={})
+    if config is None or config.scan.energies is None:
+        return None
+    if given is not None and given != config:
+        raise ConfigError(f"{run} was taken with another configuration: leave CONFIG out. Nothing was changed.")
+    if documents is not None:
+        raise click.UsageError("--documents tells one scan: leave it out with scan.energies.")
+    return config
+
+
+def _run_series(
+    config: Config,
+    output: Path | None,
+    run: Path | None,
+    sinks: list[Sink],
+    *,
+    page: bool,
+    no_live: bool,
+    as_json: bool,
+) -> None:
+    from beamline.instrument.operator import ask_operator
+    from beamline.scan.energies import run_energies
+    from beamline.scan.live_process import Commands, commands_of
+
+    stop = StopRequest()
+    with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
+        done = run_energies(
+            config, output, [terminal, *sinks, *([beside] if page else [])], stop,
+            lambda one, rest: Commands() if no_live else commands_of(one, rest),
+            series=run, ask=lambda request: terminal.ask(request, ask_operator),
+        )  # fmt: skip
+    data = {"folder": done.folder, "scans": [{"energy_kev": energy, "path": path} for energy, path in done.scans]}
+    sinks[0](Done(data, time=SystemClock().now()))
+    if not as_json:
+        click.echo("\n".join(f"{f'{energy:.7g} keV':<14}{path}" for energy, path in done.scans))
+        click.echo(f"{'materials':<14}beamline materials {done.folder} --spectra SPECTRA.csv -o OUT.h5")
+    if faults := [said for result in done.results for said in _faults(result)]:
+        raise AlarmError(f"The scans are complete, but {' '.join(faults)} Look at {done.folder}.")
 
 
 def _documents(config: Config, place: str, held: ExitStack) -> Sink:

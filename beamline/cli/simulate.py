@@ -15,7 +15,7 @@ from beamline.cli.options import json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import CostExplained, Done, Event, Sink
-from beamline.core.files import refuse_existing, write_whole
+from beamline.core.files import refuse_existing, remove, write_whole
 from beamline.core.machine import free_memory, machine, machine_line
 from beamline.core.shipped import shipped_scenes
 from beamline.core.signals import StopOnSignal, terminated_like_interrupted
@@ -100,14 +100,19 @@ def simulate(
         outputs: dict[str, object] = {}
         if truth:
             outputs |= _truth(scan, truth, truth_bin, output)
-        written = _scan(opened, scan, out, output, sink) if out else None
-        if written:
-            outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
-        if picture and not (written and written.stopped):
-            marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
-            write_whole(picture, sheet(scan, marked))
-            outputs |= {"picture": picture}
-            output("picture", str(picture))
+        try:
+            written = _scan(opened, scan, out, output, sink) if out else None
+            if written:
+                outputs |= {"output": written.path, "labels": written.labels, "n_frames": written.n_frames}
+            if picture and not (written and written.stopped):
+                marked = tuple((run.first + run.last) // 2 for run in written.runs) if written else ()
+                write_whole(picture, sheet(scan, marked))
+                outputs |= {"picture": picture}
+                output("picture", str(picture))
+        except Exception:
+            if truth:
+                remove(truth)
+            raise
         if written and written.stopped:
             raise ScanStopped(
                 f"Stopped after {written.n_frames} of {len(scan)} frames; {out} holds them and is readable."

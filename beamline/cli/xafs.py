@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import sys
 from collections.abc import Sequence
@@ -13,9 +12,10 @@ from typing import TYPE_CHECKING
 import click
 
 from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, SEED, FiniteRange, parsed
+from beamline.cli.options import POSITIVE, SEED, FiniteRange, parsed, refuse_shared, volume_path
 from beamline.cli.scan_options import underscored
-from beamline.cli.terminal import Terminal
+from beamline.cli.terminal import Terminal, counting, events_shown
+from beamline.cli.xafs_curves import CurveJob, CurveLimits, run_job
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.events import Done
 from beamline.core.signals import stop_signals
@@ -23,18 +23,17 @@ from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from beamline.monitor.view import PixelBox
-    from beamline.xafs.contrast import XafsCurve
     from beamline.xafs.results import XafsResult
-    from beamline.xafs.series import Series, SeriesResult
+    from beamline.xafs.series import SeriesResult
 
 MOST = 5000
 _SCENES = (".yaml", ".yml", "")
-_OF_SCENES = ("step", "material", "angle", "seed")
-_OF_FILES = ("region", "around", "unit", "quantity")
+_OF_SCENES = ("step", "material", "angle", "seed", "charges")
+_OF_FILES = ("regions", "around", "unit", "quantity")
+_OF_MAPS = ("spectra", "least")
+LEAST_SHARE = 0.5
+"""Least sum of volume fractions in a voxel of a map."""
 _BOX = "ROW:END,COL:END"
 
 
@@ -46,8 +45,24 @@ def box(value: str) -> PixelBox:
     return int(match[1]), int(match[2]), int(match[3]), int(match[4])
 
 
+def boxes(values: Sequence[str]) -> tuple[PixelBox, ...]:
+    """Each as of `box`."""
+    return tuple(map(box, values))
+
+
+def charges_of(value: str) -> tuple[float, ...]:
+    """Numbers from 0 to 1 apart by commas, each once. ValueError for anything else."""
+    try:
+        found = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        found = ()
+    if not found or len(set(found)) < len(found) or not all(0 <= charge <= 1 for charge in found):
+        raise ValueError(f"{value!r} are no states of charge; expected numbers from 0 to 1, e.g. 0,0.5,1")
+    return found
+
+
 @click.command()
-@click.argument("source", metavar="SCENE|FILE")
+@click.argument("sources", metavar="SCENE|FILE...", nargs=-1, required=True)
 @click.option("--from", "low", type=POSITIVE, metavar="KEV", help="First energy; a scene needs it.")
 @click.option("--to", "high", type=POSITIVE, metavar="KEV", help="Last energy; a scene needs it.")
 @click.option("--step", type=POSITIVE, metavar="KEV", help="Between a scene's energies; 0.001 unless given.")
@@ -60,7 +75,19 @@ def box(value: str) -> PixelBox:
 )
 @click.option("--seed", type=SEED, help="Seed of all random numbers of a scene. Default: 0.")
 @click.option(
-    "--region", callback=parsed(box), metavar=_BOX, help="The material in a file's frames; all of them unless given."
+    "--region",
+    "regions",
+    multiple=True,
+    callback=parsed(boxes),
+    metavar=_BOX,
+    help="The material in a file's frames; all of them unless given. Several are several states.",
+)
+@click.option(
+    "--states",
+    "charges",
+    metavar="CHARGE,...",
+    callback=parsed(charges_of),
+    help="States of charge, 0 to 1, that the scene's material has, one after the other.",
 )
 @click.option(
     "--around", callback=parsed(box), metavar=_BOX, help="Its surroundings, for the contrast; none unless given."
@@ -80,20 +107,37 @@ def box(value: str) -> PixelBox:
     type=click.Path(path_type=Path, dir_okay=False),
     help="Picture (.png), with the table beside it (.csv). Default: the source's stem + _xafs.png, here.",
 )
+@click.option(
+    "--volume",
+    "chart",
+    metavar="PATH",
+    callback=parsed(volume_path),
+    help="Write a state-of-charge map: the share of the last FILE in the sum of all, which are volume fractions.",
+)
+@click.option(
+    "--spectra",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="With --volume: table as of `materials`; FILEs are volumes in 1/mm, and the map is of its last material.",
+)
+@click.option("--least", type=FiniteRange(min=0, min_open=True), help="With --volume: least sum; 0.5 unless given.")
 @click.option("--json", "as_json", is_flag=True, help="One event a line on stdout.")
 def xafs(
-    source: str,
+    sources: tuple[str, ...],
     low: float | None,
     high: float | None,
     step: float | None,
     material: str | None,
     angle: float | None,
     seed: int | None,
-    region: PixelBox | None,
+    regions: Sequence[PixelBox],
+    charges: Sequence[float] | None,
     around: PixelBox | None,
     unit: str | None,
     quantity: str | None,
     output: Path | None,
+    chart: Path | None,
+    spectra: Path | None,
+    least: float | None,
     as_json: bool,
 ) -> None:
     """Find the energy at which a material of given thickness has the highest contrast to its surroundings, and its
@@ -101,59 +145,90 @@ def xafs(
 
     SCENE is a YAML file or the name of a scene that comes with the package: its radiographs are simulated at all
     energies from --from to --to. FILE is a text table of energy and absorption, or an HDF5 file with `energy` and
-    either `mu` or `frames` and `flats`.
+    either `mu` or `frames` and `flats`. It may be the folder of a series of scans (`scan.energies`).
+
+    Several FILEs, several --region or --states come into one picture with the edge of each. With --volume the FILEs are
+    volumes, and their map is written.
 
     Writes a picture and a table. Ctrl-C ends it with the energies so far (exit code 4). Exit code 6: no edge was found;
     picture and table are written, too.
     """
-    from beamline.xafs.contrast import XafsCurve
-    from beamline.xafs.edge import LEAST
-    from beamline.xafs.measured import FileOptions, open_series
-    from beamline.xafs.results import lines, refuse_existing_results, table_beside, write
-    from beamline.xafs.series import SeriesResult, run_series
+    from beamline.xafs import states
+    from beamline.xafs.results import lines, refuse_existing_results, table_beside, write, write_both
 
-    target = output or Path(f"{Path(source).stem}_xafs.png")
+    target = output or Path(f"{Path(sources[-1]).stem}_xafs.png")
     if target.suffix.lower() != ".png":
         raise click.BadParameter(f"{str(target)!r} is not a picture; give a .png file", param_hint="--output")
-    is_scene = Path(source).suffix.lower() in _SCENES
-    _refuse_foreign(click.get_current_context(), _OF_FILES if is_scene else _OF_SCENES)
+    if chart is not None:
+        _map(sources, chart, spectra, LEAST_SHARE if least is None else least, target, as_json)
+        return
+    _refuse_given(_OF_MAPS, "a map of volumes: give --volume PATH, too")
+    jobs = [job for source in sources for job in _jobs(source, regions, charges)]
     clock, stop = SystemClock(), StopRequest()
+    results: list[XafsResult] = []
     with json_events(as_json) as json_sink, ExitStack() as opened:
         refuse_existing_results(target)
         opened.enter_context(stop_signals(stop))
-        series: Series | XafsCurve
-        if is_scene:
-            from beamline.simulate.energy_scan import (
-                open_energy_scan,  # lazily: it imports xraylib, which measured files do not need
-            )
-
-            series = open_energy_scan(
-                source, _grid(low, high, step or 0.001), material, math.radians(angle or 0.0), seed or 0
-            ).series()
-        else:
-            options = FileOptions(low or 0.0, high or math.inf, region, around, unit, quantity)
-            series = opened.enter_context(open_series(Path(source), options))
-            n = series.energies.size if isinstance(series, XafsCurve) else series.n
-            if n < LEAST:
-                within = " between --from and --to" if low or high else ""
-                raise DataError(f"{source}: {n} energies{within} are too few for an edge, which takes {LEAST}.")
         with Terminal(sys.stderr) as terminal:
             sink = json_sink if as_json else terminal
-            if isinstance(series, XafsCurve):
-                run, title = SeriesResult(series), Path(source).name
-            else:
-                run, title = run_series(series, sink, clock, lambda: stop.stopping), series.title
-        result = _result(title, run)
-        write(result, target)
-        data = result.data() | {"picture": target, "table": table_beside(target), "stopped": run.stopped}
+            for job in jobs:
+                limits = CurveLimits(low, high, step, material, angle, seed, around, unit, quantity)
+                run, title = run_job(job, limits, len(jobs) > 1, sink, stop)
+                try:
+                    results.append(_result(title, run))
+                except ScanStopped:
+                    if not results:
+                        raise
+                if stop.stopping:
+                    break
+        if len(jobs) == 1:
+            write(results[0], target)
+            said, data = lines(results[0]), results[0].data()
+        else:
+            write_both(states.picture(results), states.table(results), target)
+            said, data = states.lines(results), states.data(results)
+        data |= {"picture": target, "table": table_beside(target), "stopped": run.stopped or len(results) < len(jobs)}
         json_sink(Done(data, time=clock.now()))
     if not as_json:
-        click.echo("\n".join([*lines(result), f"written     {target}, {table_beside(target)}"]))
-    if run.stopped:
+        click.echo("\n".join([*said, f"written     {target}, {table_beside(target)}"]))
+    if run.stopped or len(results) < len(jobs):
         n = run.curve.energies.size + run.curve.left_out.size
         raise ScanStopped(f"Stopped after {n} energies; picture and table contain them.")
-    if not result.edge.found:
-        raise QualityError(f"No absorption edge was found: {result.edge.reason}. Picture and table were written.")
+    if without := [result for result in results if not result.edge.found]:
+        where = "" if len(jobs) == 1 else f" in {without[0].title}"
+        why = without[0].edge.reason
+        raise QualityError(f"No absorption edge was found{where}: {why}. Picture and table were written.")
+
+
+def _jobs(source: str, regions: Sequence[PixelBox], charges: Sequence[float] | None) -> list[CurveJob]:
+    if CurveJob(source).is_scene:
+        _refuse_given(_OF_FILES, "measured files, not for scenes")
+        return [CurveJob(source, charge=charge) for charge in charges or (None,)]
+    _refuse_given(_OF_SCENES, "scenes, not for measured files")
+    return [CurveJob(source, region) for region in regions or (None,)]
+
+
+def _map(sources: Sequence[str], chart: Path, spectra: Path | None, least: float, target: Path, as_json: bool) -> None:
+    """`--volume`: the state-of-charge map, and its picture."""
+    from beamline.core.files import refuse_existing, write_whole
+    from beamline.reconstruct.charge_map import charge_map, picture
+    from beamline.reconstruct.energy_series import read_spectra
+    from beamline.storage.volumes.files import write_volume
+
+    _refuse_given((*_OF_FILES, *_OF_SCENES, "low", "high"), "curves, and --volume makes a map")
+    paths = [Path(source) for source in sources]
+    refuse_shared({"--volume": chart, "--output": target, **{f"FILE {n}": path for n, path in enumerate(paths, 1)}})
+    with events_shown(as_json) as sink:
+        clock = SystemClock()
+        for path in (chart, target):
+            refuse_existing(path)
+        table = None if spectra is None else read_spectra(spectra)
+        found = charge_map(paths, table, least, counting("slices", sink, clock), clock.now())
+        write_volume(chart, found.record)
+        write_whole(target, picture(found))
+        sink(Done({"volume": chart, "picture": target, **found.data()}, time=clock.now()))
+    if not as_json:
+        click.echo("\n".join([*found.lines(), f"written     {chart}, {target}"]))
 
 
 def _result(title: str, run: SeriesResult) -> XafsResult:
@@ -172,25 +247,11 @@ def _result(title: str, run: SeriesResult) -> XafsResult:
     return XafsResult(title, run.curve, find_edge(run.curve.energies, run.curve.absorption))
 
 
-def _grid(low: float | None, high: float | None, step: float) -> NDArray[np.float64]:
-    """Energies from low to high, keV. Raises UsageError: a limit is missing, or energies are too few or many."""
-    import numpy as np
-
-    from beamline.xafs.edge import LEAST
-
-    if low is None or high is None:
-        raise click.UsageError("A scene needs a range of energies: --from 8.30 --to 8.42, in keV.")
-    n = math.floor((high - low) / step * (1 + 1e-9) + 1e-9) + 1
-    if not LEAST <= n <= MOST:
-        raise click.UsageError(
-            f"From {low:g} to {high:g} keV in steps of {step:g} are {max(n, 0)} energies; it must be {LEAST} to {MOST}."
-        )
-    return low + step * np.arange(n, dtype=np.float64)
+def _refuse_given(names: Sequence[str], what: str) -> None:
+    """Raises UsageError where an option is given that does not apply."""
+    ctx = click.get_current_context()
+    if given := [name for name in names if ctx.params.get(name) not in (None, ())]:
+        raise click.UsageError(f"{_FLAGS.get(given[0], f'--{given[0]}')} is for {what}.")
 
 
-def _refuse_foreign(ctx: click.Context, foreign: Sequence[str]) -> None:
-    """Raises UsageError where an option is given that does not apply to the source."""
-    given = [name for name in foreign if ctx.params.get(name) is not None]
-    if given:
-        kind = "measured files, not for scenes" if foreign is _OF_FILES else "scenes, not for measured files"
-        raise click.UsageError(f"--{given[0]} is for {kind}.")
+_FLAGS = {"low": "--from", "high": "--to", "regions": "--region", "charges": "--states"}

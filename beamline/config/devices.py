@@ -1,4 +1,4 @@
-"""Configuration of the devices: stage, camera, shutter, sample mover, filter and beam monitor, real or simulated."""
+"""Configuration of the devices: stage, camera, shutter, beam monitor and what moves in the beam, real or simulated."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self, Union
 
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
+from beamline.config.monochromator import MonochromatorConfig, NoMonochromator
 from beamline.config.places import (
     FilterConfig,
     MotorSection,
@@ -268,6 +269,7 @@ class DeviceSection(Section):
     shutter: Annotated[Simple | StageOutputShutter | EpicsShutter, Field(discriminator="kind")]
     sample_mover: Annotated[Simple | StageMover, Field(discriminator="kind")]
     filter: Annotated[FilterConfig, Field(discriminator="kind")] = NoFilter()
+    monochromator: Annotated[MonochromatorConfig, Field(discriminator="kind")] = NoMonochromator()
     beam_monitor: Annotated[BeamMonitorConfig, Field(discriminator="kind")] = NoBeamMonitor()
 
     @model_validator(mode="after")
@@ -321,6 +323,8 @@ class DeviceSection(Section):
         }
         if not isinstance(self.filter, NoFilter):
             simulated["filter"] = _simulated(self.filter)
+        if not isinstance(self.monochromator, NoMonochromator):
+            simulated["monochromator"] = self.monochromator.kind == "simulated"
         if isinstance(self.beam_monitor, ElectrometerConfig):
             simulated["beam_monitor"] = self.beam_monitor.simulated
         return simulated

@@ -143,5 +143,8 @@ def _words(branch: Schema) -> str:
     if kind == "string":
         if "pattern" in branch:
             return f"text of {branch['description']}"
-        return f"text of {branch['minLength']} to {branch['maxLength']} characters" if "minLength" in branch else "text"
+        least, most = branch.get("minLength", 0), branch.get("maxLength")
+        if most is None:
+            return f"text of {least} or more characters" if least > 1 else "text that is not empty" if least else "text"
+        return f"text of {least} to {most} characters"
     return {"boolean": "true | false"}.get(kind, kind)

@@ -16,7 +16,15 @@ from pydantic import ValidationError
 from beamline.config.checks import faults
 from beamline.config.errors import explain
 from beamline.config.models import Config as Config
-from beamline.config.models import Fields, FileAngles, GoldenAngles, InterlacedAngles, RandomAngles, SectorAngles
+from beamline.config.models import (
+    Fields,
+    FileAngles,
+    FixedAngles,
+    GoldenAngles,
+    InterlacedAngles,
+    RandomAngles,
+    SectorAngles,
+)
 from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
@@ -57,6 +65,26 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
     """The configuration with other values, without its file and the environment. ConfigError as `load`."""
     name = "the configuration"
     return _validated(override(read(resolved_yaml(config), name), overrides, {}), name)
+
+
+def at_energies(config: Config) -> tuple[Config, ...]:
+    """The scan of each of `scan.energies`; of a configuration without them, itself.
+
+    The n-th of N scans begins n / N of a step later, or has another seed, so that all views together see more angles.
+    """
+    scan, energies = config.scan, config.scan.energies
+    if energies is None:
+        return (config,)
+    found = []
+    for n, energy in enumerate(energies):
+        words = ["scan.energies=null", override_of("scan.energy", energy)]
+        if isinstance(scan.angles, RandomAngles):
+            words.append(override_of("scan.angles.seed", scan.angles.seed + n))
+        elif isinstance(scan.angles, FixedAngles | InterlacedAngles | GoldenAngles):
+            step = scan.angles.span_deg / scan.angles.views
+            words.append(override_of("scan.angles.start_deg", scan.angles.start_deg + n / len(energies) * step))
+        found.append(changed(config, words))
+    return tuple(found)
 
 
 def override_of(key: str, value: object) -> str:
@@ -124,6 +152,7 @@ def plan_of(config: Config) -> ScanPlan:
         warm_up=scan.warm_up_s,
         return_views=scan.return_views,
         filter=scan.filter,
+        energy=scan.energy,
         darks=_field(scan.darks, scan.exposure_s),
         flats=_field(scan.flats, scan.exposure_s),
         scheme=scan.angles.scheme,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
 from beamline.config.devices import DeviceSection
 from beamline.config.monitor import MonitorSection
+from beamline.config.monochromator import Kev, NoMonochromator
 from beamline.config.references import ReferencesSection
 from beamline.config.section import Section
 from beamline.core.files import RUNS
@@ -116,6 +118,10 @@ class ScanSection(Section):
     """Light on the scintillator before frames with light, each time the shutter opens; it glows brighter when warm."""
     filter: str | None = None
     """Name of one of the places of devices.filter, where it is before the first frame; null: as it stands."""
+    energy: Kev | None = None
+    """keV to which devices.monochromator goes before the first frame; null: as it stands."""
+    energies: Annotated[tuple[Kev, ...], Field(min_length=2, max_length=1000)] | None = None
+    """keV of a series: a scan at each, one after the other; each begins a fraction of a step later in angle."""
     return_views: Annotated[int, Field(ge=0, le=100)] = 0
     """Views that are taken a second time on the way back, evenly spread: they tell whether the sample has moved."""
     without_watchdog: Literal["warn", "pause"] = "warn"
@@ -225,6 +231,27 @@ class Config(Section):
         if named is not None and named not in there:
             legal = f"devices.filter has {', '.join(there)}" if there else "devices.filter has none"
             raise ValueError(f"scan.filter {named!r} is no place of the filter; {legal}")
+        return self
+
+    @model_validator(mode="after")
+    def _energy_can_be_set(self) -> Self:
+        device, one, several = self.devices.monochromator, self.scan.energy, self.scan.energies
+        if one is not None and several is not None:
+            raise ValueError("scan.energy and scan.energies exclude each other; give one of them")
+        if one is None and several is None:
+            return self
+        name, energies = ("scan.energies", several) if several else ("scan.energy", (one or 0.0,))
+        if isinstance(device, NoMonochromator):
+            raise ValueError(f"{name} needs a monochromator, and devices.monochromator.kind is none")
+        if len(set(energies)) < len(energies):
+            raise ValueError("scan.energies has an energy twice; give each once")
+        if several and self.recon.stop_when is not None:
+            raise ValueError("recon.stop_when ends one scan, and scan.energies asks for several; set it to null")
+        low, high = device.range_kev or (0.0, math.inf)
+        if beyond := [energy for energy in energies if not low <= energy <= high]:
+            raise ValueError(
+                f"{name}: {beyond[0]:.7g} keV is not within devices.monochromator.range_kev {low:g} ... {high:g}"
+            )
         return self
 
     @property

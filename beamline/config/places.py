@@ -98,6 +98,12 @@ class NamedFilter(Section):
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Field(min_length=1)]
 
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        if twice := [name for name in dict.fromkeys(self.places) if self.places.count(name) > 1]:
+            raise ValueError(f"places has {', '.join(twice)} more than once; a place has one name")
+        return self
+
 
 class MotorFilter(MotorSection):
     """Filters on a motor."""

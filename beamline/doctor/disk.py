@@ -68,7 +68,7 @@ def needs(worked: DryRun, most_ring: int) -> ScanNeeds:
         stretches=tuple((block.n * per_row, block.n * block.period) for block in timeline.blocks),
         waiting_bytes=waiting_room(timeline) * timeline.frame_bytes,
         ring_bytes=max(2, min(slots, most_ring // timeline.frame_bytes)) * timeline.frame_bytes if most_ring else 0,
-        file_bytes=math.ceil(timeline.total_bytes * MARGIN),
+        file_bytes=math.ceil((sum(n for _, _, n in worked.series) or timeline.total_bytes) * MARGIN),
     )
 
 

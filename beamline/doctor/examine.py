@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 from beamline.config.devices import BeamMonitorConfig, DcamOrca, ElectrometerConfig, NoBeamMonitor
 from beamline.config.load import Config
 from beamline.config.models import StorageSection
+from beamline.config.monochromator import EpicsMonochromator, MonochromatorConfig
 from beamline.config.places import EpicsFilter, FilterConfig, MotorFilter
 from beamline.core.machine import free_memory
 from beamline.core.text import size
@@ -56,6 +58,7 @@ def examine(config: Config | None, clock: Clock, *, session: bool = False, usb: 
         yield port("stage port", config.devices.stage.port, found)
         yield from _monitor(config.devices.beam_monitor, found, clock)
         yield from _filter(config.devices.filter, found, clock)
+        yield from _monochromator(config.devices.monochromator, clock)
     folder = Path((StorageSection() if config is None else config.storage).folder)
     yield disk.room(folder, need)
     yield disk.speed(folder, need, clock)
@@ -120,6 +123,26 @@ def _filter(config: FilterConfig, found: Sequence[SerialPort], clock: Clock) -> 
         yield Diagnosis(name, Grade.WARNING, "It stands at no place that has a name.", expected, advice)
     else:
         yield Diagnosis(name, Grade.OK, f"{place}.", expected, values={"place": place})
+
+
+def _monochromator(config: MonochromatorConfig, clock: Clock) -> Iterator[Diagnosis]:
+    """A monochromator behind process variables: the energy at which it stands."""
+    name, expected = "monochromator", "an energy"
+    if not isinstance(config, EpicsMonochromator):
+        return
+    try:
+        with closing(config.connect(clock)) as connected:
+            energy = connected.energy()
+    except DeviceError as error:
+        yield of_error(name, error, expected)
+        return
+    low, high = config.range_kev or (0.0, math.inf)
+    if low < energy < high:
+        yield Diagnosis(name, Grade.OK, f"{energy:.7g} keV.", expected, values={"energy_kev": energy})
+    else:
+        advice = "Compare devices.monochromator.unit and range_kev with what status_pv shows"
+        found = f"It stands at {energy:.7g} keV."
+        yield Diagnosis(name, Grade.WARNING, found, f"{expected} above {low:g} keV, up to {high:g} keV", advice)
 
 
 def memory(free: int | None, needs: ScanNeeds | None) -> Diagnosis:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Self
 
 from beamline.config.devices import DcamOrca, EpicsShutter, NoBeamMonitor, SimulatedOrca, StageOutputShutter
 from beamline.config.load import Config
+from beamline.config.monochromator import EpicsMonochromator, NoMonochromator
 from beamline.config.places import EpicsFilter, MotorFilter, NoFilter, StageMover
 from beamline.core.errors import ConfigError
 from beamline.instrument.devices import make_beam_monitor, make_camera, wait_until_cold
@@ -26,6 +27,7 @@ from drivers.base.protocols import (
     CameraTiming,
     Devices,
     Filter,
+    Monochromator,
     RotationStage,
     Shutter,
     StageLimits,
@@ -34,7 +36,7 @@ from drivers.base.protocols import (
 )
 from drivers.epics.devices import PvShutter
 from drivers.frame_memory import FrameMemory
-from drivers.manual import Ask, ManualFilter, ManualSampleMover, ManualShutter
+from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
 from drivers.shutter import OutputShutter
 from drivers.stages.travel import Travel
 
@@ -52,7 +54,7 @@ class ConnectedDevices:
         close: frees ports and camera; a second time does nothing.
         beam_monitor: None if none is configured.
         frame_memory: of the camera's frames; None for a simulated camera.
-        watch_moves: takes what is called again and again while sample or filter moves; its exception ends the wait.
+        watch_moves: takes what is called again and again while sample, filter or energy moves; its exception ends that.
     """
 
     devices: Devices
@@ -97,7 +99,8 @@ def connect(
                 mover = chosen.connect(clock)
                 opened.callback(mover.close)
                 devices = replace(devices, sample=mover)
-            devices = replace(devices, filter=_filter(config, clock, ask or ask_operator, opened))
+            by = clock, ask or ask_operator, opened
+            devices = replace(devices, filter=_filter(config, *by), monochromator=_monochromator(config, *by))
         else:
             clock, memory = clock or clock_of(config.simulation.clock), None
             devices, simulated = simulated_devices(config, config.simulation, clock, opened)
@@ -107,7 +110,7 @@ def connect(
             opened.callback(monitor.close)
 
         def watch(check: Callable[[], None]) -> None:
-            for device in (devices.sample, devices.filter):
+            for device in (devices.sample, devices.filter, devices.monochromator):
                 if isinstance(device, Watchable):
                     device.watch(check)
 
@@ -139,7 +142,7 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     """
     limits = config.devices.stage.settings.limits()
     if config.simulation is not None:
-        scene_of(config)
+        scene_of(config, config.scan.energy)
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     try:
         timing = config.devices.camera.timing_of(settings)
@@ -183,6 +186,17 @@ def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter
         return None
     if not isinstance(wanted, MotorFilter | EpicsFilter):
         return ManualFilter(ask)
+    found = wanted.connect(clock)
+    opened.callback(found.close)
+    return found
+
+
+def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Monochromator | None:
+    wanted = config.devices.monochromator
+    if isinstance(wanted, NoMonochromator):
+        return None
+    if not isinstance(wanted, EpicsMonochromator):
+        return ManualMonochromator(ask)
     found = wanted.connect(clock)
     opened.callback(found.close)
     return found

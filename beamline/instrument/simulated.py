@@ -15,12 +15,13 @@ from uuid import uuid4
 from beamline.config.devices import SimulatedOrca, StageOutputShutter
 from beamline.config.load import Config, config_folder, scene_mapping
 from beamline.config.models import SimulationSection, Speed
+from beamline.config.monochromator import SceneMonochromator
 from beamline.config.places import MotorFilter, NoFilter, StageMover
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from drivers import orca_quest
 from drivers.base.clock import Clock, SystemClock
-from drivers.base.protocols import Devices, Filter, SampleMover, Shutter
+from drivers.base.protocols import Devices, Filter, Monochromator, SampleMover, Shutter
 from drivers.manual import ManualFilter
 from drivers.shutter import OutputShutter
 
@@ -60,6 +61,7 @@ def simulated_devices(
         ConfigError: the scene is wrong, or the simulated controller lacks what the configuration uses.
     """
     from simulators.devices.camera import SimulatedOrcaQuest
+    from simulators.devices.monochromator import SimulatedMonochromator
     from simulators.devices.shutter import MovedSample, SimulatedSampleMover, SimulatedShutter, WiredShutter
     from simulators.devices.trigger_line import TriggerLine
     from simulators.wires.registry import WIRES
@@ -99,8 +101,13 @@ def simulated_devices(
     model = config.devices.camera.model if isinstance(config.devices.camera, SimulatedOrca) else orca_quest.MODEL
     camera = SimulatedOrcaQuest(scene, line, clock, simulation.seed, blade, inside, pixel_pitch=pitch, model=model)
     opened.callback(camera.close)
-    known = SimulatedScene(_truth(scene, camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
-    return Devices(stage, camera, shutter, sample, changer), known
+    energy: Monochromator | None = None
+    if isinstance(crystal := config.devices.monochromator, SceneMonochromator):
+        energy = SimulatedMonochromator(
+            scene.beam.energy_kev, lambda kev: scene_of(config, kev), camera.show, clock, crystal.settle_s
+        )
+    known = SimulatedScene(_truth(camera), _cone(scene), camera.labels_at, lambda: _rehearse(camera))
+    return Devices(stage, camera, shutter, sample, changer, energy), known
 
 
 def _wire(stage: StageSection, clock: Clock, axis: TriggerLine) -> str:
@@ -112,8 +119,15 @@ def _wire(stage: StageSection, clock: Clock, axis: TriggerLine) -> str:
     return register(f"{stage.kind}-{uuid4().hex}", controller)
 
 
-def scene_of(config: Config) -> Scene:
-    """The simulated scene. Raises ConfigError: it is wrong; DataError: a volume that it names cannot be read."""
+def scene_of(config: Config, energy: float | None = None) -> Scene:
+    """The simulated scene.
+
+    Args:
+        energy: keV to which a monochromator sets its beam; None: as the scene says.
+
+    Raises:
+        ConfigError: it is wrong, or its beam has no single energy. DataError: a volume that it names cannot be read.
+    """
     from beamline.simulate.scene_file import volumes_beside
     from simulators.frame.mapping import SceneError
     from simulators.scenes.scene import load_scene
@@ -121,8 +135,16 @@ def scene_of(config: Config) -> Scene:
     said = config.simulation.scene if config.simulation else {}
     # Paths in a scene that stands in the configuration itself are full ones by now.
     folder = config_folder() if isinstance(said, dict) else (config_folder() / said).parent
+    mapping = scene_mapping(config)
+    if energy is not None and isinstance(beam := mapping.get("beam"), dict):
+        if wide := [name for name in ("spectrum", "tube") if beam.get(name) is not None]:
+            raise ConfigError(
+                f"simulation.scene.beam has a {wide[0]}, and a monochromator gives one energy: name energy_kev there "
+                "instead. Nothing was started."
+            )
+        mapping = mapping | {"beam": beam | {"energy_kev": energy}}
     try:
-        scene = load_scene(scene_mapping(config), volumes_beside(folder))
+        scene = load_scene(mapping, volumes_beside(folder))
     except SceneError as error:
         raise ConfigError(f"simulation.scene: {error}. Nothing was started.") from None
     if _cone(scene) is not None:
@@ -171,7 +193,7 @@ def clock_of(kind: str | Speed, not_before: float = 0.0) -> Clock:
     return VirtualClock(max(VIRTUAL_START, not_before)) if kind == "virtual" else SystemClock()
 
 
-def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
+def _truth(camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]:
     from recon.base.volume import Volume
 
     def truth(grid: Grid) -> Volume:
@@ -179,7 +201,7 @@ def _truth(scene: Scene, camera: SimulatedOrcaQuest) -> Callable[[Grid], Volume]
         detector = camera.detector
         up = ((detector.shape[0] - 1) / 2 - detector.axis_row) * detector.pitch
         z, y, x = grid.centre
-        return Volume(scene.sample.attenuation(replace(grid, centre=(z + up, y, x))), grid)
+        return Volume(camera.scene.sample.attenuation(replace(grid, centre=(z + up, y, x))), grid)
 
     return truth
 

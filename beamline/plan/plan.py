@@ -54,6 +54,7 @@ class ScanPlan:
             all that are planned, before and after the views.
         return_views: views that are taken a second time on the way back, evenly spread; alignment frames.
         filter: the place of the filter for all frames; None: as it stands.
+        energy: keV of the monochromator for all frames; None: as it stands.
     """
 
     angles: NDArray[np.float64]
@@ -70,6 +71,7 @@ class ScanPlan:
     warm_up: float = 0.0
     return_views: int = 0
     filter: str | None = None
+    energy: float | None = None
 
     @property
     def retakes(self) -> int:
@@ -131,7 +133,7 @@ class Timeline:
         violations: every limit that is broken, each one sentence with values and what to do.
         remarks: facts for the operator that break no limit.
         retake_seconds: for the most views that may be taken again.
-        warm_up, filter: as of the plan.
+        warm_up, filter, energy: as of the plan.
     """
 
     blocks: tuple[Block, ...]
@@ -147,6 +149,7 @@ class Timeline:
     retake_seconds: float = 0.0
     warm_up: float = 0.0
     filter: str | None = None
+    energy: float | None = None
 
     @property
     def n_frames(self) -> int:

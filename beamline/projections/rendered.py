@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
+from beamline.projections.steps.width import TURNED
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
@@ -39,6 +41,7 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             axis, pitch = (float(file[f"{PARAMETERS}/{name}"][()]) for name in ("axis_col", "pixel_pitch"))
             taken_off = file.get(f"{PARAMETERS}/background_terms")
             terms = None if taken_off is None else taken_off[()]
+            turned = math.radians(file[PARAMETERS][TURNED][()] if TURNED in file[PARAMETERS] else 0.0)
             beyond = [what for name, what in _NOT_RENDERED.items() if f"{PARAMETERS}/{name}" in file]
         except KeyError as error:
             raise DataError(
@@ -69,7 +72,7 @@ def rendered(path: Path, source: ScanSource) -> Callable[[float, int], NDArray[n
             raise DataError(
                 f"{path} is binned by {binning}, which does not divide the monitor's cells of {cell} pixels."
             )
-        geometry = Geometry.parallel([angle], source.shape, pixel, axis).binned(binning)
+        geometry = Geometry.parallel([angle + turned], source.shape, pixel_pitch=pixel, axis_col=axis).binned(binning)
         image = project(volume, geometry)[0]
         if terms is not None:
             image += surface(terms, source.shape, binning)

@@ -131,8 +131,10 @@ def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angle
             )
         # The central ray meets the middle of the detector, whatever rows are read.
         axis_row = (source.shape[0] - 1) / 2 - rows.start
-        return Geometry.cone(angles, full, pitch, *cone, axis_col, axis_row=axis_row).binned(selection.binning)
-    return Geometry.parallel(angles, full, 1.0 if pitch is None else pitch, axis_col).binned(selection.binning)
+        return Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row).binned(selection.binning)
+    return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
+        selection.binning
+    )
 
 
 def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | None:

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,10 @@ from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.spectral import TRIAL_SWEEPS, EnergyViews, Materials, fit_materials
+from recon.energy_fit import EnergyViews
+from recon.registration import register_energies
+from recon.spectral import TRIAL_SWEEPS, Materials, fit_materials
+from recon.voxels.displacement import Displacement
 
 _SWEEPS = 20
 _COPIES = 8  # of all line integrals: of the scans, joined, as lines and of a subset; with a weight each
@@ -106,11 +110,13 @@ class MaterialRun:
         outputs: the volume file of each material, by name.
         residual: what the volumes leave of the views, over the norm of the views.
         early: the fit was stopped, and the volumes are those reached.
+        moves: where the sample stood in each scan, mm; empty where it was not looked for.
     """
 
     outputs: dict[str, Path]
     residual: float
     early: bool
+    moves: tuple[Displacement, ...] = ()
 
 
 def reconstruct_materials(
@@ -121,11 +127,15 @@ def reconstruct_materials(
     clock: Clock,
     counting: Callable[[str], Callable[[int, int], None]],
     stop: StopOnSignal,
+    register: bool = False,
 ) -> MaterialRun:
     """Fit the volume fraction of each material to all scans, and write OUTPUT's stem + _NAME.h5 for each of them.
 
     The rotation axis of the first scan is used for the others, unless it is told. Ctrl-C ends the fit with the volumes
     so far.
+
+    Args:
+        register: find where the sample stood in each scan, and correct it.
 
     Raises:
         ConfigError: scans that do not fit together, energies that are missing or do not tell the materials apart, or
@@ -158,7 +168,13 @@ def reconstruct_materials(
         axis_col = parts[0].axis_col
         progress(n, len(scans))
     views = _joined(parts, np.array(attenuation))
-    grid = Grid.matching(views.geometry)
+    moves: tuple[Displacement, ...] = ()
+    if register:
+        try:
+            views, moves = register_energies(views, counting("registration"))
+        except ValueError as error:
+            raise ConfigError(f"--register: {error}. Nothing was written.") from error
+    grid = Grid.matching(parts[0].geometry)
     early, tried = False, 0
 
     def go_on(sweep: int, residual: float) -> bool:
@@ -175,11 +191,15 @@ def reconstruct_materials(
     stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps")
     try:
         with stop() as stopping:
-            made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on)
+            made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on, stop=stopping)
+            early = early or stopping()
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
-    _write(made, parts[0], scans, outputs, early, clock.now())
-    return MaterialRun(outputs, made.residual, early)
+    facts: dict[str, Any] = {"ended_early": True} if early else {}
+    if moves:
+        facts |= {"displacements": np.array([(move.x, move.y, move.z, move.turn) for move in moves])}
+    _write(made, parts[0], scans, outputs, facts, clock.now())
+    return MaterialRun(outputs, made.residual, early, moves)
 
 
 def _joined(parts: Sequence[PreparedProjections], attenuation: NDArray[np.float64]) -> EnergyViews:
@@ -252,7 +272,7 @@ def _write(
     first: PreparedProjections,
     scans: Sequence[tuple[SourceOptions, Selection]],
     outputs: dict[str, Path],
-    early: bool,
+    facts: dict[str, Any],
     time: float,
 ) -> None:
     """All files, or none of them."""
@@ -271,7 +291,7 @@ def _write(
                 parameters={
                     "method": "materials",
                     "scans": ", ".join(paths),
-                    **({"ended_early": True} if early else {}),
+                    **facts,
                     "material": name,
                     "axis_col": first.axis_col,
                     "weights": made.weights,

@@ -120,6 +120,10 @@ class Acquisition:
         if filter_ is not None and place is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"The filter goes to {place}"))
             filter_.put(place)
+        energy, monochromator = self._timeline.energy, self._devices.monochromator
+        if monochromator is not None and energy is not None and not self._stop.stopping:
+            self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
+            monochromator.move_to(energy)
         for block in self._timeline.blocks:
             if self._stop.aborting:
                 raise ScanAborted(f"Aborted: {self._stop.reason}.")

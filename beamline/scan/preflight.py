@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,19 +13,21 @@ from typing import Any
 import numpy as np
 
 from beamline.config.devices import NoBeamMonitor
-from beamline.config.load import Config, plan_of, resolved_yaml
+from beamline.config.load import Config, at_energies, plan_of, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.machine import free_memory
+from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices, camera_settings
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
+from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
+from beamline.plan.timeline import clock, work_out
 from beamline.plan.timeline import describe as describe_timeline
-from beamline.plan.timeline import work_out
 from beamline.scan.live_process import live_need
 from beamline.storage.writers.nxtomo import ScanInfo
 from drivers.base.protocols import CameraSettings, CameraTiming, StageLimits, TriggerSource
@@ -42,17 +44,29 @@ def all_of(plan: ScanPlan) -> ScanPlan:
 
 @dataclass(frozen=True, eq=False)
 class DryRun:
-    """A scan worked out without devices: plan, timeline, limits of stage and camera, free bytes on the disk."""
+    """A scan worked out without devices: plan, timeline, limits of stage and camera, free bytes on the disk.
+
+    Of a series of energies it is the first scan; `series` has the energy (keV), s and bytes of each.
+    """
 
     plan: ScanPlan
     timeline: Timeline
     stage: StageLimits
     camera: CameraTiming
     free_bytes: int
+    series: tuple[tuple[float, float, int], ...] = ()
 
     def lines(self) -> list[str]:
         """Lines of text; the violations come last."""
-        return describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
+        lines = describe_timeline(self.plan, self.timeline, self.stage, self.camera, free_bytes=self.free_bytes)
+        if self.series:
+            energies, seconds, n_bytes = zip(*self.series, strict=True)
+            said = (
+                f"{len(energies)}, {energies[0]:.7g} to {energies[-1]:.7g} keV, a scan like this of each: "
+                f"{clock(sum(seconds))} and {size(sum(n_bytes))} in all (without the monochromator's moves)"
+            )
+            lines.insert(len(lines) - len(self.timeline.violations), f"{'energies':<10}{said}")
+        return lines
 
     def data(self) -> Mapping[str, Any]:
         """For a program: the numbers behind the lines, in s, rad, bytes and pixels."""
@@ -70,6 +84,7 @@ class DryRun:
             "blur_px": worked.blur_px,
             "skew_px": worked.skew_px,
             "min_period": self.camera.min_period,
+            "energies": [dict(zip(("kev", "duration", "total_bytes"), one, strict=True)) for one in self.series],
             "blocks": [
                 {"kind": b.kind.name.lower(), "mode": b.mode, "first_row": row, "n": b.left}
                 for b, row in zip(worked.blocks, worked.first_rows, strict=True)
@@ -88,10 +103,28 @@ def dry_run(settings: Config, runs: Path | None = None, remaining: Remaining = a
         ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
             here: they are the timeline's violations.
     """
-    plan = remaining(plan_of(settings))
-    stage, camera, to_counts = connect.describe(settings)
+    each = at_energies(settings)
+    if len(each) > 1:  # a scene is read at both ends of the range
+        connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
+    stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
     free = shutil.disk_usage(disk_of(runs or Path(settings.storage.folder))).free
-    return DryRun(plan, _worked(settings, plan, stage, to_counts, camera, free), stage, camera, free)
+    plans = [remaining(plan_of(one)) for one in each]
+    worked = [
+        DryRun(plan, _worked(one, plan, stage, to_counts, camera, free), stage, camera, free)
+        for one, plan in zip(each, plans, strict=True)
+    ]
+    return worked[0] if settings.scan.energies is None else _series(worked)
+
+
+def _series(each: Sequence[DryRun]) -> DryRun:
+    """The first of several scans, with the violations of all of them."""
+    series = tuple((one.plan.energy or 0.0, one.timeline.duration, one.timeline.total_bytes) for one in each)
+    first, needed = each[0], sum(n_bytes for _, _, n_bytes in series)
+    violations = dict.fromkeys(said for one in each for said in one.timeline.violations)
+    if needed * ROOM > first.free_bytes:
+        said = f"{len(each)} energies need {size(needed)} and a tenth more, the disk has {size(first.free_bytes)} free"
+        violations[said] = None
+    return replace(first, timeline=replace(first.timeline, violations=tuple(violations)), series=series)
 
 
 def _worked(
@@ -206,22 +239,26 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         period=timeline.views.period,
         plan=json.dumps(asked),
         filter=plan.filter or known.filter,
+        energy_kev=plan.energy or known.energy_kev,
+        monochromator_kev=plan.energy or known.monochromator_kev,
     )
 
 
 def scan_info(config: Config, instrument: ConnectedDevices) -> ScanInfo:
-    """Facts for the file that need no plan; the filter is where it stands. DeviceError: a device does not answer."""
+    """Facts for the file that need no plan; filter and energy as they stand. DeviceError: a device does not answer."""
     optics, devices, monitor = config.optics, instrument.devices, config.devices.beam_monitor
     pixel_size, source_distance, distance = optics.pixel_size_um * 1e-3, None, optics.distance_mm
     if instrument.simulated is not None and instrument.simulated.cone is not None:
         # The scene's cone beam in the terms of NXtomo, whose pixel size is that on the detector.
         source_distance, sdd = instrument.simulated.cone
         pixel_size, distance = pixel_size * sdd / source_distance, sdd - source_distance
+    energy = None if devices.monochromator is None else devices.monochromator.energy()
     return ScanInfo(
         sample=config.sample.name,
         title=config.sample.description,
         pixel_size_mm=pixel_size * config.devices.camera.binning,
-        energy_kev=optics.energy_kev,
+        energy_kev=energy or optics.energy_kev,
+        monochromator_kev=energy,
         distance_mm=distance,
         source_distance_mm=source_distance,
         axis_col=optics.axis_col,

@@ -105,6 +105,14 @@ class NotJoined(ConfigError):  # noqa: N818 - an outcome, not a defect
     """A run lacks no frame, but a file was not closed, or its parts are not joined: `recover_run` does both."""
 
 
+class NothingMissing(ConfigError):  # noqa: N818 - likewise
+    """A run lacks nothing."""
+
+
+class NoFrame(ConfigError):  # noqa: N818 - likewise
+    """A run holds no frame."""
+
+
 @contextmanager
 def open_for_resume(run: Path, given: Config | None = None) -> Iterator[ResumableRun]:
     """The run in this folder, held while the context lasts, so that no other process goes on with it.
@@ -113,8 +121,8 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         given: a configuration that must be the run's.
 
     Raises:
-        ConfigError: it is no run, it goes on already, its configuration differs, or nothing is missing; NotJoined where
-            `recover_run` is all that it lacks.
+        ConfigError: it is no run, it goes on already, or its configuration differs. NothingMissing, NoFrame, and
+            NotJoined where `recover_run` is all that it lacks.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if not (run / SCAN).is_file() or not (run / CONFIG).is_file():
@@ -155,7 +163,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
                 views |= views_in(file)
                 last_frame_time = max(last_frame_time, float(file[layout.TIME][()].max()))
     if not parts:
-        raise ConfigError(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
+        raise NoFrame(f"{run} holds no frame: run the scan anew. {_UNTOUCHED}")
     end_references = None
     if len(views) >= planned:
         with ExitStack() as opened:
@@ -165,7 +173,7 @@ def _series(run: Path, given: Config | None) -> ResumableRun:
             if not closed or (len(parts) > 1 and not is_joined(run / JOINED)):
                 what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
                 raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
-            raise ConfigError(f"{whole}: nothing is missing. {_UNTOUCHED}")
+            raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
     return ResumableRun(
         run, config, tuple(parts), frozenset(views), planned, last_frame_time, tuple(left_out), end_references
     )

@@ -13,6 +13,7 @@ from typing import Any
 from beamline.config.load import Config, resolved_yaml
 from beamline.config.monitor import policies
 from beamline.core.errors import (
+    ConfigError,
     DataError,
     ReferencesError,
     ScanStopped,
@@ -129,6 +130,10 @@ def run_scan(
         DataError: frames are missing (LedgerError), or the disk failed. In all these cases what was acquired is in
             the file; the event `scan_done` says how much, and `failed` why.
     """
+    if config.scan.energies is not None:
+        raise ConfigError(
+            "scan.energies asks for several scans, and this runs one: set scan.energy. Nothing was started."
+        )
     began = time.monotonic()
     stop = stop or StopRequest()
     series = runs if isinstance(runs, ResumableRun) else None
@@ -143,7 +148,7 @@ def run_scan(
         instrument.watch_moves(stop.refuse_abort)
         ready = preflight(config, instrument, place, series.remaining if series else all_of)
         _refuse_stop(stop)
-        folder = series.begin(ready) if series else create_run_folder(place, config.sample.name, SystemClock().now())
+        folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
             try:
                 (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
@@ -163,6 +168,12 @@ def run_scan(
                 )
             guarded.callback(connected.close)
             return run.go(live, afterwards, release=guarded.close)
+
+
+def _named(config: Config) -> str:
+    """The end of a run folder's name."""
+    energy = config.scan.energy
+    return config.sample.name if energy is None else f"{config.sample.name}_{energy:.7g}keV"
 
 
 def _refuse_stop(stop: StopRequest) -> None:

@@ -26,6 +26,7 @@ import psutil
 
 from beamline.config.devices import EpicsShutter, Simple
 from beamline.config.load import Config, load
+from beamline.config.monochromator import EpicsMonochromator
 from beamline.config.places import MotorSection
 from beamline.core.events import Sink, Warned
 from beamline.core.process import ChildProcess
@@ -159,6 +160,8 @@ def make_safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
         if isinstance(device, MotorSection):
             halt = partial(device.stage.halt, clock)
             done.append(_insist(halt, clock, say, f"The {name} was told to stop."))
+    if isinstance(turned := config.devices.monochromator, EpicsMonochromator) and turned.stop_pv is not None:
+        done.append(_insist(partial(turned.halt, clock), clock, say, "The monochromator was told to stop."))
     done.append(_insist(disarm, clock, say, f"The stage stands, its trigger output is disarmed, {closed}."))
     return all(done)
 

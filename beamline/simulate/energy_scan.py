@@ -93,7 +93,12 @@ class EnergyScan:
 
 
 def open_energy_scan(
-    name: str, energies: Reals, material: str | None = None, angle: float = 0.0, seed: int = 0
+    name: str,
+    energies: Reals,
+    material: str | None = None,
+    angle: float = 0.0,
+    seed: int = 0,
+    charge: float | None = None,
 ) -> EnergyScan:
     """A scene, prepared for `energies` (keV).
 
@@ -102,6 +107,7 @@ def open_energy_scan(
         material: whose contrast is measured; None: the one with a state of charge.
         angle: of the stage, radians.
         seed: of all random numbers.
+        charge: the state of charge, 0 to 1, that the material has instead of its own; None: its own.
 
     Raises:
         ConfigError: there is no such scene, its sample is grey, or the material is not visible.
@@ -123,12 +129,13 @@ def open_energy_scan(
         )
     beam = Beam(own.photons_per_s, own.sod, own.sdd, float(energies.mean()), own.bandwidth, own.harmonics)
     chosen = _chosen(scene.sample, material)
-    scan = Scan.of(scene, seed)
     try:
-        regions = _regions(scene.sample, chosen, scan, angle)
+        sample = scene.sample if charge is None else _charged(scene.sample, chosen, charge)
+        scan = Scan.of(replace(scene, sample=sample), seed)
+        regions = _regions(sample, chosen, scan, angle)
     except ValueError as error:
         raise ConfigError(f"{opened.path}: {chosen} cannot be compared: {error}. Nothing was simulated.") from None
-    energy_scan = EnergyScan(opened.path.stem, scan, scene.sample, beam, energies, angle, chosen, regions)
+    energy_scan = EnergyScan(opened.path.stem, scan, sample, beam, energies, angle, chosen, regions)
     try:
         for end in (float(energies.min()), float(energies.max())):
             sample = energy_scan._at(end).sample  # with bandwidth and harmonics, which may be outside the tables
@@ -153,6 +160,17 @@ def _chosen(sample: Mixture, wanted: str | None) -> str:
     if wanted not in present:
         raise ConfigError(f"The scene has no material {wanted!r}; it has {', '.join(present)}. Nothing was simulated.")
     return wanted
+
+
+def _charged(sample: Mixture, name: str, charge: float) -> Mixture:
+    """The same with another state of charge of a material. ValueError: it has none."""
+    found = [
+        replace(each, material=replace(each.material, state_of_charge=charge))
+        if each.material is not None and each.material.name == name
+        else each
+        for each in sample.constituents
+    ]
+    return replace(sample, constituents=tuple(found))
 
 
 def _regions(sample: Mixture, material: str, scan: Scan, angle: float) -> ContrastRegions:

@@ -39,8 +39,10 @@ def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
     """The simulated rays as a reconstruction's geometry; a cone's detector is placed at the sample."""
     if np.isfinite(detector.sod):
         at, row = detector.sod, detector.axis_row
-        return Geometry.cone(angles, detector.shape, detector.pitch, at, at, detector.axis_col, axis_row=row)
-    return Geometry.parallel(angles, detector.shape, detector.pitch, detector.axis_col, axis_row=detector.axis_row)
+        return Geometry.cone(angles, detector.shape, detector.pitch, at, at, axis_col=detector.axis_col, axis_row=row)
+    return Geometry.parallel(
+        angles, detector.shape, pixel_pitch=detector.pitch, axis_col=detector.axis_col, axis_row=detector.axis_row
+    )
 
 
 def binning_of(detector: Detector) -> int:

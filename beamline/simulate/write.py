@@ -118,11 +118,12 @@ def _progress(n: int, total: int, seconds: float, shape: tuple[int, int], kind: 
 
 def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
     settings, beam = scene.scene.scan, scene.scene.beam
-    shot, effects = scan.frame(0).shot, {effect.name for effect in scene.scene.chain.effects}
+    chain = scene.scene.chain
+    shot, effects = scan.frame(0).shot, {effect.name for effect in chain.effects}
     plan = {
         "views": scan.views,
         "range_deg": settings.range_deg,
-        "fly": settings.fly and "motion_blur" in effects,
+        "fly": settings.fly and chain.moves,
         "seed": scan.seed,
     }
     magnification = 1.0 if beam.sod is None or beam.sdd is None else beam.sdd / beam.sod

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import require_real
 from beamline.xafs.contrast import ContrastRegions, XafsCurve
 from beamline.xafs.radiographs import FramePart, Radiographs
+from beamline.xafs.scans import ScanRadiographs
 from beamline.xafs.series import Series
 
 Reals = NDArray[np.float64]
@@ -83,14 +84,19 @@ class FileOptions:
 
 
 @contextmanager
-def open_series(path: Path, options: FileOptions) -> Iterator[Series | XafsCurve]:
+def open_series(path: Path, options: FileOptions, scans: Sequence[Path] = ()) -> Iterator[Series | XafsCurve]:
     """The curve or the radiographs of a file, which is open within the context.
+
+    Args:
+        scans: of a series in the folder `path`; none: it is a file.
 
     Raises:
         ConfigError: a region is not in the frame, or has no surroundings.
         DataError: not such a file, see `open_measured`, or an energy occurs twice.
     """
-    with open_measured(path, options.unit, options.quantity) as source:
+    opened: AbstractContextManager[XafsCurve | Radiographs | ScanRadiographs]
+    opened = nullcontext(ScanRadiographs(scans)) if scans else open_measured(path, options.unit, options.quantity)
+    with opened as source:
         order = np.argsort(source.energies, kind="stable")
         kept = order[(source.energies[order] >= options.low) & (source.energies[order] <= options.high)]
         energies = source.energies[kept]

@@ -144,13 +144,18 @@ def refuse_existing_results(target: Path) -> None:
 
 
 def write(result: XafsResult, target: Path) -> None:
-    """The picture and the table beside it.
+    """The picture and the table beside it; errors as those of `write_both`."""
+    write_both(picture(result), table(result.curve), target)
+
+
+def write_both(drawn: bytes, text: str, target: Path) -> None:
+    """A picture, PNG, and the table beside it.
 
     Raises:
         DataError: one of them exists, or the disk refuses; then neither is there.
     """
     with ExitStack() as undo:
-        for path, content in ((target, picture(result)), (table_beside(target), table(result.curve).encode())):
+        for path, content in ((target, drawn), (table_beside(target), text.encode())):
             write_whole(path, content)
             undo.callback(path.unlink)
         undo.pop_all()

@@ -24,7 +24,7 @@ for frame in api.stream(path):  # waits for the next one while the scan runs
         continue
     if fit is None:
         references = recon.References(np.array(frames["DARK"]), ((0.0, np.array(frames["FLAT"])),))
-        fit = recon.StreamingFit(recon.Geometry.parallel([0.0], frame.counts.shape, PIXEL, AXIS))
+        fit = recon.StreamingFit(recon.Geometry.parallel([0.0], frame.counts.shape, pixel_pitch=PIXEL, axis_col=AXIS))
     line_integrals = recon.correct(frame.counts[None], [frame.index], references).data
     fit.add_views(line_integrals, [frame.angle])
     at = fit.advance(0.02)  # s; a fit that is too slow for the scan falls behind it and costs it nothing

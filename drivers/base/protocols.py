@@ -1,4 +1,4 @@
-"""Device Protocols: the interfaces of stage, camera, shutter, sample mover, filter and beam monitor, in rad and s."""
+"""Device Protocols: the interfaces of stage, camera, shutter and all that moves in the beam, in rad, s and keV."""
 
 from __future__ import annotations
 
@@ -236,9 +236,21 @@ class Filter(Protocol):
         """Where it stands; None: the place has no name, or is not known. Raises DeviceError."""
 
 
+class Monochromator(Protocol):
+    """Sets the photon energy of the beam, in keV."""
+
+    name: str
+
+    def move_to(self, energy: float) -> None:
+        """Bring it to an energy, and return when it has settled there. Raises DeviceError: it did not arrive."""
+
+    def energy(self) -> float | None:
+        """Where it stands; None: not known. Raises DeviceError."""
+
+
 @runtime_checkable
 class Watchable(Protocol):
-    """A device that moves while its caller waits, such as a sample mover or a filter on a motor."""
+    """A device that moves while its caller waits, such as a sample mover, a filter or a monochromator on a motor."""
 
     def watch(self, check: Callable[[], None]) -> None:
         """From now on `check` is called again and again while it moves; its exception ends the wait."""
@@ -273,3 +285,4 @@ class Devices:
     shutter: Shutter
     sample: SampleMover
     filter: Filter | None = None
+    monochromator: Monochromator | None = None

@@ -1,4 +1,4 @@
-"""Shutter, filter and beam monitor behind process variables."""
+"""Shutter, filter, monochromator and beam monitor behind process variables."""
 
 from __future__ import annotations
 
@@ -150,9 +150,101 @@ class PvFilter:
             )
 
     def _said(self) -> PvValue:
-        (status,) = self._status.read("")
-        refuse_invalid(self.name, self._status.name, status)
-        return status
+        return _valid(self._status, self.name)
+
+
+@dataclass(frozen=True)
+class MonochromatorPvs:
+    """The process variables of a monochromator, as pva://NAME or ca://NAME.
+
+    Attributes:
+        pv: takes the energy; a motor record's VAL, for instance.
+        status_pv: where the energy itself is read.
+        stop_pv: takes a 1 that stops it; None: it cannot be stopped.
+        per_kev: the number that they show at 1 keV; 1000 where they are in eV.
+        tolerance: keV by which the energy may differ from the one that was asked for.
+        settle: s for which it must stay there.
+        timeout: s, for each answer.
+        travel: s that the status may take to follow.
+    """
+
+    pv: str
+    status_pv: str
+    stop_pv: str | None = None
+    per_kev: float = 1.0
+    tolerance: float = 5e-4
+    settle: float = 1.0
+    timeout: float = 2.0
+    travel: float = 60.0
+
+
+class PvMonochromator:
+    """Implements `drivers.base.protocols.Monochromator`. A move ends when the status has been there for a while.
+
+    Raises:
+        DeviceRefused: an address of another kind. DeviceTimeout, DeviceError: the status does not answer.
+    """
+
+    def __init__(self, pvs: MonochromatorPvs, clock: Clock, name: str = "monochromator") -> None:
+        self.name = name
+        self._pvs, self._clock = pvs, clock
+        self._check: Callable[[], None] = lambda: None
+        with ExitStack() as opened:
+            self._setter, self._status = (_channel(url, name, pvs.timeout, opened) for url in (pvs.pv, pvs.status_pv))
+            self._stopper = None if pvs.stop_pv is None else _channel(pvs.stop_pv, name, pvs.timeout, opened)
+            _ = self.energy()
+            self.close: Callable[[], None] = opened.pop_all().close
+            """The monochromator stays where it is."""
+
+    def watch(self, check: Callable[[], None]) -> None:
+        """From now on `check` is called again and again on the way; its exception stops the move where that can be."""
+        self._check = check
+
+    def energy(self) -> float:
+        said = _valid(self._status, self.name)
+        try:
+            return float(said.value) / self._pvs.per_kev
+        except ValueError:
+            raise DeviceError(
+                self.name, f"{self._status.name} is no number", reply=str(said), expected="an energy"
+            ) from None
+
+    def move_to(self, energy: float) -> None:
+        pvs, clock = self._pvs, self._clock
+        wanted = energy * pvs.per_kev
+        self._setter.write("", wanted)
+        deadline = clock.now() + pvs.travel
+        try:
+            while _waited(lambda: self._is_at(energy), deadline - clock.now(), clock, self._check):
+                if not _waited(lambda: not self._is_at(energy), pvs.settle, clock, self._check):
+                    return
+        except DeviceError:
+            raise
+        except BaseException:
+            self.stop()
+            raise
+        raise DeviceTimeout(
+            self.name,
+            f"it did not come to {energy:.7g} keV and stay there within {pvs.travel:g} s",
+            request=f"{self._setter.name} = {wanted:.7g}",
+            reply=f"{self._status.name} is {_valid(self._status, self.name)}",
+            expected=f"{wanted:.7g}, within {pvs.tolerance * pvs.per_kev:g}",
+            advice="Look where it is, and whether this computer may write to it",
+        )
+
+    def stop(self) -> None:
+        """Stop it where it can be stopped. Raises DeviceError."""
+        if self._stopper is not None:
+            self._stopper.write("", 1)
+
+    def _is_at(self, energy: float) -> bool:
+        return abs(self.energy() - energy) <= self._pvs.tolerance
+
+
+def _valid(channel: ProcessVariable, device: str) -> PvValue:
+    (value,) = channel.read("")
+    refuse_invalid(device, channel.name, value)
+    return value
 
 
 def _channel(url: str, device: str, timeout: float, opened: ExitStack) -> ProcessVariable:
@@ -182,9 +274,7 @@ class PvSource:
         self._channel = open_channel(url, name, timeout)
 
     def text(self) -> str:
-        (value,) = self._channel.read("")
-        refuse_invalid(self._name, self._channel.name, value)
-        return value.text
+        return _valid(self._channel, self._name).text
 
     def close(self) -> None:
         self._channel.close()

@@ -84,9 +84,9 @@ class Geometry:
         cls,
         angles: ArrayLike,
         detector_shape: tuple[int, int],
+        *,
         pixel_pitch: float = 1.0,
         axis_col: float | None = None,
-        *,
         axis_row: float | None = None,
         shifts: ArrayLike | None = None,
         roll: ArrayLike = 0.0,
@@ -109,8 +109,8 @@ class Geometry:
         pixel_pitch: float,
         sod: float,
         sdd: float,
-        axis_col: float | None = None,
         *,
+        axis_col: float | None = None,
         axis_row: float | None = None,
         shifts: ArrayLike | None = None,
         roll: ArrayLike = 0.0,
@@ -135,8 +135,8 @@ class Geometry:
         pixel_pitch: float,
         sod: float,
         sdd: float,
-        axis_col: float | None = None,
         *,
+        axis_col: float | None = None,
         shifts: ArrayLike | None = None,
     ) -> Geometry:
         """Fan beam onto a flat line of `cols` pixels: a cone of one row, in the plane of the source.
@@ -148,7 +148,7 @@ class Geometry:
             ValueError: as `cone`.
         """
         moved = None if shifts is None else np.stack([np.asarray(shifts, np.float64), np.zeros(np.size(angles))], 1)
-        return cls.cone(angles, (1, cols), pixel_pitch, sod, sdd, axis_col, axis_row=0.0, shifts=moved)
+        return cls.cone(angles, (1, cols), pixel_pitch, sod, sdd, axis_col=axis_col, axis_row=0.0, shifts=moved)
 
     def __repr__(self) -> str:
         low, high = np.rad2deg((self.angles.min(), self.angles.max()))

@@ -90,10 +90,13 @@ class Grid:
         pixel = geometry.sample_pitch
         edge = min(max(wanted.voxel_size, pixel), _COARSEST * pixel)
         field = cls.of_field(geometry, edge)
-        nz, nx, _ = field.shape
-        # The corners of a cone's box must not reach the source.
-        across = max(nx, math.floor(min(_WIDER * nx, math.sqrt(2) * geometry.sod / edge - 1))) if wider else nx
-        return replace(field, shape=(nz, across, across))
+        return field.widened(_WIDER, geometry) if wider else field
+
+    def widened(self, by: float, geometry: Geometry) -> Grid:
+        """The box of a field, `by` times as wide, or up to where the corners of a cone's box reach the source."""
+        nz, nx, _ = self.shape
+        across = max(nx, math.floor(min(by * nx, math.sqrt(2) * geometry.sod / self.voxel_size - 1)))
+        return replace(self, shape=(nz, across, across))
 
     @property
     def spacing(self) -> tuple[float, float, float]:

@@ -18,13 +18,15 @@ from recon.base.kernel import Kernel
 from recon.base.masks import masked
 from recon.base.ray_model import RayModel
 from recon.base.volume import Grid, Volume
+from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import binned_geometry
 from recon.splatting.splat import project
 from recon.voxels.direct import direct
 from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
-from recon.voxels.projector import Projector
+from recon.voxels.projector import Projector, volume_lines
+from recon.voxels.tv import difference_weights
 from recon.voxels.view_weights import angular_weights, missing_arc
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
@@ -47,6 +49,7 @@ _WILD, _WILD_VIEWS = 10.0, 0.1
 _FARTHEST, _EMPTY = 0.95, 0.15
 
 _SCALED_BY = 12  # views
+_MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
 _SWEEP_WEIGHT = 0.004  # density units
 _SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
 
@@ -165,6 +168,22 @@ def first_volume(projections: NDArray[np.float32], geometry: Geometry, grid: Gri
     # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
     whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
     return Volume(direct(projections, geometry, grid, ramp) * whole, grid)
+
+
+def mean_change(projections: NDArray[np.float32], geometry: Geometry, grid: Grid) -> float:
+    """Total variation of matter a voxel, over the density unit, in the middle slices of a first volume.
+
+    0 where a direct method takes these views badly (too short a scan of a cone), or the slices hold no matter.
+    """
+    nz, ny, nx = grid.shape
+    first = max(0, nz // 2 - _MIDDLE)
+    slab = grid.part(slice(first, min(nz, first + 2 * _MIDDLE)), slice(0, ny), slice(0, nx))
+    if _swept(geometry, "fbp"):
+        return 0.0
+    volume = first_volume(projections, geometry, slab)
+    lines, unit = volume_lines(np.maximum(volume.data, 0)), density_unit(volume)
+    matter = np.count_nonzero(lines > MATTER * unit)
+    return float(total_variation(lines, difference_weights(slab)) / (matter * unit)) if matter else 0.0
 
 
 def sweeps_of_start(geometry: Geometry, start: Start) -> float:

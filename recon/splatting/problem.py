@@ -39,6 +39,7 @@ class FitProblem:
         half_field: mm.
         unit: 1/mm.
         noise: standard deviation of a pixel's noise, in units of `images`.
+        change: mean of matter from voxel to voxel, in `unit`, see `initialise.mean_change`; 0: not known.
         backend: the device's operations, and the owner of all these arrays.
     """
 
@@ -52,6 +53,7 @@ class FitProblem:
     noise: float
     loss: ProjectionLoss[Any]
     backend: Backend[Any]
+    change: float = 0.0
 
     @property
     def scale(self) -> np.float32:
@@ -164,10 +166,11 @@ def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) ->
         data = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)  # make_problem fills the others
     else:
         data = bin_views(data, factor)
-    return make_problem(
+    binned = make_problem(
         data, geometry, problem.grid, problem.unit, problem.backend,
         weights=weights, loss=loss, ssim_weight=ssim_weight,
     )  # fmt: skip
+    return replace(binned, change=problem.change)
 
 
 def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> FitProblem:

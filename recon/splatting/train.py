@@ -24,7 +24,7 @@ from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import arrays_of, state_from
-from recon.splatting.finish import finish
+from recon.splatting.finish import Asked, ask, finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.in_time import (
@@ -35,10 +35,10 @@ from recon.splatting.in_time import (
     first_draw_seconds,
     first_sweep_seconds,
 )
-from recon.splatting.initialise import default_count, leaves_the_field, place, sweeps_of_start
+from recon.splatting.initialise import default_count, leaves_the_field, mean_change, place, sweeps_of_start
 from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, binned_geometry, coarser
-from recon.splatting.schedule import Schedule
+from recon.splatting.schedule import ASKED_AT, Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.splatting.splat import voxelize
 from recon.voxels.projector import data_residual
@@ -117,7 +117,8 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     if blank.size:
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
     seen, known = geometry.select(used), None if weights is None else weights[used]
-    field_grid = Grid.for_fit(geometry, problem.grid, wider=leaves_the_field(data[used], seen))
+    wider = leaves_the_field(data[used], seen)
+    field_grid = Grid.for_fit(geometry, problem.grid, wider=wider)
     binned_geometry(seen, settings.coarse)  # refuses views that cannot be binned before any computation
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
@@ -127,6 +128,8 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         state = _resumed(control.resume, geometry.n_views, backend)
     n_start, unit = state.n, state.unit
     fine = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
+    if settings.tv_weight is None:
+        fine = replace(fine, change=decide("change", lambda: mean_change(data[used], seen, field_grid)))
     rough = fine
     if settings.coarse > 1:
         rough = coarser(fine, settings.coarse, settings.loss, settings.ssim_weight)
@@ -144,7 +147,17 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
     schedule = Schedule(method.planned_steps, seconds, by_content)
     schedule = Schedule.resumed(schedule, control.resume or {})
+    asks = by_content and method.finish is None and not (wider or method.early_stop or seen.is_cone)
+    fitted = replace(problem, projections=data[used], geometry=told.select(used), use=DataUse(known))
     history: list[Progress] = []
+
+    def of_model() -> tuple[Volume, Gaussians]:
+        model = turned_by_rows(fit.gaussians_of(state, backend), told, 1)
+        return Volume(voxelize(model, problem.grid, truncation=settings.truncation).numpy(), problem.grid), model
+
+    def asked() -> list[float] | None:
+        found = ask(*of_model(), fitted, settings, control)
+        return None if found is None else list(found)
 
     def report(at: float) -> None:
         history.append(
@@ -159,6 +172,9 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     fit_begin = reported = saved = now()
     done = 0
     while schedule.steps is None or state.step < schedule.steps:
+        if asks and state.step == ASKED_AT and schedule.asked is None:
+            answer = decide("fit", asked)
+            schedule.told(None if answer is None else Asked(bool(answer[0]), *answer[1:]), state.step)
         spent = now() - fit_begin
         if schedule.seconds is not None and spent >= schedule.seconds and done > 0:
             break
@@ -189,8 +205,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     last = state
     if tracker.kept:
         state = state_from(tracker.kept, backend)
-    model = turned_by_rows(fit.gaussians_of(state, backend), told, 1)
-    volume = Volume(voxelize(model, problem.grid, truncation=settings.truncation).numpy(), problem.grid)
+    volume, model = of_model()
     if not planned:  # the fit has ended before
         wanted, _, trials = decide("finish", lambda: _finish_in_time(method, seen, problem.grid, now, end - now(), 0.0))
     if wanted == 0 or now() >= end or (control.should_stop is not None and control.should_stop()):
@@ -199,8 +214,9 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         if method.seconds is not None:
             control = replace(control, should_stop=_until(control, end))
         control = replace(control, stop_trials=None if trials else lambda: True)
-        fitted = replace(problem, projections=data[used], geometry=told.select(used), use=DataUse(known))
-        finished, sweeps = finish(volume, model, fitted, wanted, settings, control, not method.allow_negative)
+        finished, sweeps = finish(
+            volume, model, fitted, wanted, settings, control, not method.allow_negative, schedule.asked
+        )
         if kept_back.size and _worse(finished, volume, data[kept_back], told.select(kept_back)):
             sweeps = 0
         else:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 from scipy.special import xlogy
 
 from recon.base.arrays import F32
@@ -16,6 +17,9 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import interleaved
 
+_RANGE = 1e30  # products of a sensitivity and an activity beyond it, or below 1 / it, leave float32
+_SMOOTH = (0.0, 1.5, 1.5)  # views, rows and columns, standard deviation, of the mean that weights follow
+_FEWEST = 0.5  # counts of a line's mean, at least
 _LEAST = 1e-6  # share of the largest sensitivity below which a voxel is not seen, and keeps no activity
 
 
@@ -91,30 +95,40 @@ def mlem(
         counts per mm of line, 0 or more; 0 where no line sees a voxel.
 
     Raises:
-        ValueError: no iterations or subsets; counts that are zero everywhere; or a line with counts whose mean is zero
-            whatever the activity.
+        ValueError: no iterations, or other subsets than 1 to the number of views. Counts that are zero everywhere. A
+            line with counts whose mean is zero whatever the activity. Survival so small that float32 overflows.
     """
-    if operator.index(iterations) < 1 or operator.index(subsets) < 1:
-        raise ValueError(f"at least one iteration and subset are needed, got {iterations} and {subsets}")
+    views = emission.geometry.n_views
+    if operator.index(iterations) < 1:
+        raise ValueError(f"iterations must be 1 or more, got {iterations}")
+    if not 1 <= operator.index(subsets) <= views:
+        raise ValueError(f"subsets must be 1 to {views}, a view each at most, got {subsets}")
     if not emission.counts.any():
         raise ValueError("counts are zero everywhere: there is nothing to reconstruct")
     whole = Projector(emission.geometry, grid)
     parts = []
-    for views in interleaved(whole, subsets):
-        projector = whole.subset(views)
+    for some in interleaved(whole, subsets):
+        projector = whole.subset(some)
         if emission.survival is None:
             survival = np.ones(projector.projection_shape, np.float32)
         else:
-            survival = emission.survival[views]
-        background = np.float32(0) if emission.background is None else emission.background[views]
-        parts.append(_Subset(projector, emission.counts[views], survival, background, projector.adjoint(survival)))
+            survival = emission.survival[some]
+        background = np.float32(0) if emission.background is None else emission.background[some]
+        parts.append(_Subset(projector, emission.counts[some], survival, background, projector.adjoint(survival)))
     most = max(float(part.sensitivity.max()) for part in parts)
     if most == 0:
         raise ValueError("no line sees the grid: survival is 0 everywhere, or the lines miss it")
     least = _LEAST * most
     x = np.where(sum(part.sensitivity for part in parts) > least, np.float32(1), np.float32(0))
     seen = sum(float(x.ravel() @ part.sensitivity.ravel()) for part in parts)
-    x *= np.float32(emission.counts.sum(dtype=np.float64) / seen)
+    level = float(emission.counts.sum(dtype=np.float64)) / seen
+    if not (most > 1 / _RANGE and level < _RANGE):
+        highest = 1.0 if emission.survival is None else float(emission.survival.max())
+        raise ValueError(
+            f"survival is {highest:.3g} at most, so that activity would be about {level:.3g} counts per mm, beyond the "
+            "numbers of float32. Expected the share of pairs that a line counts, such as 0.3"
+        )
+    x *= np.float32(level)
     for iteration in range(1, iterations + 1):
         likelihood = 0.0
         for projector, counts, survival, background, sensitivity in parts:
@@ -132,3 +146,22 @@ def mlem(
         if on_iteration is not None and on_iteration(iteration, likelihood):
             break
     return Volume(x, grid)
+
+
+def weighted_lines(emission: Emission) -> tuple[F32, F32]:
+    """Line integrals of the activity and weights [view, row, col] that carry the likelihood of counts to any method.
+
+    To second order about an expected mean λ the negative log-likelihood of y is ½ w (p - p~)², with p~ = (y - b) / s,
+    whatever λ is, and Fisher's w = s² / λ (McCullagh & Nelder 1989, section 2.5). λ is y smoothed by neighbours: the
+    counts of a line alone would weigh its lucky ones least, and lower the sum. Lines of survival 0 weigh nothing.
+    """
+    ones = np.ones_like(emission.counts)
+    survival = ones if emission.survival is None else emission.survival
+    background = 0 * ones if emission.background is None else emission.background
+    seen = survival > 0
+    # Of counts over survival: efficiency and attenuation differ from line to line, activity hardly does.
+    level = gaussian_filter(np.where(seen, emission.counts, 0), _SMOOTH, mode="nearest")
+    shape = gaussian_filter(survival * seen, _SMOOTH, mode="nearest")
+    mean = np.maximum(level * np.divide(survival, shape, out=ones.copy(), where=shape > 0), background)
+    lines = np.divide(emission.counts - background, survival, out=0 * ones, where=seen)
+    return lines, np.divide(survival**2, np.maximum(mean, _FEWEST), out=0 * ones, where=seen)

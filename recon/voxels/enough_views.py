@@ -20,7 +20,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.held_out_weight import busiest_rows
 from recon.voxels.iterative import solve
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import ordered_fista
+from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -146,4 +146,5 @@ class _ByTheNoise:
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         weight = NoiseBalance.of(problem, x, modelled=False, evenly=False)
-        return ordered_fista(problem, x, weight, sweeps=self.iterations, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        subsets = Subsets.of(problem, _SUBSETS)
+        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=_TV_STEPS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from recon.base.geometry import Geometry
 from recon.base.noise import median_deviation
 from recon.base.volume import Grid
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import bregman, ordered_fista
+from recon.voxels.ordered_fista import Subsets, bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
 from recon.voxels.voxel_problem import VoxelProblem
@@ -41,11 +42,19 @@ _COARSE, _FEWEST_ROWS = 1.2, 4 * _ROWS  # voxels in pixels, from which on it pay
 _AS_WELL = 1.03  # of the least residual: heavier weights, and less noise, at no loss (docs/choosing.md)
 _MATTER, _ENOUGH = 0.1, 0.5  # shares: of the largest line integrals, and of the matter in the fullest rows
 _NEARER = 0.99  # of the residual before: what further sweeps have to bring
+_BY_CHANCE = 1.005  # of a residual: what the vertex of a parabola may lie below its lowest point, and more
 
 # Weights of the two runs of `bregman`, in that of one run. Then by how much the residual of views held out has to fall;
 # less is chance (docs/notes/exploration.md).
 _HEAVY, _LESS_HEAVY = 3.0, 2.5
 _GAIN, _FURTHER_GAIN = 0.003, 0.001
+
+
+class Preferred(NamedTuple):
+    """A weight that views held out prefer, and the least residual of theirs in its search."""
+
+    weight: float
+    residual: float
 
 
 def slab_of(geometry: Geometry, grid: Grid, first: int, stop: int) -> tuple[Geometry, Grid]:
@@ -125,12 +134,18 @@ def _can_hold_out(geometry: Geometry) -> bool:
 
 
 def choose_weight(
-    problem: VoxelProblem, start: F32, *, modelled: bool, unmodelled: float | None = None, of_cones: bool = False
+    problem: VoxelProblem,
+    start: F32,
+    *,
+    modelled: bool,
+    unmodelled: float | None = None,
+    of_cones: bool = False,
+    known: float | None = None,
 ) -> NoiseBalance | float:
     """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`.
 
-    `of_cones`: views of a cone are held out, too. What `preferred_weight` finds is a decision of its own, PREFERRED,
-    which holds for other methods on the same views.
+    `of_cones`: views of a cone are held out, too. `known`: the weight that they prefer, found before. What
+    `preferred_weight` finds is a decision of its own, PREFERRED, which holds for other methods on the same views.
     """
 
     @cache
@@ -142,14 +157,19 @@ def choose_weight(
         if of_cones and problem.projector.geometry.is_cone:
             found = heaviest_weight(problem, balance().first)
         elif unmodelled is None:
-            found = problem.decide(PREFERRED, lambda: preferred_weight(problem, balance().first))
+            found = problem.decide(PREFERRED, lambda: known or _preferred(problem, balance().first))
         return [balance().first, balance().noise] if found is None else [found]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0], unmodelled is not None) if noise else first
 
 
-def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
+def _preferred(problem: VoxelProblem, first: float) -> float | None:
+    found = preferred_weight(problem, first)
+    return None if found is None else found.weight
+
+
+def preferred_weight(problem: VoxelProblem, first: float) -> Preferred | None:
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0, that views held out prefer, from `first` on.
 
     Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, with the weight, and on to the
@@ -178,7 +198,7 @@ def preferred_weight(problem: VoxelProblem, first: float) -> float | None:
     lighter, here, heavier = (errors.get(octave, errors[best]) for octave in (best - 1, best, best + 1))
     curvature = lighter - 2 * here + heavier
     vertex = (lighter - heavier) / (2 * curvature) if min(lighter, heavier) > here else 0.0
-    return float(first * 2 ** (best + vertex))
+    return Preferred(float(first * 2 ** (best + vertex)), here)
 
 
 def heaviest_weight(problem: VoxelProblem, first: float) -> float | None:
@@ -209,14 +229,18 @@ def heaviest_weight(problem: VoxelProblem, first: float) -> float | None:
     return first * 2.0**heaviest if heaviest else None
 
 
-def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
+def bregman_weight(problem: VoxelProblem, weight: float, residual: float | None = None) -> float | None:
     """The weight of `bregman` that predicts views held out better than one run of as many sweeps with `weight`; None:
     none does.
 
     At the same noise two runs show more of a crack than one, most where views are few (docs/notes/exploration.md).
+    `residual`: of the search for `weight`; where two runs are clearly above it, one run is not tried again.
     """
     error = _Trial.of(problem)
-    once, heavy = error(weight), error(_HEAVY * weight, twice=True)
+    heavy = error(_HEAVY * weight, twice=True)
+    if residual is not None and heavy > _BY_CHANCE * residual:
+        return None
+    once = error(weight)
     if heavy > once:
         return None
     less_heavy = error(_LESS_HEAVY * weight, twice=True)
@@ -224,22 +248,38 @@ def bregman_weight(problem: VoxelProblem, weight: float) -> float | None:
     return factor * weight if best < (1 - _GAIN) * once else None
 
 
-def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
+def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int, *, steadily: bool = True) -> int:
     """Sweeps from `start` [y, x, z] with the weight μ that views held out prefer: `sweeps`, or three times these.
 
     A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24). It leaves
-    others nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Sixteen rows are refined from seven of
-    eight views in three rounds. Each has to bring the others nearer, and all by one per cent, which parts the two
-    (docs/notes/exploration.md). Where slices are not those of rows: `sweeps`.
+    others nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Each round of `residuals_of_rounds` has
+    to bring the others nearer, and all by one per cent, which parts the two (docs/notes/exploration.md). Where slices
+    are not those of rows: `sweeps`. Not `steadily`: of a fit that was ended early, the second round alone may do so.
+    """
+    errors = residuals_of_rounds(problem, start, weight, sweeps)
+    least = min(errors, default=math.inf)
+    nearer = bool(errors) and least < _NEARER * errors[0]
+    if steadily:
+        nearer = nearer and len(errors) == _ROUNDS and errors[-1] <= least
+    return _ROUNDS * sweeps if nearer else sweeps
+
+
+def residuals_of_rounds(
+    problem: VoxelProblem, start: F32, weight: float, sweeps: int, within: tuple[float, float] = (0.0, math.inf)
+) -> list[float]:
+    """What sixteen rows, refined from seven of eight views in three rounds of `sweeps`, leave of the others after each.
+
+    They end after a round that takes them farther away, or leaves a residual that is not `within`. Empty where slices
+    are not those of rows.
     """
     geometry, grid = problem.projector.geometry, problem.projector.grid
     rows = Grid.matching(geometry)
     same = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
+    errors: list[float] = []
     if not (same and geometry.rows_show_slices):
-        return sweeps
+        return errors
     trial = _Trial.of(problem, start)
     x = trial.start.copy()
-    errors: list[float] = []
 
     def further(sweep: int, residual: float) -> bool:
         if not trial.problem.go_on(sweep, residual):
@@ -247,12 +287,11 @@ def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: i
         if sweep % sweeps:
             return True
         errors.append(trial.error(x))
-        return len(errors) == 1 or errors[-1] <= errors[-2]
+        return within[0] <= errors[-1] <= within[1] and errors[-1] <= min(errors)
 
     watched = replace(trial.problem, go_on=further)
-    ordered_fista(watched, x, weight, sweeps=_ROUNDS * sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS)
-    nearer = len(errors) == _ROUNDS and errors[-1] <= min(errors) and errors[-1] < _NEARER * errors[0]
-    return _ROUNDS * sweeps if nearer else sweeps
+    ordered_fista(watched, x, weight, trial.subsets, sweeps=_ROUNDS * sweeps, tv_steps=_TV_STEPS)
+    return errors
 
 
 class _Trial:
@@ -260,6 +299,7 @@ class _Trial:
 
     def __init__(self, problem: VoxelProblem, start: F32, unseen: VoxelProblem) -> None:
         self.problem, self.start, self._unseen = replace(problem, go_on=self._go_on), start, unseen
+        self.subsets = Subsets.of(problem, _SUBSETS)
         self._asked, self._ended = problem.go_on, False
 
     @classmethod
@@ -290,7 +330,6 @@ class _Trial:
                 rng=np.random.default_rng(0),
                 go_on=lambda *_: problem.trial_goes_on(),
                 decide=Decisions(),
-                curvature={},
             )
 
         seen, unseen = split_views(views)
@@ -316,7 +355,7 @@ class _Trial:
             return math.inf
         run, sweeps = (bregman, _AT_ONCE) if twice else (ordered_fista, _SWEEPS)
         problem = replace(self.problem, rng=np.random.default_rng(0))  # the same order of subsets for all
-        x = run(problem, self.start.copy(), weight, sweeps=sweeps, subsets=_SUBSETS, tv_steps=_TV_STEPS)
+        x = run(problem, self.start.copy(), weight, self.subsets, sweeps=sweeps, tv_steps=_TV_STEPS)
         return math.inf if self._ended else self.error(x)
 
     def error(self, x: F32) -> float:

@@ -93,20 +93,25 @@ class Seen:
     weight: F32 | None
 
 
-def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
-    """The motion after a Gauss-Newton step on the views, with differences between control points kept small.
-
-    Args:
-        image: the volume [y, x, z] at a time, before it moves.
-    """
-    slope: list[F32] = []
-    right = np.zeros_like(motion.control)
+def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> tuple[F64, list[F32]]:
+    """Minus the gradient of half the weighed squares by the control points, and the slopes of W x by u of each time."""
+    right, slope = np.zeros_like(motion.control), list[F32]()
     for part in seen:
         u, x = motion.at(part.time), image(part.time)
         left = part.data - part.projector.forward_lines(moved(x, u))
         slope.append(np.empty_like(u))
         slopes(x, u, slope[-1])
         right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(_weighted(left, part)))
+    return right, slope
+
+
+def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -> Motion:
+    """The motion after a Gauss-Newton step on the views, with differences between control points kept small.
+
+    Args:
+        image: the volume [y, x, z] at a time, before it moves.
+    """
+    right, slope = descent(motion, seen, image)
 
     def curved(control: F64) -> F64:
         out = np.zeros_like(control)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -23,8 +23,37 @@ _LOOKED_AT = 9  # views of a sweep whose residual is looked at
 _LEAST_VIEWS = 12  # least views of a subset: fewer have other eigenvectors than all views, and the steps disagree
 
 
+@dataclass(frozen=True, eq=False)
+class Subsets:
+    """Subsets of the views of a problem, which all runs with these views and weights may share.
+
+    Attributes:
+        views: indices, of each subset.
+        projectors: of these views.
+        step: 1 / L, with L the largest eigenvalue of AᵀWA of the subset that weighs most.
+    """
+
+    views: Sequence[NDArray[np.intp]]
+    projectors: Sequence[Projector]
+    step: float
+
+    @classmethod
+    def of(cls, problem: VoxelProblem, most: int) -> Subsets:
+        """At most so many; each has at least twelve views."""
+        projector, weight = problem.projector, problem.weight
+        count = subsets_of(projector.geometry, most)
+        if count == 1:
+            return cls(interleaved(projector, 1), [projector], 1 / largest_eigenvalue(projector, weight))
+        views = interleaved(projector, count)
+        projectors = [projector.subset(some) for some in views]
+        if weight is None:
+            return cls(views, projectors, 1 / largest_eigenvalue(projectors[0], None))
+        heaviest = int(np.argmax([float(weight[some].sum(dtype=np.float64)) for some in views]))
+        return cls(views, projectors, 1 / largest_eigenvalue(projectors[heaviest], weight[views[heaviest]]))
+
+
 def ordered_fista(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, *, sweeps: int, subsets: int, tv_steps: int
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int
 ) -> F32:
     """min ½||A x - p||² + μ TV(x), x >= 0, by steps from a subset of the views each, with momentum and restarts.
 
@@ -37,17 +66,10 @@ def ordered_fista(
     Args:
         x: [y, x, z], not zero; overwritten.
         weight: μ, or an object that chooses it after each sweep.
-        subsets: at most; each has at least twelve views.
         tv_steps: dual steps of each proximal step, which continue from the last ones.
     """
-    projector = problem.projector
-    count = subsets_of(projector.geometry, subsets)
-    parts = interleaved(projector, count)
-    projectors = [projector.subset(views) if count > 1 else projector for views in parts]
-    if count not in problem.curvature:
-        problem.curvature[count] = _curvature(problem, projectors, parts)
-    step = 1 / problem.curvature[count]
-    prox = TotalVariationProx(x.shape, difference_weights(projector.grid), problem.nonnegative, tv_steps)
+    parts, projectors, step, count = subsets.views, subsets.projectors, subsets.step, len(subsets.views)
+    prox = TotalVariationProx(x.shape, difference_weights(problem.projector.grid), problem.nonnegative, tv_steps)
     gradient, ahead, scale = np.empty_like(x), Momentum(x, problem.decide), problem.scale
     for k in range(sweeps):
         error, seen = 0.0, []
@@ -75,7 +97,7 @@ def ordered_fista(
     return x
 
 
-def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subsets: int, tv_steps: int) -> F32:
+def bregman(problem: VoxelProblem, x: F32, weight: float, subsets: Subsets, *, sweeps: int, tv_steps: int) -> F32:
     """Two runs of `ordered_fista`; the second adds the first one's residual to the views: 2 p - A x₁.
 
     Bregman iteration (Osher, Burger, Goldfarb, Xu & Yin 2005, Multiscale Model. Simul. 4, 460, eq. 3.1 to 3.3). Total
@@ -84,7 +106,7 @@ def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subset
     weight, at which its volume has little noise.
 
     Args:
-        x: as `ordered_fista`.
+        x, subsets: as `ordered_fista`.
         weight: μ of both runs.
         sweeps: of each run; if `problem.go_on` ends the first run, there is no second.
     """
@@ -95,26 +117,15 @@ def bregman(problem: VoxelProblem, x: F32, weight: float, *, sweeps: int, subset
         ended = not problem.go_on(sweep, residual)
         return not ended
 
-    x = ordered_fista(
-        replace(problem, go_on=first), x, weight, sweeps=sweeps, subsets=subsets, tv_steps=tv_steps
-    )  # fmt: skip
+    x = ordered_fista(replace(problem, go_on=first), x, weight, subsets, sweeps=sweeps, tv_steps=tv_steps)
     if ended:
         return x
     more = problem.projector.forward_lines(x)
     combine(2.0, problem.data, -1.0, more, more)
     again = replace(problem, data=more, go_on=lambda sweep, residual: problem.go_on(sweeps + sweep, residual))
-    return ordered_fista(again, x, weight, sweeps=sweeps, subsets=subsets, tv_steps=tv_steps)
+    return ordered_fista(again, x, weight, subsets, sweeps=sweeps, tv_steps=tv_steps)
 
 
 def subsets_of(geometry: Geometry, most: int) -> int:
-    """Number of subsets that `ordered_fista` makes of these views."""
+    """Number of subsets that `Subsets.of` makes of these views."""
     return max(1, min(most, geometry.n_views // _LEAST_VIEWS))
-
-
-def _curvature(problem: VoxelProblem, projectors: Sequence[Projector], parts: Sequence[NDArray[np.intp]]) -> float:
-    """The largest eigenvalue of a subset: the one with the most weight."""
-    if problem.weight is None or len(parts) == 1:
-        return largest_eigenvalue(projectors[0], problem.weight)
-    sums = [float(problem.weight[views].sum(dtype=np.float64)) for views in parts]
-    most = int(np.argmax(sums))
-    return largest_eigenvalue(projectors[most], problem.weight[parts[most]])

@@ -35,8 +35,6 @@ class VoxelProblem:
         go_on: called with (iteration, relative residual) after each iteration; False ends the method.
         decide: keeps decisions that follow from sums over the whole volume or all rays.
         trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
-        curvature: largest eigenvalue of a subset, by the number of subsets, once a run has found it: runs of the same
-            views and weights share it.
     """
 
     projector: Projector
@@ -47,7 +45,6 @@ class VoxelProblem:
     go_on: Callable[[int, float], bool]
     decide: Decisions = field(default_factory=Decisions)
     trial_goes_on: Callable[[], bool] = lambda: True
-    curvature: dict[int, float] = field(default_factory=dict)
 
     @property
     def scale(self) -> float:
@@ -57,7 +54,7 @@ class VoxelProblem:
     def of_views(self, views: NDArray[np.intp]) -> VoxelProblem:
         """Data and weights of some views; the projector stays that of all views."""
         weight = None if self.weight is None else self.weight[views]
-        return replace(self, data=self.data[views], weight=weight, curvature={})
+        return replace(self, data=self.data[views], weight=weight)
 
     def filtered(self, filter: Filter) -> F32 | None:
         """FBP or FDK [y, x, z] of the views with some weight, rays of weight 0 filled in; None: neither takes them."""

@@ -93,6 +93,17 @@ class SimulatedOrcaQuest:
         """Places of the frame's pixels, in mm from the rotation axis: the truth for alignment."""
         return self._camera_view().detector
 
+    @property
+    def scene(self) -> Scene:
+        """What stands in the beam."""
+        return self._scene
+
+    def show(self, scene: Scene) -> None:
+        """Its sample and its beam stand here from now on, with the effects that there are. Frames that were not taken
+        yet show them, too."""
+        with self._lock:
+            self._scene = replace(self._scene, sample=scene.sample, beam=scene.beam)
+
     def labels_at(self, time: float) -> tuple[Label, ...]:
         """The anomalies in the frame exposed at `time` (s since the Unix epoch), which must have been taken."""
         return self._labels.get(time, ())

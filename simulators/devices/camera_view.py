@@ -79,11 +79,14 @@ class CameraView:
         )
 
     def shot(self, frame: Exposed) -> Shot:
+        """Of a scene without effects of motion in the middle of its exposure, where a reconstruction takes it to be."""
+        middle = frame.time + self.settings.exposure / 2
+        turned = 0.0 if self.scene.chain.moves else self.angle_at(middle) - self.angle_at(frame.time)
         return Shot(
             detector=self.detector,
             exposure=self.settings.exposure,
             time=frame.time,
-            angle=frame.angle,
+            angle=frame.angle + turned,
             angle_at=self.angle_at,
             elapsed=frame.time - self.connected,
             row_period=orca_quest.timing(self.settings, model=self.model).row_period,

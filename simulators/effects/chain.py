@@ -112,7 +112,8 @@ class Chain:
         return any(isinstance(effect, SamplingEffect) for effect in self.effects)
 
     def moments(self, shot: Shot) -> Moments:
-        moments = Moments.at_trigger(shot.detector.shape[0])
+        """Of an exposure; without blur all of it is seen in its middle, where a reconstruction takes it to be."""
+        moments = Moments.once(shot.detector.shape[0], shot.exposure / 2)
         for effect in self.effects:
             if isinstance(effect, SamplingEffect):
                 moments = effect.moments(moments, shot)

@@ -38,7 +38,7 @@ class MotionBlur(SamplingEffect):
         n = self.samples(shot)
         if n == 0:
             return moments
-        within = (np.arange(n) + 0.5) / n * shot.exposure
+        within = ((np.arange(n) + 0.5) / n - 0.5) * shot.exposure  # from the middle of the exposure
         times = (within[:, None, None] + moments.times).reshape(-1, moments.times.shape[1])
         return Moments(times, np.tile(moments.weights / n, n))
 

@@ -28,7 +28,7 @@ class Shot:
         detector: the frame's pixels (after ROI and binning).
         exposure: s.
         time: s since the Unix epoch, at the trigger.
-        angle: true angle of the stage at the trigger, radians.
+        angle: true angle of the stage where a frame without effects of motion is exposed, radians.
         angle_at: true angle of the stage in radians at a time in s; called by effects of motion only.
         elapsed: s since the camera was connected; the time of all drifts.
         row_period: s by which each row starts later than the one above.
@@ -85,8 +85,9 @@ class Moments:
     weights: NDArray[np.float64]
 
     @classmethod
-    def at_trigger(cls, rows: int) -> Moments:
-        return cls(np.zeros((1, rows)), np.ones(1))
+    def once(cls, rows: int, seconds: float = 0.0) -> Moments:
+        """All rows so long after the trigger."""
+        return cls(np.full((1, rows), seconds), np.ones(1))
 
 
 def frame_rng(effect: str, shot: Shot) -> np.random.Generator:

@@ -63,7 +63,7 @@ def judge(folder: Path, volume: Path) -> None:
     with h5py.File(volume) as file:
         data = file["entry/data/data"]
         side = data.shape[0]
-        grid = Grid.matching(Geometry.parallel(np.zeros(1), (BAND, data.shape[2]), 1.0))
+        grid = Grid.matching(Geometry.parallel(np.zeros(1), (BAND, data.shape[2]), pixel_pitch=1.0))
         truth = sample(side).attenuation(grid)
         for rows in bands(side):
             error = float(np.sqrt(np.mean((data[rows] - truth) ** 2)))

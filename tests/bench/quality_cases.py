@@ -88,7 +88,7 @@ def walnut(folder: Path, views: int) -> Case:
         file.visititems(lambda _, node: found.append(node) if getattr(node, "ndim", 0) == 3 else None)
         chosen = np.linspace(0, 240, views, endpoint=False).astype(int)
         data = np.asarray(found[0][:][chosen], np.float32)
-    geometry = Geometry.parallel(np.deg2rad(0.75 * chosen), (96, 256), 0.15217249972911476, 127.5)
+    geometry = Geometry.parallel(np.deg2rad(0.75 * chosen), (96, 256), pixel_pitch=0.15217249972911476, axis_col=127.5)
     truth = np.maximum(first_of(folder / "walnut_fdk_256.npz")[70:166], 0)
     return Case("walnut slab", data, geometry, Grid.matching(geometry), truth, float(truth.max()))
 
@@ -98,7 +98,7 @@ def walnut_halved(folder: Path, views: int) -> Case:
     fine = walnut(folder, views)
     data = fine.projections.reshape(views, 48, 2, 128, 2).mean(axis=(2, 4))[:, 8:40]
     truth = fine.truth.reshape(48, 2, 128, 2, 128, 2).mean(axis=(1, 3, 5))[8:40]
-    geometry = Geometry.parallel(fine.geometry.angles, (32, 128), 2 * fine.geometry.pixel_pitch)
+    geometry = Geometry.parallel(fine.geometry.angles, (32, 128), pixel_pitch=2 * fine.geometry.pixel_pitch)
     return Case("walnut", np.ascontiguousarray(data), geometry, Grid.matching(geometry), truth, float(truth.max()))
 
 
@@ -122,12 +122,14 @@ def slab(folder: Path, name: str, views: int, photons: float = 5000) -> Case:
     fine = SLABS[name](folder)
     angles = np.linspace(0, np.pi, views, endpoint=False)
     rows, side = fine.shape[0] // 2, fine.shape[2] // 2
-    clean = Projector(Geometry.parallel(angles, (2 * rows, 2 * side), 0.5), Grid(fine.shape, 0.5)).forward(fine)
+    clean = Projector(Geometry.parallel(angles, (2 * rows, 2 * side), pixel_pitch=0.5), Grid(fine.shape, 0.5)).forward(
+        fine
+    )
     scale = 2 / float(clean.max())  # the longest path lets an eighth through
     counts = photons * np.exp(-scale * clean).reshape(views, rows, 2, side, 2).mean(axis=(2, 4))
     data = -np.log(np.maximum(np.random.default_rng(0).poisson(counts), 1) / photons)
     truth = scale * fine.reshape(rows, 2, side, 2, side, 2).mean(axis=(1, 3, 5))
-    geometry = Geometry.parallel(angles, (rows, side), 1.0)
+    geometry = Geometry.parallel(angles, (rows, side), pixel_pitch=1.0)
     return Case(
         f"{name} slab", data.astype(np.float32), geometry, Grid.matching(geometry), truth, float(truth.max())
     )  # fmt: skip
@@ -144,7 +146,7 @@ def dense_battery(views: int, side: int = 256, photons: float = 2e4, particles: 
         [phantom.line_integrals(a, fine).reshape(side, 2, side, 2).mean(axis=(1, 3)) for a in angles]
     )  # fmt: skip
     data = -np.log(np.maximum(rng.poisson(photons * np.exp(-clean)), 1) / photons)
-    geometry = Geometry.parallel(angles, (side, side), pitch)
+    geometry = Geometry.parallel(angles, (side, side), pixel_pitch=pitch)
     truth = phantom.attenuation(Grid.matching(geometry))
     return Case("battery", data.astype(np.float32), geometry, Grid.matching(geometry), truth, float(truth.max()))
 

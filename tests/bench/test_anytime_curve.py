@@ -54,7 +54,7 @@ def particles(angles: NDArray[np.float64]) -> Scan:
     phantom = Phantom.of(battery(np.random.default_rng(7), (0.72, 0.36), 120))
     fine = Detector.centred((2 * ROWS, 2 * SIDE), pitch / 2)
     exact = [phantom.line_integrals(a, fine).reshape(ROWS, 2, SIDE, 2).mean(axis=(1, 3)) for a in angles]
-    geometry = Geometry.parallel(angles, (ROWS, SIDE), pitch)
+    geometry = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=pitch)
     return _noisy(np.stack(exact)), geometry, phantom.attenuation(Grid.matching(geometry))
 
 
@@ -64,11 +64,13 @@ def smooth(angles: NDArray[np.float64]) -> Scan:
     waves = gaussian_filter(np.random.default_rng(5).normal(size=shape), 8)
     y, x = np.indices(shape[1:]) - (SIDE - 0.5)
     fine = np.maximum(1 + 0.5 * waves / waves.std(), 0) * np.clip((0.84 * SIDE - np.hypot(y, x)) / 12, 0, 1)
-    clean = Projector(Geometry.parallel(angles, shape[:2], 0.5), Grid(shape, 0.5)).forward(fine.astype(np.float32))
+    clean = Projector(Geometry.parallel(angles, shape[:2], pixel_pitch=0.5), Grid(shape, 0.5)).forward(
+        fine.astype(np.float32)
+    )
     scale = 2 / float(clean.max())
     exact = scale * clean.reshape(VIEWS, ROWS, 2, SIDE, 2).mean(axis=(2, 4), dtype=np.float64)
     truth = scale * fine.reshape(ROWS, 2, SIDE, 2, SIDE, 2).mean(axis=(1, 3, 5))
-    return _noisy(exact), Geometry.parallel(angles, (ROWS, SIDE), 1.0), truth.astype(np.float32)
+    return _noisy(exact), Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=1.0), truth.astype(np.float32)
 
 
 @dataclass(frozen=True)

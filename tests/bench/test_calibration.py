@@ -45,8 +45,8 @@ def _geometry(beam: str, axis: float, shifts: NDArray[np.float64], roll: float, 
     angles = np.linspace(0, BEAMS[beam], VIEWS, endpoint=False)
     turns = {"roll": np.radians(roll), "tilt": np.radians(tilt)}
     if beam == "parallel":
-        return Geometry.parallel(angles, SHAPE, 1.0, axis, shifts=shifts, **turns)
-    return Geometry.cone(angles, SHAPE, 1.5, 200, 300, axis, shifts=shifts, **turns)
+        return Geometry.parallel(angles, SHAPE, pixel_pitch=1.0, axis_col=axis, shifts=shifts, **turns)
+    return Geometry.cone(angles, SHAPE, 1.5, 200, 300, axis_col=axis, shifts=shifts, **turns)
 
 
 def _disturbed(beam: str, case: str) -> Geometry:

@@ -73,7 +73,7 @@ def _walnut(folder: Path) -> tuple[Geometry, F32, F32]:
         angles = np.deg2rad(file["exchange/theta"][::4])
     with np.load(folder / "walnut_fdk_256.npz") as file:
         truth = np.maximum(np.asarray(file["volume"][70:166], np.float32), 0)
-    return Geometry.parallel(angles, (96, 256), WALNUT_PITCH, 127.5), views, truth
+    return Geometry.parallel(angles, (96, 256), pixel_pitch=WALNUT_PITCH, axis_col=127.5), views, truth
 
 
 def _battery(side: int = 96, n_views: int = 60, photons: float = 2e4) -> tuple[Geometry, F32, F32]:
@@ -86,7 +86,7 @@ def _battery(side: int = 96, n_views: int = 60, photons: float = 2e4) -> tuple[G
     exact = np.stack([phantom.line_integrals(a, fine).reshape(side, 2, side, 2).mean((1, 3)) for a in angles])
     counts = rng.poisson(photons * np.exp(-exact))
     views = -np.log(np.maximum(counts, 1) / photons).astype(np.float32)
-    geometry = Geometry.parallel(angles, (side, side), pitch)
+    geometry = Geometry.parallel(angles, (side, side), pixel_pitch=pitch)
     return geometry, views, phantom.attenuation(Grid.matching(geometry))
 
 

@@ -44,7 +44,7 @@ METHODS: dict[str, Any] = {
 def views_of(beam: str, rows: int) -> Geometry:
     """A parallel beam with a pixel a voxel; the published cone, whose pixels are 0.71 voxels at the axis."""
     if beam == "parallel":
-        return Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (SLICES, SIDE), 2 / SIDE)
+        return Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (SLICES, SIDE), pixel_pitch=2 / SIDE)
     return Geometry.cone(np.linspace(0, 2 * np.pi, VIEWS, endpoint=False), (rows, 2 * SIDE), 2 / SIDE, 5.0, 7.0)
 
 

@@ -39,7 +39,7 @@ def scene(seed: int, side: int = 64, rows: int = 16) -> tuple[F32, Geometry, F32
         axes = tuple(rng.uniform(0.01, 0.06, 3).tolist())
         bodies.append(Ellipsoid(axes, float(rng.uniform(1, 6)), centre=(r * np.cos(turn), r * np.sin(turn), z)))
     phantom = Phantom.of((Cylinder(0.33, 0.9 * height, 2.0), *bodies))
-    geometry = Geometry.parallel((np.arange(VIEWS) * GOLDEN % 1) * np.pi, (rows, side), pitch)
+    geometry = Geometry.parallel((np.arange(VIEWS) * GOLDEN % 1) * np.pi, (rows, side), pixel_pitch=pitch)
     detector = Detector.centred((rows, side), pitch)
     exact = np.stack([phantom.line_integrals(angle, detector) for angle in geometry.angles])
     counts = np.maximum(rng.poisson(photons * np.exp(-exact)), 1)

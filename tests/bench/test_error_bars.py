@@ -119,9 +119,9 @@ def test_volumes_of_balls_within_their_intervals(seed: int, views: int, photons:
     """Four scans of the same balls with other noise, each segmented."""
     truth, known = balls(seed)
     angles = np.linspace(0, np.pi, views, endpoint=False)
-    clean = Projector(Geometry.parallel(angles, (80, 192), 0.5), Grid(truth.shape, 0.5)).forward(truth)
+    clean = Projector(Geometry.parallel(angles, (80, 192), pixel_pitch=0.5), Grid(truth.shape, 0.5)).forward(truth)
     counts = photons * np.exp(-2 / clean.max() * clean).reshape(views, 40, 2, 96, 2).mean(axis=(2, 4))
-    geometry = Geometry.parallel(angles, (40, 96), 1.0)
+    geometry = Geometry.parallel(angles, (40, 96), pixel_pitch=1.0)
     box, corner = (slice(0, 40), slice(14, 82), slice(14, 82)), np.array([0.5, 14.5, 14.5])
     for label, method in {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(tv_weight=3e-3)}.items():
         errors: list[float] = []

@@ -22,7 +22,7 @@ DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
 SIDE, VIEWS, THICKEST = 64, 60, 3.0  # pixels and voxels a side; the largest line integral
 PHOTONS = (10, 30, 100, 300, 1000)
 TV_WEIGHTS = (0.004, 0.008, 0.016, 0.032, 0.064)
-GEOMETRY = recon.Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (SIDE, SIDE), 1 / SIDE)
+GEOMETRY = recon.Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (SIDE, SIDE), pixel_pitch=1 / SIDE)
 GRID = recon.Grid.matching(GEOMETRY)
 
 
@@ -32,7 +32,7 @@ def _samples() -> Iterator[tuple[str, F32, F32]]:
     can = Phantom.of(battery(np.random.default_rng(0), (1.0, 1.0), 40))
     clean = np.stack([can.line_integrals(a, fine) for a in GEOMETRY.angles])
     yield "battery", _joined(clean), can.attenuation(GRID)
-    twice = recon.Geometry.parallel(GEOMETRY.angles, (2 * SIDE, 2 * SIDE), 0.5 / SIDE)
+    twice = recon.Geometry.parallel(GEOMETRY.angles, (2 * SIDE, 2 * SIDE), pixel_pitch=0.5 / SIDE)
     for name in ("shell", "thorax"):
         large = padded(OBJECTS[name](DATA), 4 * SIDE).reshape(2 * SIDE, 2, 2 * SIDE, 2, 2 * SIDE, 2)
         volume = large.mean(axis=(1, 3, 5), dtype=np.float32)

@@ -14,6 +14,7 @@ import pytest
 import recon
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
+from recon.voxels.displacement import Displacement, displaced
 from simulators.light.palette import known
 from tests.bench.quality_cases import seen_by_simulator
 
@@ -51,7 +52,7 @@ def grains() -> F32:
 def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
     fine, n = grains(), len(energies) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(energies)
-    geometry = Geometry.parallel(angles, (ROWS, SIDE), PITCH)
+    geometry = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH)
     oxide, liquid = known("NMC811"), known("electrolyte")
     assert oxide is not None
     assert liquid is not None
@@ -92,3 +93,44 @@ def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
         f"apart {apart[best]:.3f} at {best} ({alone:.1f} CPU s), ratio {joint / apart[best]:.2f}, guess {guess:.3f}"
     )
     assert joint < apart[best]
+
+
+def test_shifts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six energies of 15 views; the sample stood up to 3 pixels elsewhere at each but the first."""
+    monkeypatch.setattr("tests.bench.test_materials.ROWS", 16)
+    fine, each, photons, rng = grains(), 15, 5000, np.random.default_rng(3)
+    half = np.concatenate([rng.integers(-6, 7, (len(SIX), 2)), rng.integers(-3, 4, (len(SIX), 1))], 1)  # half pixels
+    half[0] = 0
+    n = len(SIX) * each
+    angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(SIX)
+    geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH), np.zeros((n, ROWS, SIDE))
+    oxide, liquid = known("NMC811"), known("electrolyte")
+    assert oxide is not None and liquid is not None
+    materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid
+    sections = np.stack([material.attenuation(SIX) for material in materials], 1)
+    for e, (x, y, z) in enumerate(half):
+        own = np.flatnonzero(energy == e)
+        for volume, mu in zip(fine, sections[e], strict=True):
+            depth[own] += mu * seen_by_simulator(np.roll(volume, (z, y, x), (0, 1, 2)), geometry.select(own), PITCH / 2)
+    counts = np.random.default_rng(2).poisson(photons * np.exp(-depth)).clip(1)
+    views = recon.EnergyViews((-np.log(counts / photons)).astype(np.float32), geometry, energy, sections)
+    began = time.process_time()
+    corrected, moves = recon.register_energies(views)
+    took = time.process_time() - began
+    apart = np.array([(move.x, move.y, move.z) for move in moves]) / PITCH - half / 2
+    truth = fine.reshape(3, ROWS, 2, SIDE, 2, SIDE, 2).mean((2, 4, 6))
+    oxides = truth[:2].sum(0)
+    matter, charge = oxides > 0.9, truth[1] / np.maximum(oxides, 0.1)
+    matter[:2] = matter[-2:] = False
+
+    def error(seen: recon.EnergyViews) -> float:
+        share = recon.fit_materials(seen).share(1, [0], 0.05)
+        return float(np.sqrt(np.nanmean((share - charge)[matter] ** 2)))
+
+    true = displaced(geometry, energy, [Displacement(*(at / 2 * PITCH)) for at in half])
+    errors = [error(each) for each in (views, corrected, replace(views, geometry=true))]
+    print(
+        f"\nlargest errors of x, y, z {np.abs(apart).max(0).round(3)} px ({took:.1f} CPU s); charge's error "
+        f"{errors[0]:.3f} as it is, {errors[1]:.3f} registered, {errors[2]:.3f} with the true shifts"
+    )
+    assert errors[1] < 0.5 * errors[0]

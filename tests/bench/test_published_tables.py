@@ -110,11 +110,11 @@ def row(case: Case, label: str, method: Any) -> int:
         f"{memory.grown / 1e6:5.0f} MB",
         flush=True,
     )
-    if len(found.history) < 2:
+    at = {progress.step: progress.seconds for progress in found.history}  # a fit reports its last step twice
+    if len(at) < 2:
         return 0
-    first, last = found.history[0], found.history[-1]
-    pace = (last.seconds - first.seconds) / (last.step - first.step)
-    return max(1, round((SECONDS - busy) / pace) + last.step)
+    pace = float(np.median(np.diff(list(at.values())) / np.diff(list(at))))  # the first step may have compiled
+    return max(1, round((SECONDS - busy) / pace) + work)
 
 
 @pytest.mark.parametrize("views", [75, 50, 25])
@@ -134,7 +134,7 @@ def rows_of(case: Case) -> None:
     print()
     for label in ROWS:
         method = METHODS[label]
-        warm_up(method, case.geometry)
+        warm_up(method, case.geometry, weighted=case.weights is not None)
         if isinstance(method, FieldMethod):
             row(case, f"{label}, equal time", replace(method, seconds=SECONDS))
             continue

@@ -57,7 +57,7 @@ def walnut(shared_data: Path) -> tuple[F32, Geometry, F32]:
         data = np.stack([file["exchange/data"][int(v), 28:68] for v in views]).astype(np.float32)
     with np.load(shared_data / "walnut_fdk_256.npz") as file:
         truth = np.asarray(file[file.files[0]][98:138], np.float32)
-    return data, Geometry.parallel(angles[views], data.shape[1:], pitch, 127.5), truth
+    return data, Geometry.parallel(angles[views], data.shape[1:], pixel_pitch=pitch, axis_col=127.5), truth
 
 
 def particles(shared_data: Path, views: int = 90, photons: float = 5000) -> tuple[F32, Geometry, F32]:
@@ -65,7 +65,7 @@ def particles(shared_data: Path, views: int = 90, photons: float = 5000) -> tupl
     rng = np.random.default_rng(7)
     pitch, shape = 0.72 / 160, (48, 160)
     phantom = Phantom.of(battery(rng, (0.72, 48 * pitch), 50))
-    geometry = Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), shape, pitch)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, views, endpoint=False), shape, pixel_pitch=pitch)
     fine = Detector.centred((2 * shape[0], 2 * shape[1]), pitch / 2)
     light = np.exp(-np.stack([phantom.line_integrals(angle, fine) for angle in geometry.angles]))
     counts = rng.poisson(photons * light.reshape(views, shape[0], 2, shape[1], 2).mean(axis=(2, 4)))

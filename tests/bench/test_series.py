@@ -40,7 +40,7 @@ def scanned(phantom: dict[str, Any]) -> tuple[recon.TimedViews, F32]:
         now = sample_at(sample, seconds)
         light.append(np.mean([np.exp(-now.line_integrals(angle, aim)) for aim in aims], 0))
     counts = np.random.default_rng(0).poisson(PHOTONS * np.stack(light)).clip(1)
-    geometry = recon.Geometry.parallel(angles, (SIDE, SIDE), PITCH)
+    geometry = recon.Geometry.parallel(angles, (SIDE, SIDE), pixel_pitch=PITCH)
     truth = np.stack([sample_at(sample, t).attenuation(Grid.matching(geometry)) for t in TIMES.tolist()])
     return recon.TimedViews(-np.log(counts / PHOTONS).astype(np.float32), geometry, times), truth
 

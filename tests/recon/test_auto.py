@@ -19,7 +19,7 @@ from recon.splatting.r2 import R2
 from recon.trials import shared_decisions
 from recon.voxels import held_out_weight
 from recon.voxels.direct import Fbp
-from recon.voxels.held_out_weight import PREFERRED, preferred_weight
+from recon.voxels.held_out_weight import PREFERRED, Preferred, preferred_weight
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
@@ -74,16 +74,18 @@ def test_another_slab_takes_the_method_that_the_first_one_chose(data: F32) -> No
 
 def test_the_weight_that_one_trial_finds_is_that_of_all_trials(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two methods are tried, and one of them reconstructs the whole, whose weight is sought anew: two searches."""
-    found = list[float | None]()
+    found = list[float]()
 
-    def counted(problem: VoxelProblem, first: float) -> float | None:
-        found.append(preferred_weight(problem, first))
-        return found[-1]
+    def counted(problem: VoxelProblem, first: float) -> Preferred | None:
+        preferred = preferred_weight(problem, first)
+        assert preferred is not None
+        found.append(preferred.weight)
+        return preferred
 
     monkeypatch.setattr(held_out_weight, "preferred_weight", counted)
     decide, auto = Decisions(), Auto((FistaTv(iterations=4), FistaTv(iterations=5)))
     recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide))
-    assert len(found) == 2 and None not in found
+    assert len(found) == 2
     assert decide.made[PREFERRED] == found[1:] and decide.made["weight"] == [found[1:]]
     recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=Decisions(0, decide.made)))  # another slab
     assert len(found) == 2

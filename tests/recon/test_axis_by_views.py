@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from recon.axis_by_views import axis_by_views
 from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.prep.align import AxisError
+from recon.voxels.projector import Projector
 
 VIEWS, ROWS, COLS, SOD, SDD = 36, 6, 64, 60.0, 90.0
 BALLS = np.array([[9.0, -4.0, 1.0, 5.0], [-7.0, 6.0, -2.0, 4.0], [-2.0, -10.0, 0.0, 3.0]])  # x, y, z, radius in mm
@@ -36,15 +38,28 @@ def _views(axis_col: float, sod: float, sdd: float) -> NDArray[np.float32]:
 @pytest.mark.parametrize(("start", "noise"), [(31.5, 0.3), (24.0, 0.3), (24.0, 0.0)])
 def test_the_axis_is_found_to_a_tenth_of_a_column(sod: float, sdd: float, start: float, noise: float) -> None:
     views = _views(29.2, sod, sdd) + np.random.default_rng(1).normal(0, noise, (VIEWS, ROWS, COLS)).astype(np.float32)
-    found = axis_by_views(views, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, start))
+    found = axis_by_views(views, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, axis_col=start))
     assert found.value == pytest.approx(29.2, abs=0.1) and found.confident and found.method == "views held out"
     assert abs(found.candidates[found.curve.argmin()] - 29.2) <= 1
+
+
+def test_the_axis_of_a_sample_wider_than_the_field() -> None:
+    """Foam in 86 columns, seen in 80 of them. The field alone has no room for the rest, and each axis looks alike."""
+    rng, rows, n = np.random.default_rng(1), 12, 96
+    y, x = np.mgrid[:n, :n] - (n - 1) / 2
+    cells = np.kron(rng.random((rows // 4, n // 4, n // 4)) > 0.6, np.ones((4, 4, 4)))
+    foam = (0.01 * cells * (np.hypot(x, y) < 43)).astype(np.float32)
+    whole = Geometry.cone(2 * np.pi * np.arange(48) / 48, (rows, 2 * n), 1.0, 2.5 * n, 5.0 * n, axis_col=n + 1.8)
+    views = Projector(whole, Grid(foam.shape, 1.0)).forward(foam)[..., 56:-56]
+    views += rng.normal(0, 0.01, views.shape).astype(np.float32)
+    found = axis_by_views(views, replace(whole, detector_shape=views.shape[1:], axis_col=39.5))
+    assert found.value == pytest.approx(41.8, abs=0.2) and found.confident
 
 
 def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> None:
     """Also where it is so far from the axis that the candidates beside it leave nearly as much."""
     views, told = _views(29.2, SOD, SDD), list[int]()
-    right = Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, 29.2)
+    right = Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=29.2)
     assert axis_by_views(views, right, told.append, near=True).value == 29.2 and told == list(range(1, 11))
     for wrong in (29.9, 40.2):
         found = axis_by_views(views, replace(right, axis_col=wrong), near=True)
@@ -55,7 +70,7 @@ def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> 
 
 def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
     with pytest.raises(AxisError, match=r"within 12 columns of column 50.0: .* agree best with column"):
-        axis_by_views(_views(29.2, SOD, SDD), Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, 50.0))
+        axis_by_views(_views(29.2, SOD, SDD), Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=50.0))
     noise = np.random.default_rng(0).normal(0, 1, (VIEWS, ROWS, COLS)).astype(np.float32)
     with suppress(AxisError):  # the minimum of noise may lie at an edge
         assert not axis_by_views(noise, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD)).confident
@@ -73,4 +88,4 @@ def test_views_without_matter_are_refused() -> None:
         some = views.copy()
         some[list(empty)] = 0
         with pytest.raises((AxisError, ValueError), match=r"no matter|zero"):
-            axis_by_views(some, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, 29.2))
+            axis_by_views(some, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=29.2))

@@ -16,7 +16,7 @@ from recon.error_bars import alternating, error_bars, error_bars_memory
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 
-VIEWS = Geometry.parallel(np.linspace(0, np.pi, 96, endpoint=False), (12, 48), 0.5)
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 96, endpoint=False), (12, 48), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
 NOISE = 0.02
 LINEAR = recon.FistaTv(iterations=10, tv_weight=0.0, allow_negative=True)

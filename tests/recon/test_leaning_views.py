@@ -38,8 +38,8 @@ def leaning(cone: bool, degrees: float = 4.0) -> Geometry:
         "tilt": np.deg2rad(degrees) * np.sin(3 * ANGLES),
     }
     if cone:
-        return Geometry.cone(ANGLES, (32, 38), 0.06, 8.0, 12.0, 18.7, **lean)
-    return Geometry.parallel(ANGLES, (32, 38), 0.04, 18.7, **lean)
+        return Geometry.cone(ANGLES, (32, 38), 0.06, 8.0, 12.0, axis_col=18.7, **lean)
+    return Geometry.parallel(ANGLES, (32, 38), pixel_pitch=0.04, axis_col=18.7, **lean)
 
 
 def rays(geometry: Geometry) -> np.ndarray:

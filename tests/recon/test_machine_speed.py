@@ -17,10 +17,10 @@ from recon.splatting.splat import project
 SHAPE = (24, 60)
 TURN = np.linspace(0, 2 * np.pi, 40, endpoint=False)
 BEAMS = {
-    "parallel": Geometry.parallel(TURN / 2, SHAPE, 0.1),
+    "parallel": Geometry.parallel(TURN / 2, SHAPE, pixel_pitch=0.1),
     "cone": Geometry.cone(TURN, SHAPE, 1.0, 30.0, 300.0),
     "short scan of a cone": Geometry.cone(TURN * 0.45, SHAPE, 1.0, 30.0, 300.0),
-    "leaning": Geometry.parallel(TURN / 2, SHAPE, 0.1, tilt=0.1),
+    "leaning": Geometry.parallel(TURN / 2, SHAPE, pixel_pitch=0.1, tilt=0.1),
 }
 
 
@@ -87,7 +87,7 @@ def test_shifted_views_are_measured_on_all_that_they_see() -> None:
     # Moved by as much as the detector is high or nearly as wide, with an axis that makes up for it: the same scan.
     plain, ticks = BEAMS["parallel"], iter(range(100_000))
     shifts = np.tile([50.0, 24.0], (40, 1))
-    moved = Geometry.parallel(TURN / 2, SHAPE, 0.1, 29.5 - 50, axis_row=11.5 - 24, shifts=shifts)
+    moved = Geometry.parallel(TURN / 2, SHAPE, pixel_pitch=0.1, axis_col=29.5 - 50, axis_row=11.5 - 24, shifts=shifts)
     grid = Grid.matching(plain)
     assert Grid.for_fit(moved, grid) == Grid.for_fit(plain, grid)
     speeds = measured_speeds(_views(plain), moved, grid, lambda: float(next(ticks)))

@@ -25,7 +25,7 @@ FIELDS = {
     "intratomo": {"steps": 120, "rays": 128, "samples": 16, "rate": 1e-2, "width": 32, "bands": 3},
     "sax-nerf": {"steps": 120, "rays": 64, "samples": 12, "rate": 1e-2, "levels": 1, "width": 16, "window_count": 0},
 }  # settings with which a neural field is done within a second
-VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (6, 24), 0.5)
+VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (6, 24), pixel_pitch=0.5)
 
 
 @pytest.fixture(scope="module")

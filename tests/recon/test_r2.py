@@ -36,7 +36,7 @@ def test_matter_beyond_the_default_grid_is_explained() -> None:
     sample = Phantom.of((Cylinder(2.6, 1.6, 0.2), Ellipsoid((0.5, 0.4, 0.4), 0.6, centre=(-0.6, 0.4, 0.1))))
     turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     detector = Detector(SHAPE, PITCH, 32.0, (SHAPE[0] - 1) / 2)
-    views = recon.Geometry.parallel(turn, SHAPE, PITCH, axis_col=32.0)
+    views = recon.Geometry.parallel(turn, SHAPE, pixel_pitch=PITCH, axis_col=32.0)
     data = np.stack([sample.line_integrals(a, detector) for a in turn])
     grid = recon.Grid.of_field(views, PITCH)
     result = recon.reconstruct(data, views, R2(steps=400, gaussians=2500), grid=grid)
@@ -192,7 +192,7 @@ def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.ini
 def test_tilted_views_are_fitted_as_they_are(phantom: Phantom, noisy: np.ndarray) -> None:
     start = recon.reconstruct(noisy, VIEWS, R2(steps=200, gaussians=2000)).gaussians
     assert start is not None
-    tilted = recon.Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=18.3, tilt=0.15, roll=0.03)
+    tilted = recon.Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=18.3, tilt=0.15, roll=0.03)
     data = project(start, tilted).numpy()
     told, untold = (recon.reconstruct(data, g, R2(steps=300, gaussians=2000), grid=GRID) for g in (tilted, VIEWS))
     truth = voxelize(start, GRID).numpy()

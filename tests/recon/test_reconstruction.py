@@ -171,7 +171,7 @@ def test_classical_methods_by_the_same_call_beat_fbp(
 
 
 def test_tilted_views_half_a_turn_apart_are_two_sides(noisy: np.ndarray) -> None:
-    views = recon.Geometry.parallel([0.0, np.pi], SHAPE, PITCH, axis_col=18.3, tilt=0.3)
+    views = recon.Geometry.parallel([0.0, np.pi], SHAPE, pixel_pitch=PITCH, axis_col=18.3, tilt=0.3)
     assert np.isfinite(recon.reconstruct(noisy[[0, 0]], views, R2(steps=2, gaussians=200), grid=GRID).volume.data).all()
     with pytest.raises(ValueError, match="one view"):
         recon.reconstruct(noisy[[0, 0]], views.at([0.3, 0.3 + 2 * np.pi]), grid=GRID)
@@ -183,7 +183,7 @@ def test_one_view_is_refused(noisy: np.ndarray) -> None:
 
 
 def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> None:
-    degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, PITCH, axis_col=18.3)
+    degrees = recon.Geometry.parallel(np.rad2deg(ANGLES), SHAPE, pixel_pitch=PITCH, axis_col=18.3)
     with pytest.warns(UserWarning, match=r"172\.5 rad and look like degrees.*np\.deg2rad"):
         recon.reconstruct(noisy, degrees, "fbp")
     with (

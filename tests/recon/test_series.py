@@ -12,7 +12,7 @@ import recon
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.series import Series, TimedViews, fit_series, hats
+from recon.series import Series, TimedViews, _of_moments, fit_series, hats
 from recon.voxels.projector import Projector
 
 SIDE, ROWS = 40, 4
@@ -35,7 +35,7 @@ def views_of(n: int, noise: float = 0.0, fine: int = 2) -> TimedViews:
     """Golden-angle views over 10 s. The sample has `fine` voxels a pixel."""
     times = (np.arange(n) + 0.5) * 10 / n
     angles, wide = GOLDEN * np.arange(n), SIDE * fine
-    dense = Geometry.parallel(angles, (ROWS, wide), 1 / fine)
+    dense = Geometry.parallel(angles, (ROWS, wide), pixel_pitch=1 / fine)
     box = replace(Grid.matching(dense), slice_pitch=1 / fine)
     seen = [
         Projector(dense.select([v]), box).forward(discs(t, wide))[0].reshape(ROWS, SIDE, fine).mean(2)
@@ -57,11 +57,33 @@ def test_shares_are_those_of_linear_interpolation() -> None:
 
 def test_the_residual_is_that_of_the_series_in_the_views() -> None:
     views = views_of(60, noise=0.05)
-    found = fit_series(views, 3, motion=True, tv_weight=0.05)
+    found = fit_series(views, 3, motion=True, tv_weight=0.15)
     projector = Projector(views.geometry, found.grid)
     model = np.stack([projector.subset([v]).forward(found.at(t))[0] for v, t in enumerate(views.times)])
     left = np.linalg.norm(model - views.projections) / np.linalg.norm(views.projections)
-    assert left == pytest.approx(found.residual, rel=0.15)  # views of a moment count as simultaneous, steps go on
+    print(left, found.residual)
+    assert left == pytest.approx(found.residual, rel=0.15)  # that of the last sweep, while its steps go on
+
+
+def test_a_linear_change_is_found_from_views_without_noise() -> None:
+    """Views of the model itself: what bounds the error is the number of sweeps (60: 49 dB, 120: 62 dB). With views that
+    count as of eight moments it is 29 dB after any number."""
+    n = 60
+    times, geometry = np.linspace(0, 10, n), Geometry.parallel(GOLDEN * np.arange(n), (ROWS, SIDE))
+    truth = np.stack([discs(0.0), discs(10.0)])
+    whole = Projector(geometry, Grid.matching(geometry))
+    data = np.einsum("vk,kvrc->vrc", hats(times, np.array([0.0, 10.0])), np.stack([whole.forward(x) for x in truth]))
+    found = fit_series(TimedViews(data.astype(np.float32), geometry, times), 2, tv_weight=0.01, sweeps=120)
+    assert psnr(found.volumes, truth) > 50
+    assert psnr(found.at(5.0), truth.mean(0)) > 50
+
+
+def test_a_scan_counts_at_most_so_many_moments_and_learns_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    views, found = views_of(60, noise=0.05), list[F32]()
+    for most in (16, 64):
+        monkeypatch.setattr("recon.series._MOMENTS", most)
+        found.append(fit_series(views, 3, tv_weight=0.5, sweeps=20).volumes)
+    assert psnr(found[0], found[1]) > 35
 
 
 def mean_psnr(at: dict[float, F32]) -> float:
@@ -91,7 +113,7 @@ def test_one_fit_beats_sub_scans_and_one_volume_of_all_views() -> None:
     for parts in (2, 3, 4, 6):
         apart = of_sub_scans(views, parts)
         others.append(mean_psnr({t: apart.at(t) for t in times}))
-    found = fit_series(views, 4, tv_weight=0.1)
+    found = fit_series(views, 4, tv_weight=0.35)
     assert mean_psnr({t: found.at(t) for t in times}) > max(others)
 
 
@@ -118,3 +140,25 @@ def test_too_few_and_too_many_volumes_are_refused(knots: int) -> None:
 def test_times_that_say_nothing_are_refused(times: F64) -> None:
     with pytest.raises(ValueError, match="one a view"):
         replace(views_of(24), times=times)
+
+
+def test_a_gap_with_too_few_views_for_a_volume_is_refused() -> None:
+    views = views_of(60)
+    gap = replace(views, times=np.where(views.times < 3, views.times, views.times + 20))
+    with pytest.raises(ValueError, match=r"volume 2 of 4, at time 10.*, has 0 views within 4.9.*, expected 6 or more"):
+        fit_series(gap, 4)
+
+
+def test_each_part_of_a_scan_with_a_moment_a_view_sees_all_times_and_directions() -> None:
+    """Also the views held out, of which there are eight parts."""
+    views = views_of(72)
+    for parts in (8, 9):
+        timed, past = _of_moments(views, np.array([0.0, 10.0]), 72)
+        part = timed.parted(parts)
+        assert past.size == 72
+        for number in range(parts):
+            own = np.flatnonzero(part == number)
+            assert own.size == 72 // parts
+            assert np.diff(np.r_[-1, own, 72]).max() <= 72 / 3
+            angles = np.sort(np.mod(views.geometry.angles[own], np.pi))
+            assert np.diff(np.r_[angles, angles[0] + np.pi]).max() < np.pi / 3

@@ -11,9 +11,10 @@ import pytest
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.energy_fit import EnergyFit, EnergyViews
 from recon.methods import by_name
 from recon.reconstruction import reconstruct
-from recon.spectral import TRIAL_SWEEPS, EnergyFit, EnergyViews, fit_materials
+from recon.spectral import TRIAL_SWEEPS, fit_materials
 from recon.voxels.projector import Projector
 
 SECTIONS = np.array([[0.2, 1.0], [0.5, 0.9], [1.0, 0.2], [0.9, 0.4]])  # [energy, material]
@@ -214,3 +215,25 @@ def test_values_that_are_not_finite_are_refused() -> None:
     views = views_of(balls(), 4)
     with pytest.raises(ValueError, match="weight 0"):
         EnergyViews(views.projections * np.float32(np.nan), views.geometry, views.energy, SECTIONS)
+
+
+@pytest.mark.parametrize("at", [5, 300])
+@pytest.mark.parametrize("tv_weight", [None, 1e-3])
+def test_a_stop_is_asked_for_within_a_sweep_and_keeps_the_steps_before(tv_weight: float | None, at: int) -> None:
+    """Stopped at a view's energy of some step: nothing is asked again, and the volumes are those of whole steps."""
+    asked, sweeps = list[int](), list[int]()
+
+    def stop() -> bool:
+        asked.append(1)
+        return len(asked) >= at
+
+    def go_on(sweep: int, residual: float) -> bool:
+        sweeps.append(sweep)
+        return True
+
+    views = views_of(balls(), 12)
+    found = fit_materials(views, tv_weight=tv_weight, sweeps=40, go_on=go_on, stop=stop)
+    assert np.isfinite(found.densities).all() and (found.densities > -1e-6).all()
+    assert found.densities.any() and len(asked) <= at + 3 and len(sweeps) <= at // (len(SECTIONS) * 2) + 1
+    if tv_weight is not None and at == 300:
+        assert rms(found.densities - balls()) < 0.3 * rms(balls())

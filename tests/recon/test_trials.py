@@ -80,7 +80,7 @@ def test_what_loses_weak_matter_is_taken_only_where_all_do(losing: tuple[int, ..
 
 def _dense_and_weak(haze: float) -> ReconProblem:
     """A dense rod in the upper rows and a weak one in the lower rows, in views that lack `haze`."""
-    views = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (160, 64), 0.01)
+    views = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (160, 64), pixel_pitch=0.01)
     grid = Grid.matching(views)
     z, y, x = (np.arange(n) - (n - 1) / 2 for n in grid.shape)
     away = (y[:, None] ** 2 + x**2)[None]

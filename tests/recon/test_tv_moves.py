@@ -20,7 +20,7 @@ from recon.splatting.splat import project, voxelize
 from tests.recon.helpers import in_double
 
 VOXEL = 2 / 256  # of the published field, -1 to 1 in 256 voxels
-VIEWS = Geometry.parallel([0.2, 1.1, 2.3], (20, 24), VOXEL)
+VIEWS = Geometry.parallel([0.2, 1.1, 2.3], (20, 24), pixel_pitch=VOXEL)
 GRID = Grid.matching(VIEWS)
 # So much smoothness that nothing else counts, on a box that is the whole grid.
 SETTINGS = FitSettings(

@@ -107,13 +107,15 @@ def test_too_short_a_scan_is_refused_by_its_own_degrees() -> None:
 
 
 def test_half_a_turn_of_a_parallel_beam_that_lacks_views_is_taken() -> None:
-    warm_up(Fbp(), Geometry.parallel(np.linspace(0, 0.9 * np.pi, 20), (4, 16), 0.1))
+    warm_up(Fbp(), Geometry.parallel(np.linspace(0, 0.9 * np.pi, 20), (4, 16), pixel_pitch=0.1))
 
 
 @pytest.mark.parametrize("turn", [2 * np.pi, 3.6, 3.3])
 def test_a_toy_is_of_the_same_kind(turn: float) -> None:
     angles = np.linspace(0, turn, 50, endpoint=False)
-    cone = Geometry.cone(angles, (100, 200), 0.1, 30.0, 90.0, 80.0, shifts=np.ones((50, 2)), tilt=np.full(50, 0.01))
+    cone = Geometry.cone(
+        angles, (100, 200), 0.1, 30.0, 90.0, axis_col=80.0, shifts=np.ones((50, 2)), tilt=np.full(50, 0.01)
+    )
     data, toy = toy_of(cone)
     assert toy.is_cone and (missing_arc(toy) > 0) == (missing_arc(cone) > 0) == (turn < 3.4)
     assert (toy.tilt != 0).all() and toy.shifts.any()

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from recon.base.geometry import Geometry
 
 _MOST_PX, _MOST_DEG = 20.0, 30.0  # beyond them a view shows no detail
+TURNED = "middle_of_exposure_deg"
+"""Parameter of a volume: from the angle in the file to that of the view, where the arc is too short to be modelled."""
 _LEAST_PX = 1.0  # at the edge of the field; `auto` models a motion from there on
 
 
@@ -105,6 +107,7 @@ class Width:
         blur = 0.0 if self.spread in ("none", "pixel") else float(self.spread)
         width = RayWidth(0.0 if self.spread == "none" else 1.0, blur).binned(selection.binning)
         told, motion = self._motion(source), _Motion(0.0, 0.0)
+        parameters: dict[str, Value] = {}
         reach, rows = geometry.reach / geometry.sample_pitch * selection.binning, source.shape[0]
         if told is not None:
             leaning = not geometry.is_straight or selection.step(Calibrate).may_lean
@@ -119,8 +122,11 @@ class Width:
                     )
             elif abs(told.arc) * reach >= _LEAST_PX:
                 motion = _Motion(told.arc, 0.0 if bent else told.skew)
+            elif told.arc:  # too short to be modelled, but views are of the middle of the exposure all the same
+                geometry = replace(geometry, angles=geometry.angles + told.arc / 2)
+                parameters[TURNED] = math.degrees(told.arc / 2)
         if not (width or any(motion)):
-            return geometry, StepDone(parameters={})
+            return geometry, StepDone(parameters=parameters)
         first = (selection.rows or (0, 0))[0] + (selection.binning - 1) / 2
         seen = replace(geometry, angles=geometry.angles + motion.arc / 2 + motion.skew * first)
         seen = seen.seen_with(replace(width, arc=abs(motion.arc)), motion.skew * selection.binning)
@@ -131,7 +137,7 @@ class Width:
                "field)"] if motion.arc else []),
             *([f"the last row sees {turned[1]:.2g} degrees more than the first"] if motion.skew else []),
         ]  # fmt: skip
-        parameters: dict[str, Value] = {
+        parameters |= {
             "ray_width": self.spread, "exposure_arc_deg": math.degrees(motion.arc), "readout_arc_deg": turned[1],
         }  # fmt: skip
         return seen, StepDone(f"In the model of the views {', '.join(said)}.", parameters)

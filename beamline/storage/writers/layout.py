@@ -5,6 +5,7 @@
                                 count_time (s), x_pixel_size, y_pixel_size, distance (mm), field_of_view
       instrument/beam           incident_energy;  instrument/devices: what each device said of itself
       instrument/filter         NXattenuator: type, where there is a filter
+      instrument/monochromator  NXmonochromator: energy (keV), where there is a monochromator
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
       frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
@@ -132,6 +133,7 @@ class ScanInfo:
         plan: JSON; config: YAML; both as text for the record.
         devices: the description of each device, by its name.
         filter: its place, by name.
+        monochromator_kev: at which it stands; `energy_kev` is the same then. None: there is none, or it is not known.
         beam_unit: of the beam monitor's readings; None: there is none.
     """
 
@@ -149,6 +151,7 @@ class ScanInfo:
     devices: Mapping[str, Description] = field(default_factory=lambda: MappingProxyType({}))
     beam_unit: str | None = None
     filter: str | None = None
+    monochromator_kev: float | None = None
 
 
 def iso_time(seconds: float) -> str:
@@ -222,6 +225,10 @@ def create(
     if info.filter is not None:
         file.create_group("/entry/instrument/filter").attrs["NX_class"] = "NXattenuator"
         file["/entry/instrument/filter/type"] = info.filter
+    if info.monochromator_kev is not None:
+        file.create_group("/entry/instrument/monochromator").attrs["NX_class"] = "NXmonochromator"
+        file["/entry/instrument/monochromator/energy"] = np.float64(info.monochromator_kev)
+        file["/entry/instrument/monochromator/energy"].attrs["units"] = "keV"
     for device, description in info.devices.items():
         group = file.create_group(f"/entry/instrument/devices/{device.replace('/', '_')}")
         group.attrs["NX_class"] = "NXcollection"

@@ -13,7 +13,7 @@ from recon.base.volume import Grid
 from recon.voxels.held_out_weight import choose_weight
 from recon.voxels.iterative import run_iterative
 from recon.voxels.noise_balance import NoiseBalance
-from recon.voxels.ordered_fista import ordered_fista
+from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.sweeps import interleaved
 from recon.voxels.voxel_problem import VoxelProblem, density_unit, iterative_memory, largest_eigenvalue
 
@@ -63,9 +63,8 @@ class FistaTv:
             weight = problem.decide(
                 "weight", lambda: share * density_unit(x) * largest_eigenvalue(projector, problem.weight)
             )
-        return ordered_fista(
-            problem, x, weight, sweeps=self.iterations, subsets=self.subsets, tv_steps=self.tv_steps
-        )  # fmt: skip
+        subsets = Subsets.of(problem, self.subsets)
+        return ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
 
     def toy(self) -> Self:
         return replace(self, iterations=1)

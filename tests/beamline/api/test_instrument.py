@@ -234,3 +234,23 @@ def test_importing_the_package_loads_nothing_heavy() -> None:
 def test_every_name_is_there_and_typed() -> None:
     for name in api.__all__:
         assert getattr(api, name).__doc__
+
+
+def test_an_energy_moves_the_monochromator_that_there_is(tmp_path: Path) -> None:
+    with api.connect(
+        config_folder() / "simulated.yaml",
+        say=None,
+        set={
+            "devices.monochromator": {"kind": "simulated"},
+            "simulation.clock": "virtual",
+            "storage.folder": tmp_path,
+            "scan.angles.views": 4,
+            "scan.mode": "step",
+            "scan.darks.count": 2,
+            "scan.flats.count": 2,
+        },
+    ) as instrument:
+        result = instrument.scan(energy_kev=8.34, live=False)
+        with open_scan(result.path) as source:
+            assert source.energy_kev == 8.34
+        assert result.folder.name.endswith("_battery_8.34keV")

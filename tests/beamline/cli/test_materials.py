@@ -211,3 +211,25 @@ def test_a_source_within_the_field_is_refused(scans: list[Path], tmp_path: Path)
     assert done.exit_code == 2, done.output
     assert "the box reaches" in done.output
     assert not list(tmp_path.glob("out*"))
+
+
+def test_a_sample_that_moved_between_the_scans_is_registered(tmp_path: Path) -> None:
+    """By two pixels along x and one along y in the third scan."""
+    made = []
+    for seed, energy in enumerate(ENERGIES):
+        by = (2 * PITCH, -PITCH) if seed == 2 else (0.0, 0.0)
+        text = SCENE
+        for x, y in GRAINS.values():
+            text = text.replace(f"centre: [{x}, {y}, 0.0]", f"centre: [{x + by[0]}, {y + by[1]}, 0.0]")
+        assert (text == SCENE) is (seed != 2)
+        (tmp_path / "scene.yaml").write_text(text)
+        made.append(tmp_path / f"scan{seed}.h5")
+        words = "--set", f"beam.energy_kev={energy}", "--seed", str(seed), "-o", made[-1]
+        assert run("simulate", tmp_path / "scene.yaml", *words).exit_code == 0
+    words = "--spectra", spectra(tmp_path), "--axis", "31.5", "--register"
+    done = run("materials", *made, *words, "-o", tmp_path / "out.h5")
+    assert done.exit_code == 0, done.output
+    with opened_volume(tmp_path / "out_charged.h5") as record:
+        found = np.asarray(record.parameters["displacements"])[:, :3] / PITCH
+    assert found[:, :2] == pytest.approx(np.array([[0, 0], [0, 0], [2, -1], [0, 0]]), abs=0.15)
+    assert f"{1e3 * found[2, 0] * PITCH:+.2f}, " in done.stdout and "µm along x, y, z" in done.stdout

@@ -81,7 +81,7 @@ def test_a_simulated_scan_is_a_scan(folder: Path) -> None:
 def test_truth_stands_on_the_grid_of_the_reconstruction(folder: Path) -> None:
     result = _beamline("simulate", "scene.yaml", "--truth", "truth.h5", "--truth-bin", "2")
     assert result.exit_code == 0, result.output
-    grid = Grid.matching(Geometry.parallel([0.0], (32, 40), 0.012, 21.0).binned(2))
+    grid = Grid.matching(Geometry.parallel([0.0], (32, 40), pixel_pitch=0.012, axis_col=21.0).binned(2))
     with h5py.File("truth.h5") as file:
         data, labels = file["entry/data/data"][...], file["entry/data/labels"][...]
         assert file["entry/data/labels"].attrs["names"].tolist() == ["air", "ellipsoid", "cylinder"]
@@ -210,6 +210,16 @@ def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
     assert result.exit_code == 2
     assert "scene.yaml cannot be exposed: solid 0 (ellipsoid) reaches" in result.stderr
     assert not Path("s.h5").exists()
+
+
+@pytest.mark.parametrize("output", ["--out", "--picture"])
+def test_no_truth_is_left_of_a_scene_that_cannot_be_exposed(folder: Path, output: str) -> None:
+    """The body is at the source in the first view alone, so that the rehearsal of the last one shows nothing."""
+    body = "{kind: ellipsoid, semi_axes: [0.1, 0.1, 0.1], attenuation: 4.0, centre: [0.0, -0.3, 0.0]}"
+    wrong = ("--set", "beam.sod=0.35", "--set", "beam.sdd=1", "--set", f"phantom.solids=[{body}]")
+    result = _beamline("simulate", "scene.yaml", "--truth", "t.h5", output, "s.h5", *wrong)
+    assert (result.exit_code, "reaches" in result.stderr) == (2, True), result.stderr
+    assert not Path("t.h5").exists()
 
 
 def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:

@@ -51,6 +51,10 @@ FAULTS = {
         "my.yaml:8: devices.camera.roi.3 is 'x'; expected a whole number >= 1",
     ),
     "name": (("name: test", "name: a/b"), "sample.name is 'a/b'; expected text of letters, digits and _"),
+    "no text": (
+        ('port: "sim://pm16c"', "port: .nan"),
+        "my.yaml:7: devices.stage.port is .nan; expected text that is not empty",
+    ),
     "scalar for a group": (
         ("{pixel_size_um: 5}", "5"),
         "my.yaml:11: optics is 5; expected a group of keys: pixel_size_um",
@@ -215,6 +219,7 @@ def test_a_number_beyond_all_that_is_real_is_refused(tmp_path: Path, setting: st
         ("[]", "devices.filter.places is []; expected a list of 1 or more: text of 1 to 80 characters"),
         ("['']", "devices.filter.places.0 is ''; expected text of 1 to 80 characters"),
         ("[3]", "devices.filter.places.0 is 3; expected text of 1 to 80 characters"),
+        ("[Al, Cu, Al]", "places has Al more than once; a place has one name"),
     ],
 )
 def test_a_list_of_names_says_what_it_expects(tmp_path: Path, places: str, said: str) -> None:

@@ -52,7 +52,7 @@ def test_every_alternative_in_a_template_is_one(name: str) -> None:
     """The commented devices, put in the place of the ones that stand there."""
     text = (config.config_folder() / f"{name}.yaml").read_text("utf-8")
     joined = re.sub(r",\n  #  +", ", ", text)
-    kind = r"^  # (stage|shutter|sample_mover|filter|beam_monitor): (\{.*?\})(?=\s|$)"
+    kind = r"^  # (stage|shutter|sample_mover|filter|monochromator|beam_monitor): (\{.*?\})(?=\s|$)"
     offered = re.findall(kind, joined, re.MULTILINE)
     kinds = set()
     for key, flow in offered:
@@ -81,7 +81,7 @@ def test_the_devices_of_the_page_on_epics_are_ones() -> None:
     tree["devices"] |= yaml.safe_load(block)["devices"]
     loaded = Config.model_validate(tree).devices
     assert {loaded.stage.kind, loaded.shutter.kind, loaded.filter.kind, loaded.beam_monitor.kind} == {"epics"}
-    assert loaded.sample_mover.kind == "stage"
+    assert (loaded.sample_mover.kind, loaded.monochromator.kind) == ("stage", "epics")
 
 
 def _keys(value: Any, path: tuple[str, ...] = ()) -> set[tuple[str, ...]]:

@@ -19,7 +19,7 @@ from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 pytestmark = pytest.mark.usefixtures("one_thread")
 F32 = NDArray[np.float32]
 SHAPE = (48, 64)
-GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, 60, endpoint=False), SHAPE, 1.0, 32.3)
+GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, 60, endpoint=False), SHAPE, pixel_pitch=1.0, axis_col=32.3)
 WEAK = 0.0015  # 1/px, and so is what stands on a dense post, as Diamond's resin does
 DOME = Ellipsoid((14.0, 14.0, 14.0), WEAK, centre=(1.0, 0.0, -2.0))
 POST = Cylinder(12.0, 20.0, 0.05, centre=(0.0, 0.0, 16.0))
@@ -122,7 +122,7 @@ def test_dust_in_some_views_and_dead_pixels_do_not_bend_the_surface() -> None:
 
 def test_the_same_surface_in_a_cone() -> None:
     angles = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    cone = Geometry.cone(angles, SHAPE, 1.0, 400.0, 400.0, 32.3)
+    cone = Geometry.cone(angles, SHAPE, 1.0, 400.0, 400.0, axis_col=32.3)
     detector = Detector(SHAPE, 1.0, 32.3, cone.axis_row, 400.0)
     sample = Phantom.of((DOME, replace(POST, height=12.0)))
     clean = np.stack([sample.line_integrals(angle, detector) for angle in angles])

@@ -36,7 +36,9 @@ LEARN = Calibrate(("axis", "shifts"))
 def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Counts of balls that jump, in pixels of half a millimetre."""
     path = tmp_path_factory.mktemp("calibrate") / "scan.h5"
-    geometry = Geometry.parallel(np.linspace(0, np.pi, N, endpoint=False), SHAPE, PITCH, AXIS, shifts=JUMP)
+    geometry = Geometry.parallel(
+        np.linspace(0, np.pi, N, endpoint=False), SHAPE, pixel_pitch=PITCH, axis_col=AXIS, shifts=JUMP
+    )
     counts = 100 + 40_000 * np.exp(-balls(10, 12).views(geometry))
     images = [np.full(SHAPE, level) + np.eye(*SHAPE) * i for level in (100.0, 40_100.0) for i in (0, 1)] + list(counts)
     kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * N

@@ -18,7 +18,7 @@ from tests.simulators import shots
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHAPE, ATTENUATION = (2, 100), 0.02
-GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), SHAPE, 1.0, 49.5)
+GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), SHAPE, pixel_pitch=1.0, axis_col=49.5)
 ENERGIES = (20.0, 30.0, 45.0)
 STATED = Hardening("stated", (np.array(ENERGIES) ** -3, np.ones(3)))
 F32 = NDArray[np.float32]
@@ -62,7 +62,7 @@ def test_a_body_denser_outside_is_no_hardening_and_a_cone_takes_a_stated_beam() 
     shell = Phantom.of((Box((60.0, 40.0, 8.0), 0.03), Box((48.0, 28.0, 8.0), -0.012)))
     curve, said = curve_of(_views(shell, (30.0,)), GEOMETRY, Hardening("fit"))
     assert curve is None and "agree less with each other" in said, said
-    cone = Geometry.cone(GEOMETRY.angles, SHAPE, 1.0, 400.0, 500.0, 49.5)
+    cone = Geometry.cone(GEOMETRY.angles, SHAPE, 1.0, 400.0, 500.0, axis_col=49.5)
     curve, said = curve_of(_views(ROD), cone, Hardening("fit"))
     assert curve is None and "takes a parallel beam" in said
     assert curve_of(_views(ROD), cone, STATED)[0] is not None

@@ -42,8 +42,8 @@ def posed(turns: np.ndarray = TURNS) -> Geometry:
     return Geometry.parallel(
         np.radians(DEGREES),
         SHAPE,
-        PITCH,
-        AXIS,
+        pixel_pitch=PITCH,
+        axis_col=AXIS,
         shifts=SHIFTS,
         roll=np.radians(turns[:, 0]),
         tilt=np.radians(turns[:, 1]),
@@ -99,7 +99,10 @@ def test_poses_are_those_of_the_file_in_any_order(tmp_path: Path, by: str) -> No
     assert (
         error(found)
         < 0.2
-        < 0.5 * error(replace(found, geometry=Geometry.parallel(np.radians(DEGREES), SHAPE, PITCH, AXIS)))
+        < 0.5
+        * error(
+            replace(found, geometry=Geometry.parallel(np.radians(DEGREES), SHAPE, pixel_pitch=PITCH, axis_col=AXIS))
+        )
     )
     assert found.done["poses"].said.startswith("40 poses from")
 
@@ -262,7 +265,7 @@ def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> Non
         1.5 * PITCH,
         10.0,
         15.0,
-        AXIS,
+        axis_col=AXIS,
         shifts=np.stack((shift, SHIFTS[:, 1]), axis=1),
         roll=roll,
         tilt=tilt,

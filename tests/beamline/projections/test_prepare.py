@@ -53,7 +53,7 @@ def test_rows_and_bins(tmp_path: Path, rows: tuple[int, int] | None, binning: in
     selection = Selection(rows=rows, binning=binning, axis_col=20.7, steps=PLAIN)
     prepared, _ = _prepare(path, selection)
     first, end = rows or (0, 4)
-    expected = Geometry.parallel(SCAN.angles, (end - first, 40), 0.5, 20.7).binned(binning)
+    expected = Geometry.parallel(SCAN.angles, (end - first, 40), pixel_pitch=0.5, axis_col=20.7).binned(binning)
     assert prepared.geometry.detector_shape == shape == expected.detector_shape
     assert prepared.geometry.axis_col == expected.axis_col
     assert prepared.geometry.pixel_pitch == 0.5 * binning

@@ -18,7 +18,7 @@ from tests.beamline.scans import TwoCylinders, write_exchange
 
 @given(column=st.floats(-10, 5000), binning=st.integers(1, 16))
 def test_unbinned_inverts_the_geometrys_binning(column: float, binning: int) -> None:
-    binned = Geometry.parallel([0.0], (16, 6000), 1.0, column).binned(binning).axis_col
+    binned = Geometry.parallel([0.0], (16, 6000), pixel_pitch=1.0, axis_col=column).binned(binning).axis_col
     assert unbinned(binned, binning) == pytest.approx(column, abs=1e-6)
 
 

@@ -46,14 +46,24 @@ def _rays(step: Width, source: Any, selection: Selection | None = None) -> tuple
     return before, *step.rays(source, chosen, before)
 
 
-def test_nothing_is_changed_by_default_where_the_stage_stood_or_hardly_moved() -> None:
+def test_nothing_is_changed_by_default_where_the_stage_stood() -> None:
     unknown = _source()
     unknown.exposures[:] = np.nan
-    for source in (_source("step"), _source(exposure=0.01), unknown):
+    for source in (_source("step"), unknown):
         before, after, done = _rays(Width(), source)
         assert after is before and (done.said, done.parameters) == ("", {})
     before, after, _ = _rays(Width(arc="none"), _source())
     assert after is before
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_a_stage_that_hardly_moved_was_in_the_middle_of_the_exposure_too(sense: float) -> None:
+    """No width is modelled below a pixel; else the volume would be turned by half of the arc."""
+    before, after, done = _rays(Width(), _source(sense=sense, exposure=0.01))
+    turned = sense * STEP / PERIOD * 0.01 / 2
+    np.testing.assert_allclose(after.angles, before.angles + turned, rtol=0, atol=1e-15)
+    assert (after.width, after.skew) == (before.width, 0) and done.said == ""
+    assert done.parameters == {"middle_of_exposure_deg": pytest.approx(math.degrees(turned))}
 
 
 @pytest.mark.parametrize("sense", [1.0, -1.0])

@@ -182,7 +182,9 @@ def test_the_shortest_fit_is_said_to_be_late_too(
 @pytest.fixture
 def high(prepared: PreparedProjections) -> PreparedProjections:
     """The same views, 64 rows high."""
-    views = Geometry.parallel(prepared.geometry.angles, (64, 40), prepared.geometry.pixel_pitch, SCAN.axis_col)
+    views = Geometry.parallel(
+        prepared.geometry.angles, (64, 40), pixel_pitch=prepared.geometry.pixel_pitch, axis_col=SCAN.axis_col
+    )
     data = np.repeat(prepared.projections.data[:, 2:3], 64, axis=1)
     noise = np.random.default_rng(0).normal(0, 0.02, data.shape).astype(np.float32)
     return replace(
@@ -266,7 +268,7 @@ def _cone(
     pitch = prepared.geometry.pixel_pitch
     angles = np.linspace(0, turn, 36, endpoint=False)
     cone = Geometry.cone(
-        angles, SCAN.shape, magnification * pitch, 400.0, 400.0 * magnification, SCAN.axis_col, tilt=tilt
+        angles, SCAN.shape, magnification * pitch, 400.0, 400.0 * magnification, axis_col=SCAN.axis_col, tilt=tilt
     )
     grid = Grid.matching(cone)
     assert grid == Grid.matching(prepared.geometry)

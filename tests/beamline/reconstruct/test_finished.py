@@ -112,7 +112,9 @@ def test_fbp_is_the_object_in_inverse_millimetres(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("real_pictures")
 def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -> None:
     events: list[Event] = []
-    np.savez(tmp_path / "truth.npz", volume=SCAN.truth(Grid.matching(Geometry.parallel([0.0], (2, 40), 0.5))))
+    np.savez(
+        tmp_path / "truth.npz", volume=SCAN.truth(Grid.matching(Geometry.parallel([0.0], (2, 40), pixel_pitch=0.5)))
+    )
     target = OutputPaths(tmp_path / "out.h5", tmp_path / "out.html")
     options = _options(tmp_path, method=R2(steps=150, gaussians=400), target=target, truth=str(tmp_path / "truth.npz"))
     options = replace(options, selection=Selection(views="fixed:12", axis_col=SCAN.axis_col))

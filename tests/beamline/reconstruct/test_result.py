@@ -44,7 +44,7 @@ def _scan(folder: Path, turn: float) -> tuple[PreparedProjections, ReportContext
         selection = Selection(axis_col=SCAN.axis_col)
         prepared = prepare_projections(source, selection, lambda said: None)
     angles = np.linspace(0, turn, 30, endpoint=False)
-    cone = Geometry.cone(angles, SCAN.shape, 5.0, 400.0, 2000.0, SCAN.axis_col)
+    cone = Geometry.cone(angles, SCAN.shape, 5.0, 400.0, 2000.0, axis_col=SCAN.axis_col)
     grid = Grid.matching(cone)
     data = Projector(cone, grid).forward(SCAN.truth(grid))
     views = replace(prepared, projections=replace(prepared.projections, data=data), geometry=cone, held_out=None)
@@ -126,8 +126,8 @@ def test_a_view_is_drawn_as_large_as_it_is_at_the_axis(monkeypatch: pytest.Monke
     drawn: list[Figure] = []
     monkeypatch.setattr(figures, "png", lambda figure: drawn.append(figure) or b"")
     for geometry in (
-        Geometry.parallel([0.0, 1.0], (6, 40), 0.5, 18.0),
-        Geometry.cone([0.0, 1.0], (6, 40), 5.0, 100.0, 1000.0, 18.0),
+        Geometry.parallel([0.0, 1.0], (6, 40), pixel_pitch=0.5, axis_col=18.0),
+        Geometry.cone([0.0, 1.0], (6, 40), 5.0, 100.0, 1000.0, axis_col=18.0),
     ):
         figures.projection(np.random.default_rng(0).random((2, 6, 40), np.float32), geometry, 0, "mm")
     flat, cone = (figure.axes[0].get_images()[0].get_extent() for figure in drawn)

@@ -212,7 +212,7 @@ def test_the_sheet_of_darks_and_flats(rng: np.random.Generator) -> None:
 
 
 def test_projection_and_sinogram(rng: np.random.Generator) -> None:
-    geometry = Geometry.parallel([2.0, 0.0, 1.0], (2, 30), 0.1, axis_col=20.0)
+    geometry = Geometry.parallel([2.0, 0.0, 1.0], (2, 30), pixel_pitch=0.1, axis_col=20.0)
     data = rng.random((3, 2, 30), dtype=np.float32)
     assert _pixels(figures.projection(data, geometry, 0, "mm")).ndim == 3
     assert _pixels(figures.sinogram(data, geometry, 1)).ndim == 3

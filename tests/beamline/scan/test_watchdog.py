@@ -229,7 +229,10 @@ class _Behind:
     """A soft IOC: a motor record, a shutter whose blade follows, and the stops of two other motors."""
 
     def __init__(self, record: MotorRecord, lost: bool) -> None:
-        self._record, self.values = record, {"open": 0.0, "close": 0.0, "blade": 1.0, "M.STOP": 0.0, "F.STOP": 0.0}
+        self._record, self.values = (
+            record,
+            {"open": 0.0, "close": 0.0, "blade": 1.0, "M.STOP": 0.0, "F.STOP": 0.0, "E": 8.0, "E.STOP": 0.0},
+        )
         if lost:
             del self.values["blade"]
 
@@ -261,6 +264,8 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         f"status_pv: 'pva://{PREFIX}blade', timeout_s: 0.5}}",
         f"devices.sample_mover={{kind: stage, in_deg: 0, out_deg: 10, stage: {{kind: epics, {motor}M'}}}}",
         f"devices.filter={{kind: stage, places: {{none: 0}}, stage: {{kind: epics, {motor}F'}}}}",
+        f"devices.monochromator={{kind: epics, pv: 'pva://{PREFIX}E', status_pv: 'pva://{PREFIX}E', "
+        f"stop_pv: 'pva://{PREFIX}E.STOP', timeout_s: 0.5}}",
         "scan.mode=step",
     ]
     config = load(config_folder() / "instrument.yaml", words, {})
@@ -277,7 +282,8 @@ def test_devices_behind_process_variables_are_made_safe(monkeypatch: pytest.Monk
         assert stage.position() < 2.9  # it was on its way to 3
         stage.close()
     assert (served.values.get("blade", 0.0), served.values["M.STOP"], served.values["F.STOP"]) == (0.0, 1.0, 1.0)
-    stopped, shutter, mover, changer, disarmed = said
+    stopped, shutter, mover, changer, crystal, disarmed = said
+    assert (crystal, served.values["E.STOP"]) == ("The monochromator was told to stop.", 1.0)
     assert changer == "The filter was told to stop."
     assert (stopped, mover) == ("The stage was told to stop.", "The sample mover was told to stop.")
     assert (shutter == "The shutter is closed.") is not lost

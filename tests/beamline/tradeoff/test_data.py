@@ -34,7 +34,7 @@ def test_arrays_survive_the_file(tmp_path: Path) -> None:
 
 
 def test_the_geometry_comes_without_the_views(tmp_path: Path) -> None:
-    views = Geometry.parallel([0.0, 1.0], (4, 6), 0.5, 2.2)
+    views = Geometry.parallel([0.0, 1.0], (4, 6), pixel_pitch=0.5, axis_col=2.2)
     Data(np.zeros((2, 4, 6), np.float32), views, None, None).save(tmp_path / "data.npz")
     found = geometry_in(tmp_path / "data.npz")
     assert (found.detector_shape, found.axis_col, found.is_cone) == ((4, 6), 2.2, False)

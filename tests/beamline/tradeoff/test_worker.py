@@ -34,7 +34,7 @@ SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
 
 @pytest.fixture
 def data() -> Data:
-    views = Geometry.parallel(SCAN.angles, SCAN.shape, 0.5, SCAN.axis_col)
+    views = Geometry.parallel(SCAN.angles, SCAN.shape, pixel_pitch=0.5, axis_col=SCAN.axis_col)
     integrals = SCAN.line_integrals().astype(np.float32)
     held = np.arange(3, 30, 9)
     used = np.setdiff1d(np.arange(30), held)
@@ -154,7 +154,7 @@ def test_iterations(data: Data, method: str) -> None:
 
 
 def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
-    fine = Geometry.parallel([0.0], (8, 12), 0.5)
+    fine = Geometry.parallel([0.0], (8, 12), pixel_pitch=0.5)
     coarse, grid = Grid.matching(fine.binned(2)), Grid.matching(fine)
 
     def ramp(on: Grid) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -168,7 +168,7 @@ def test_a_volume_of_binned_pixels_lies_where_the_fine_one_does() -> None:
 
 def _cone(data: Data, **leaning: float) -> Data:
     """The same pixels as if they were a cone's."""
-    around = Geometry.cone(2 * data.geometry.angles, SCAN.shape, 1.0, 60.0, 120.0, SCAN.axis_col, **leaning)
+    around = Geometry.cone(2 * data.geometry.angles, SCAN.shape, 1.0, 60.0, 120.0, axis_col=SCAN.axis_col, **leaning)
     return replace(data, geometry=around, held_out=None)
 
 

@@ -16,6 +16,16 @@ from recon.base.volume import Grid, Volume
 from recon.splatting.problem import binned_geometry
 
 
+def test_an_axis_is_never_taken_for_a_pitch() -> None:
+    """What a user may leave out has a name: a third number was the pitch, and meant as the axis."""
+    given: Any = ([0.0], (4, 96), 47.5)
+    with pytest.raises(TypeError, match="positional"):
+        Geometry.parallel(*given)
+    for cone in ((*given, 50.0, 70.0, 47.5), ([0.0], 96, 0.5, 50.0, 70.0, 47.5)):
+        with pytest.raises(TypeError, match="positional"):
+            (Geometry.cone if cone[1] == (4, 96) else Geometry.fan)(*cone)
+
+
 def test_the_axis_is_in_the_middle_unless_told() -> None:
     assert Geometry.parallel([0.0], (4, 10)).axis_col == 4.5
     assert Geometry.parallel([0.0], (4, 10), axis_col=3.2).axis_col == 3.2
@@ -89,7 +99,7 @@ def test_the_edges_are_half_a_voxel_beyond_the_centres() -> None:
 
 def test_the_field_of_a_centred_axis_is_the_matching_grid() -> None:
     for cols, pitch in ((7, 0.1), (160, 0.0046), (2048, 1.0)):
-        views = Geometry.parallel([0.0], (5, cols), pitch)
+        views = Geometry.parallel([0.0], (5, cols), pixel_pitch=pitch)
         assert Grid.of_field(views, pitch) == Grid.matching(views)
 
 
@@ -154,9 +164,9 @@ def test_the_field_holds_every_ray_and_no_more(
 ) -> None:  # fmt: skip
     angles, how = 0.7 * np.arange(len(shifts)), {"axis_row": axis[1], "shifts": shifts}
     if cone:
-        views = Geometry.cone(angles, (rows, cols), 2 * pitch, 1000 * pitch, 2000 * pitch, axis[0], **how)
+        views = Geometry.cone(angles, (rows, cols), 2 * pitch, 1000 * pitch, 2000 * pitch, axis_col=axis[0], **how)
     else:
-        views = Geometry.parallel(angles, (rows, cols), pitch, axis[0], **how)
+        views = Geometry.parallel(angles, (rows, cols), pixel_pitch=pitch, axis_col=axis[0], **how)
     voxel = pitch * coarser
     (*_, bottom), (x, y, top) = Grid.of_field(views, voxel).edges
     u, z = np.stack([_edges(views, view) for view in range(views.n_views)], axis=1)
@@ -178,7 +188,7 @@ def test_shifts_common_to_all_views_equal_a_moved_axis() -> None:
 
 @given(sod=st.floats(3, 60), voxel=st.floats(1, 9), axis=st.floats(0, 40))
 def test_the_field_of_a_wide_cone_ends_before_its_source(sod: float, voxel: float, axis: float) -> None:
-    views = Geometry.cone([0.0, 2.0], (5, 40), 2.0, sod, 2 * sod, axis)
+    views = Geometry.cone([0.0, 2.0], (5, 40), 2.0, sod, 2 * sod, axis_col=axis)
     field = Grid.of_field(views, min(voxel, sod))
     assert np.hypot(*field.edges[1, :2]) < sod
     assert field.edges[1, 0] >= min(views.reach, 0.7 * sod - field.voxel_size / 2) * (1 - 1e-9)
@@ -196,8 +206,8 @@ def test_binned_pixels_stay_before_the_sample_where_they_were(
 ) -> None:  # fmt: skip
     how = {"axis_row": row, "shifts": [[1.0, -2.0]]}
     fine = (
-        Geometry.cone([0.3], (11, 31), 0.3, 50.0, 70.0, axis, **how)
-        if cone else Geometry.parallel([0.3], (11, 31), 0.3, axis, **how)
+        Geometry.cone([0.3], (11, 31), 0.3, 50.0, 70.0, axis_col=axis, **how)
+        if cone else Geometry.parallel([0.3], (11, 31), pixel_pitch=0.3, axis_col=axis, **how)
     )  # fmt: skip
     coarse = binned_geometry(fine, factor)
     for point in ((0.0, 0.0, 0.0), (0.7, -0.4, 1.1)):
@@ -210,9 +220,9 @@ def test_binned_pixels_stay_before_the_sample_where_they_were(
 def test_axes_are_a_right_handed_frame_that_puts_points_where_trigonometry_does(
     angle: float, roll: float, tilt: float, point: tuple[float, float, float], cone: bool
 ) -> None:
-    how = {"axis_col": 3.3, "axis_row": 2.2, "shifts": [[0.5, -1.5]], "roll": roll, "tilt": tilt}
-    make = (lambda *a, **k: Geometry.cone(*a, 50.0, 70.0, **k)) if cone else Geometry.parallel
-    geometry = make([angle], (6, 8), 0.3, **how)
+    how: Any = {"axis_col": 3.3, "axis_row": 2.2, "shifts": [[0.5, -1.5]], "roll": roll, "tilt": tilt}
+    distances = {"sod": 50.0, "sdd": 70.0} if cone else {}
+    geometry = (Geometry.cone if cone else Geometry.parallel)([angle], (6, 8), pixel_pitch=0.3, **distances, **how)
     u, v, d = geometry.axes(0)
     np.testing.assert_allclose(np.stack((u, v, d)) @ np.stack((u, v, d)).T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(np.cross(u, v), -d, atol=1e-12)
@@ -234,9 +244,9 @@ def test_the_pixel_of_a_cone_is_smaller_at_the_sample() -> None:
 def test_cutting_and_binning_keep_the_rays_of_a_cone_and_of_leaning_views(start: int, factor: int, cone: bool) -> None:
     lean = {"axis_row": 3.1, "shifts": [[1.0, 2.0]], "roll": 0.2, "tilt": 0.1}
     whole = (
-        Geometry.cone([0.3], (9, 12), 0.5, 20.0, 30.0, 4.2, **lean)
+        Geometry.cone([0.3], (9, 12), 0.5, 20.0, 30.0, axis_col=4.2, **lean)
         if cone
-        else Geometry.parallel([0.3], (9, 12), 0.5, 4.2, **lean)
+        else Geometry.parallel([0.3], (9, 12), pixel_pitch=0.5, axis_col=4.2, **lean)
     )
     binned = whole.rows(start, 9).binned(factor)
     for j in range(binned.detector_shape[0]):
@@ -261,7 +271,7 @@ def test_views_keep_their_own_shifts_roll_and_tilt() -> None:
 
 
 def test_a_grid_follows_the_height_of_the_axis_row() -> None:
-    view = Geometry.parallel([0.0], (5, 8), 0.5, axis_row=3.0)  # the middle row, 2, is one row below z = 0
+    view = Geometry.parallel([0.0], (5, 8), pixel_pitch=0.5, axis_row=3.0)  # the middle row, 2, is one row below z = 0
     assert Grid.matching(view).centre[0] == pytest.approx(-0.5)
     assert Grid.of_field(view, 0.5).centre[0] == pytest.approx(-0.5)
 
@@ -289,7 +299,9 @@ def test_views_half_a_turn_apart_bring_nothing_new_only_where_they_see_the_same_
 
 
 def test_arrays_hold_all_of_a_geometry() -> None:
-    one = Geometry.cone([0.0, 1.0], (4, 6), 0.2, 50, 90, 2.2, shifts=[(1, 2), (3, 4)], roll=0.1, tilt=[0.2, 0.3])
+    one = Geometry.cone(
+        [0.0, 1.0], (4, 6), 0.2, 50, 90, axis_col=2.2, shifts=[(1, 2), (3, 4)], roll=0.1, tilt=[0.2, 0.3]
+    )
     for geometry in (
         one.seen_with(RayWidth(1.0, 0.5, 0.01)),
         Geometry.parallel([1.0], (3, 3)).seen_with(NO_WIDTH, 1e-4),
@@ -312,7 +324,7 @@ def test_rows_with_angles_of_their_own_are_of_straight_parallel_views() -> None:
 
 
 def test_a_fan_is_a_cone_of_one_row_in_the_plane_of_the_source() -> None:
-    fan = Geometry.fan([0.0, 1.0], 7, 0.5, 20.0, 40.0, 2.5, shifts=[0.25, -1.0])
-    cone = Geometry.cone([0.0, 1.0], (1, 7), 0.5, 20.0, 40.0, 2.5, shifts=[(0.25, 0.0), (-1.0, 0.0)])
+    fan = Geometry.fan([0.0, 1.0], 7, 0.5, 20.0, 40.0, axis_col=2.5, shifts=[0.25, -1.0])
+    cone = Geometry.cone([0.0, 1.0], (1, 7), 0.5, 20.0, 40.0, axis_col=2.5, shifts=[(0.25, 0.0), (-1.0, 0.0)])
     assert repr(fan) == repr(cone) and fan.axis_row == 0
     np.testing.assert_array_equal(fan.shifts, cone.shifts)

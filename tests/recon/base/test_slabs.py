@@ -36,7 +36,7 @@ def test_rows_of_a_slab_see_what_whole_views_see(
     shifts = np.zeros((6, 2))
     shifts[::2, 1] = shift
     angles = np.arange(6) / 2
-    geometry = Geometry.parallel(angles, (24, 20), 0.3, axis_row=axis_row, shifts=shifts)
+    geometry = Geometry.parallel(angles, (24, 20), pixel_pitch=0.3, axis_row=axis_row, shifts=shifts)
     grid = Grid.matching(geometry)
     volume = rng.random(grid.shape, np.float32)
     whole = Projector(geometry, grid).forward(volume)

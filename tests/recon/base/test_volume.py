@@ -63,11 +63,11 @@ def test_views_that_jump_along_the_axis_find_all_matter() -> None:
 
 def _shifted(*shifts: tuple[float, float]) -> Geometry:
     """Views of 10 x 32 pixels of half a millimetre, shifted like these (col, row) in turn."""
-    return Geometry.parallel(TURN, (10, 32), 0.5, shifts=np.resize(np.array(shifts), (48, 2)))
+    return Geometry.parallel(TURN, (10, 32), pixel_pitch=0.5, shifts=np.resize(np.array(shifts), (48, 2)))
 
 
 def test_a_shift_of_all_views_moves_the_matching_volume_as_the_axis_row_does() -> None:
-    explicit = Geometry.parallel(TURN, (10, 32), 0.5, axis_col=15.5 + 14.0, axis_row=11.5)
+    explicit = Geometry.parallel(TURN, (10, 32), pixel_pitch=0.5, axis_col=15.5 + 14.0, axis_row=11.5)
     found = Grid.matching(_shifted((14.0, 7.0)))
     assert found == Grid.matching(explicit)
     assert found.centre[0] == pytest.approx(Grid.for_fit(_shifted((0.0, 7.0)), found).centre[0])

@@ -22,7 +22,7 @@ from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 pytestmark = pytest.mark.usefixtures("one_thread")
 F32 = NDArray[np.float32]
 SHAPE, VIEWS = (24, 48), 60
-GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), SHAPE, 1.0, 24.3)
+GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), SHAPE, pixel_pitch=1.0, axis_col=24.3)
 TIMES = np.linspace(0, 1, VIEWS)
 SOFT, NOISE = 0.01, 0.003  # 1/px; line integrals
 INSIDE, ROWS = 22.0, slice(2, 22)  # px about the axis, and slices, in which volumes are compared

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 F32 = NDArray[np.float32]
 SHAPE, VIEWS = (20, 72), 60  # two bands
 MIDDLE = 35.5
-GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), SHAPE, 1.0, MIDDLE)
+GEOMETRY = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), SHAPE, pixel_pitch=1.0, axis_col=MIDDLE)
 BALL = Ellipsoid((2.0, 2.0, 2.0), 0.03, centre=(0, 0, 0))
 
 
@@ -96,6 +96,6 @@ def test_a_stripe_of_all_rows_may_be_the_wall_of_a_can() -> None:
 def test_few_views_are_refused_and_the_memory_is_that_of_a_band() -> None:
     with pytest.raises(ValueError, match="39 views"):
         learn_gains(np.ones((39, *SHAPE), np.float32), GEOMETRY.select(np.arange(39)))
-    high = Geometry.parallel(GEOMETRY.angles, (2000, 72), 1.0, MIDDLE)
-    low = Geometry.parallel(GEOMETRY.angles, (24, 72), 1.0, MIDDLE)
+    high = Geometry.parallel(GEOMETRY.angles, (2000, 72), pixel_pitch=1.0, axis_col=MIDDLE)
+    low = Geometry.parallel(GEOMETRY.angles, (24, 72), pixel_pitch=1.0, axis_col=MIDDLE)
     assert gains_memory(high) < gains_memory(low) + 16 * 2000 * 72

@@ -20,7 +20,7 @@ from recon.voxels.projector import Projector, data_residual
 
 ANGLES = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 VIEWS = {
-    "parallel": Geometry.parallel(ANGLES, (8, 24), 0.5),
+    "parallel": Geometry.parallel(ANGLES, (8, 24), pixel_pitch=0.5),
     "cone": Geometry.cone(ANGLES, (8, 24), 0.75, 40.0, 60.0),
 }
 SMALL = {

@@ -14,11 +14,13 @@ GRID = Grid((20, 32, 32), 0.25, (0.4, 0.2, -0.3))
 ANGLES = np.array([0.0, 0.3, np.pi / 2, 2.0, 4.0])
 LEAN = {"roll": 0.05 * np.cos(ANGLES), "tilt": 0.04 * np.sin(ANGLES), "shifts": np.stack((ANGLES / 3, -ANGLES / 4), 1)}
 VIEWS = {
-    "parallel": Geometry.parallel(ANGLES, (12, 20), 0.4, 9.2),
-    "skew": Geometry.parallel(ANGLES, (12, 20), 0.4, 9.2).seen_with(Geometry.parallel([0], (1, 1)).width, 0.01),
-    "leaning": Geometry.parallel(ANGLES, (12, 20), 0.4, 9.2, **LEAN),
-    "cone": Geometry.cone(ANGLES, (12, 20), 0.6, 20.0, 30.0, 10.1, axis_row=5.0),
-    "leaning cone": Geometry.cone(ANGLES, (12, 20), 0.6, 20.0, 30.0, 10.1, axis_row=5.0, **LEAN),
+    "parallel": Geometry.parallel(ANGLES, (12, 20), pixel_pitch=0.4, axis_col=9.2),
+    "skew": Geometry.parallel(ANGLES, (12, 20), pixel_pitch=0.4, axis_col=9.2).seen_with(
+        Geometry.parallel([0], (1, 1)).width, 0.01
+    ),
+    "leaning": Geometry.parallel(ANGLES, (12, 20), pixel_pitch=0.4, axis_col=9.2, **LEAN),
+    "cone": Geometry.cone(ANGLES, (12, 20), 0.6, 20.0, 30.0, axis_col=10.1, axis_row=5.0),
+    "leaning cone": Geometry.cone(ANGLES, (12, 20), 0.6, 20.0, 30.0, axis_col=10.1, axis_row=5.0, **LEAN),
 }
 
 
@@ -40,7 +42,7 @@ def test_integrals_of_a_smooth_blob_are_those_of_the_projector(kind: str) -> Non
 
 
 def test_a_ray_past_the_box_has_no_length_and_one_along_a_side_is_not_lost() -> None:
-    geometry = Geometry.parallel([0.0], (1, 41), 0.5)  # columns at -10 ... 10 mm
+    geometry = Geometry.parallel([0.0], (1, 41), pixel_pitch=0.5)  # columns at -10 ... 10 mm
     grid = Grid((4, 8, 8), 1.0)
     lengths = rays_of(geometry, 0, np.arange(41), grid).lengths * 8
     across = (np.arange(41) - 20) * 0.5

@@ -13,9 +13,9 @@ from tests.recon.kernels.gpu.on_gpu import EXACT as EXACT
 
 SHAPE, PITCH = (11, 13), 0.5  # no multiple of a tile
 BEAMS = {
-    "parallel": Geometry.parallel([0.7], SHAPE, PITCH, 5.3),
-    "leaning": Geometry.parallel([2.5], SHAPE, PITCH, 5.3, axis_row=4.0, roll=0.2, tilt=-0.3),
-    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, 5.3),
+    "parallel": Geometry.parallel([0.7], SHAPE, pixel_pitch=PITCH, axis_col=5.3),
+    "leaning": Geometry.parallel([2.5], SHAPE, pixel_pitch=PITCH, axis_col=5.3, axis_row=4.0, roll=0.2, tilt=-0.3),
+    "cone": Geometry.cone([-4.0], SHAPE, 0.8, 25.0, 40.0, axis_col=5.3),
 }
 GRID = Grid((5, 6, 9), 0.6, centre=(0.4, -0.8, 1.1))
 FAR = 30.0  # px: no pixel is farther from the middle of the detector, or from a centre in it

@@ -42,7 +42,7 @@ def test_far_outside_there_is_nothing_and_no_gradient(far: float) -> None:
 
 def test_far_outside_and_large_enough_to_be_seen() -> None:
     far = 1e5
-    view = Geometry.parallel([0.0], SHAPE, 1.0)
+    view = Geometry.parallel([0.0], SHAPE, pixel_pitch=1.0)
     found = compare(at([(far, 0.0, 3.0), (3.0, 0.0, -far), (-far, far, far)], far / 2), view, device=DEVICE)
     assert found.value < bound(far, 0.3 * far)
     assert found.worst < gradient_bound(far, 0.3 * far), found.gradients
@@ -51,7 +51,7 @@ def test_far_outside_and_large_enough_to_be_seen() -> None:
 def test_on_the_borders_of_images_and_tiles() -> None:
     sigma = 0.4
     cols, rows = (-1.0, -0.5, 0.0, 7.5, 8.0, 12.0, 12.5, 13.0), (-1.0, 0.0, 7.5, 8.0, 10.0, 11.0)
-    view = Geometry.parallel([0.0], SHAPE, 1.0, 0.0, axis_row=0.0)  # x is the column, z the row
+    view = Geometry.parallel([0.0], SHAPE, pixel_pitch=1.0, axis_col=0.0, axis_row=0.0)  # x is the column, z the row
     found = compare(at([(u, 0.0, v) for u in cols for v in rows], sigma), view, device=DEVICE)
     assert found.value < bound(FAR, 0.7 * sigma)
     assert found.worst < gradient_bound(FAR, 0.7 * sigma), found.gradients
@@ -129,7 +129,7 @@ def test_a_dynamic_range_of_1e8_leaves_each_pixel_its_digits() -> None:
     # Densities fall by 1e8 along the columns: the error of a pixel is relative to what is in that pixel.
     n = 9
     size = 10 ** np.linspace(4, -4, n)
-    view = Geometry.parallel([0.0], (5, 8 * n), 1.0, 0.0, axis_row=0.0)
+    view = Geometry.parallel([0.0], (5, 8 * n), pixel_pitch=1.0, axis_col=0.0, axis_row=0.0)
     places = np.stack((8 * np.arange(n) + 3.3, np.zeros(n), np.full(n, 2.2)), 1)
     g = Gaussians.from_physical(places, np.full(n, 0.6), size, density_unit=1.0)
     found = project(as_leaves(g, DEVICE), view, truncation=WHOLE, implementation="gpu").detach().cpu().double()[0]
@@ -147,7 +147,7 @@ def test_a_pile_at_one_pixel_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> 
     groups, weight = 200, 1 + 0.9 * 2.0**-17
     one = Gaussians.from_physical([[0.0, 0.0, 0.0]], [0.9], [weight / (0.9 * math.sqrt(2 * math.pi))])
     pile = as_leaves(one.select(torch.zeros(groups * images._GROUP, dtype=torch.int64)), DEVICE)
-    shown = project(pile, Geometry.parallel([0.0], (1, 1), 1.0), truncation=WHOLE, implementation="gpu")
+    shown = project(pile, Geometry.parallel([0.0], (1, 1), pixel_pitch=1.0), truncation=WHOLE, implementation="gpu")
     off = abs(float(shown.detach()) / (groups * images._GROUP * weight) - 1)
     assert off < 16 * STEP  # of it the weight's own: a dozen roundings
     one_by_one = np.cumsum(np.full(groups, weight, np.float32), dtype=np.float32)[-1]

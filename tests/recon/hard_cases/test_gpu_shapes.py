@@ -65,7 +65,7 @@ def test_flat_discs_at_any_angle(beam: str, thin: float) -> None:
 
 
 def test_a_flat_disc_seen_edge_on() -> None:
-    view = Geometry.parallel([0.0], SHAPE, PITCH)  # a line 0.002 px wide through the middle of a column
+    view = Geometry.parallel([0.0], SHAPE, pixel_pitch=PITCH)  # a line 0.002 px wide through the middle of a column
     found = compare(Gaussians.from_physical([[0.0, 0.0, 0.0]], [[1e-3, 2.0, 2.0]], [0.8]), view, device=DEVICE)
     assert found.value < bound(FAR, 1e-3 / PITCH)
     assert found.worst < gradient_bound(FAR, 1e-3 / PITCH), found.gradients
@@ -76,7 +76,7 @@ def test_dots_smaller_than_a_pixel(sigma: float) -> None:
     g = some((sigma,) * 3, 12, 6.0)
     identity = torch.tensor([[1.0, 0, 0, 0]]).repeat(12, 1)
     moved = Gaussians(torch.round(g.means) + 0.5 * sigma, g.log_scales, identity, g.raw_densities, g.density_unit)
-    found = compare(moved, Geometry.parallel([0.0], SHAPE, 1.0), device=DEVICE)
+    found = compare(moved, Geometry.parallel([0.0], SHAPE, pixel_pitch=1.0), device=DEVICE)
     assert found.value < bound(FAR, sigma)
     del found.gradients["quaternions"]  # of round Gaussians they are zero, see below
     assert found.worst < gradient_bound(FAR, sigma), found.gradients
@@ -122,7 +122,7 @@ def test_factors_of_the_quadratic_form_keep_their_digits_at_any_width(sigma: flo
     g = as_leaves(Gaussians.from_physical([[2.0, 0.0, 1.0]], [sigma], [0.8 / sigma]), DEVICE)
     raw = (g.means, g.log_scales, g.quaternions, g.raw_densities)
     run = engine.GpuPass(*(t.detach() for t in raw), g.density_unit)
-    seen = run.view(Geometry.parallel([0.0], (5, 9), 1.0), 0, 1e-6, 3.5, RayModel())
+    seen = run.view(Geometry.parallel([0.0], (5, 9), pixel_pitch=1.0), 0, 1e-6, 3.5, RayModel())
     table = seen.footprints.table[0].tolist()
     np.testing.assert_allclose([table[k] * sigma**2 for k in (K, KV)], 1, rtol=1e-5)
     assert table[W] == pytest.approx(0.8 * math.sqrt(2 * math.pi), rel=1e-5)

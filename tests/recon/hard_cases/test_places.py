@@ -21,7 +21,7 @@ from tests.recon.hard_cases.measure import RECURRENCE, STEP, WHOLE, bound, compa
 from tests.recon.helpers import as_leaves, gradients, in_double
 
 SHAPE = (33, 47)  # neither a multiple of the 4 rows nor of the 16 columns that the kernels take at a time
-VIEW = Geometry.parallel([0.0], SHAPE, 1.0, 0.0, axis_row=0.0)  # x is the column, z the row
+VIEW = Geometry.parallel([0.0], SHAPE, pixel_pitch=1.0, axis_col=0.0, axis_row=0.0)  # x is the column, z the row
 CONE = Geometry.cone([0.0], SHAPE, 1.0, 10.0, 20.0)
 EXACT = RayModel(exact_above=0.0)
 

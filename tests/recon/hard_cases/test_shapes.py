@@ -21,9 +21,11 @@ from tests.recon.helpers import as_leaves, gradients
 SHAPE, PITCH = (24, 30), 0.5
 ANGLES = (0.3, 0.7, 2.5, -4.0)
 BEAMS = {
-    "parallel": Geometry.parallel(ANGLES, SHAPE, PITCH, 13.3),
-    "leaning": Geometry.parallel(ANGLES, SHAPE, PITCH, 13.3, axis_row=10.0, roll=(0.2, -0.1, 0.0, 0.05), tilt=-0.3),
-    "cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, 13.3),
+    "parallel": Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=13.3),
+    "leaning": Geometry.parallel(
+        ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=13.3, axis_row=10.0, roll=(0.2, -0.1, 0.0, 0.05), tilt=-0.3
+    ),
+    "cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, axis_col=13.3),
 }
 GRID = Grid((9, 12, 20), 0.6, centre=(0.4, -0.8, 1.1))
 FAR = 40.0  # px: no pixel is farther from the middle of the detector, or from a centre in it
@@ -116,7 +118,7 @@ def test_flat_discs_at_any_angle(beam: str, thin: float) -> None:
 @pytest.mark.parametrize("edge_on", [True, False])
 def test_a_flat_disc_seen_edge_on_and_face_on(edge_on: bool) -> None:
     # Thin along x: at 0 degrees a line 0.002 px wide through the middle of a column, at 90 degrees a round spot.
-    view = Geometry.parallel([0.0 if edge_on else math.pi / 2], (25, 31), PITCH)
+    view = Geometry.parallel([0.0 if edge_on else math.pi / 2], (25, 31), pixel_pitch=PITCH)
     g = Gaussians.from_physical([[0.0, 0.0, 0.0]], [[1e-3, 2.0, 2.0]], [0.8])
     found = compare(g, view)
     assert found.value < bound(FAR, 1e-3 / PITCH if edge_on else 2.0 / PITCH)
@@ -136,7 +138,7 @@ def test_a_flat_disc_seen_edge_on_and_face_on(edge_on: bool) -> None:
 @pytest.mark.parametrize("sigma", [0.2, 0.05, 1e-2, 1e-3])
 def test_dots_smaller_than_a_pixel(sigma: float) -> None:
     # On the lattice of the pixels, and off it by half a standard deviation: else no pixel sees the small ones.
-    view = Geometry.parallel([0.0], (25, 31), 1.0)
+    view = Geometry.parallel([0.0], (25, 31), pixel_pitch=1.0)
     g = some((sigma,) * 3, 40, 10.0, rounded=1.0)
     moved = Gaussians(g.means + 0.5 * sigma, g.log_scales, torch.tensor([[1.0, 0, 0, 0]]).repeat(40, 1),
                       g.raw_densities, g.density_unit)  # fmt: skip
@@ -153,7 +155,7 @@ def test_dots_smaller_than_a_pixel(sigma: float) -> None:
 def test_dots_of_any_size_where_a_position_can_be_as_fine(sigma: float, pitch: float) -> None:
     # Only around 0 does float32 hold places a part of these σ (px) apart: the product of three of them is below its
     # range from 1e-13 px on, with µm in mm from 1e-10 px.
-    view = Geometry.parallel([0.0], (5, 7), pitch, axis_col=0.0, axis_row=0.0)
+    view = Geometry.parallel([0.0], (5, 7), pixel_pitch=pitch, axis_col=0.0, axis_row=0.0)
     length = sigma * pitch
     off, rng = np.array([0.6, 0.0, -0.4]) * length, np.random.default_rng(0)
     shape, turn = np.array([[2.0, 1.0, 1.5]]) * length, rng.normal(size=(1, 4))

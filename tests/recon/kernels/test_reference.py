@@ -23,7 +23,7 @@ Parameters = tuple[Tensor, Tensor, Tensor, Tensor]
 
 ANGLES, SHAPE = (0.4, -2.7), (7, 8)
 SET_UP = {"axis_col": 3.1, "axis_row": 2.2, "shifts": ((0.4, -0.3), (1.2, 0.7)), "roll": (0.2, -0.1), "tilt": 0.3}
-PARALLEL = Geometry.parallel(ANGLES, SHAPE, 1.1, **SET_UP)
+PARALLEL = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=1.1, **SET_UP)
 CONE = Geometry.cone(ANGLES, SHAPE, 1.6, 25.0, 36.0, **SET_UP)
 
 
@@ -163,7 +163,7 @@ def test_turning_the_object_is_turning_the_view(angle: float, turn: float, seed:
     )
     every = torch.full((5,), exact)
     for kind in (
-        Geometry.parallel([angle, angle - turn], SHAPE, 1.1, roll=0.2, tilt=0.4),
+        Geometry.parallel([angle, angle - turn], SHAPE, pixel_pitch=1.1, roll=0.2, tilt=0.4),
         Geometry.cone([angle, angle - turn], SHAPE, 1.6, 25.0, 36.0, roll=0.2, tilt=0.4),
     ):
         seen = reference.project_view(*moved, kind, 0, exact=every)
@@ -177,7 +177,7 @@ def test_the_uncorrected_factor_tells_densities_that_differ_from_side_to_side() 
     long, thin, length = 2.0, 0.4, 3.0
     one = (torch.zeros(1, 3), torch.tensor([[long, thin, thin]]), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1))
     needle = tuple(p.double() for p in one)
-    sides = Geometry.parallel([0.0, math.pi / 2], (31, 31), 0.5)  # across it, along it
+    sides = Geometry.parallel([0.0, math.pi / 2], (31, 31), pixel_pitch=0.5)  # across it, along it
     peaks = {}
     for name, fixed in (("true", 0.0), ("plain", length)):
         peaks[name] = [float(reference.project_view(*needle, sides, view, length=fixed)[15, 15]) for view in (0, 1)]

@@ -16,7 +16,7 @@ from recon.voxels.projector import Projector
 F64 = NDArray[np.float64]
 SHAPE = (8, 48)
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
-VIEWS = recon.Geometry.parallel(ANGLES, SHAPE, 1.0)
+VIEWS = recon.Geometry.parallel(ANGLES, SHAPE, pixel_pitch=1.0)
 GRID = recon.Grid.matching(VIEWS)
 INSIDE, TRUE = 12.0, 0.06  # radius of the part that is looked at, attenuation of the cylinder of radius 18
 

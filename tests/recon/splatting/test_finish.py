@@ -70,7 +70,7 @@ def test_more_sweeps_or_a_second_run_are_made_where_no_number_is_given(
     sweeps: int | None, preferred: int, made: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: 1.0)
-    monkeypatch.setattr("recon.splatting.finish.preferred_sweeps", lambda *_: preferred)
+    monkeypatch.setattr("recon.splatting.finish.preferred_sweeps", lambda *_, **__: preferred)
     monkeypatch.setattr("recon.splatting.finish.bregman_weight", lambda *_: 3.0)
     looks, g = Mock(return_value=False), _blob()
     data = project(g, VIEWS).numpy()

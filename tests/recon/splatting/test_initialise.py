@@ -8,7 +8,15 @@ import pytest
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import leaves_the_field, morton_order, place, sample_gaussians, scale_to_data
+from recon.splatting.initialise import (
+    first_volume,
+    leaves_the_field,
+    mean_change,
+    morton_order,
+    place,
+    sample_gaussians,
+    scale_to_data,
+)
 from recon.splatting.splat import project
 from recon.voxels.projector import Projector
 from tests.recon.conftest import Make
@@ -134,3 +142,23 @@ def test_morton_order_is_a_permutation_that_keeps_neighbours(rng: np.random.Gene
 def test_one_gaussian_has_an_order() -> None:
     one = Gaussians.from_physical([[1.0, 2.0, 3.0]], [1.0], [1.0])
     assert morton_order(one.means.numpy(), 1.0).tolist() == [0]
+
+
+def test_the_change_of_matter_is_its_variation_over_its_voxels() -> None:
+    """By numpy, for a tube along the axis; a full cylinder of the same radius changes less."""
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), (6, 40))
+    grid = Grid.matching(geometry)
+    y, x = np.indices((40, 40)) - 19.5
+    data, found = [], []
+    for inner in (8, 0):
+        tube = 0.3 * ((np.hypot(x, y) <= 12) & (np.hypot(x, y) >= inner))
+        data.append(Projector(geometry, grid).forward(np.tile(tube.astype(np.float32), (6, 1, 1))))
+        found.append(mean_change(data[-1], geometry, grid))
+    volume = np.maximum(first_volume(data[0], geometry, grid).data, 0)
+    unit = np.percentile(volume[volume > 0], 99.5)
+    forward = [np.diff(volume, axis=axis, append=np.take(volume, [-1], axis)) for axis in range(3)]
+    expected = np.sqrt(np.square(forward).sum(axis=0)).sum() / np.count_nonzero(volume > 0.05 * unit) / unit
+    assert found[0] == pytest.approx(expected, rel=1e-3)
+    assert found[1] < found[0]
+    assert mean_change(7 * data[0], geometry, grid) == pytest.approx(found[0], rel=1e-3)
+    assert mean_change(0 * data[0], geometry, grid) == 0

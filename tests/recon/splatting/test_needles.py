@@ -9,7 +9,7 @@ from recon.base.geometry import Geometry
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.needles import needles
 
-VIEWS = Geometry.parallel([0.0, 1.0], (8, 8), 0.2)  # half a pixel is 0.1 mm
+VIEWS = Geometry.parallel([0.0, 1.0], (8, 8), pixel_pitch=0.2)  # half a pixel is 0.1 mm
 
 
 def test_mass_is_shared_among_thin_long_and_round_ones() -> None:

@@ -195,7 +195,7 @@ def test_the_unit_of_length_does_not_matter(random_gaussians: Make, rng: np.rand
     settings = replace(PLAIN, tv_weight=0.15)
 
     def loss(factor: float) -> float:
-        views = Geometry.parallel(VIEWS.angles, VIEWS.detector_shape, VIEWS.pixel_pitch * factor)
+        views = Geometry.parallel(VIEWS.angles, VIEWS.detector_shape, pixel_pitch=VIEWS.pixel_pitch * factor)
         scaled = [
             replace(g, means=g.means * factor, log_scales=g.log_scales + np.log(factor), density_unit=0.7 / factor)
             for g in (truth, start)

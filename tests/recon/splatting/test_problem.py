@@ -18,7 +18,7 @@ from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project
 from tests.recon.helpers import run_steps
 
-VIEWS = Geometry.parallel([0.0, 0.9, 2.0], (12, 18), 0.5)
+VIEWS = Geometry.parallel([0.0, 0.9, 2.0], (12, 18), pixel_pitch=0.5)
 GRID = Grid.matching(VIEWS)
 
 
@@ -137,7 +137,7 @@ def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) 
     width, cut = 9.0, Truncation(9.0, 1e-12)  # of the Gaussians, in pixels
     how = {"axis_col": 15.3, "axis_row": 9.6, "shifts": [[0, 0], [1.5, -0.7], [0, 0]]}
     views = (
-        Geometry.parallel(VIEWS.angles, (23, 37), 0.5, **how)
+        Geometry.parallel(VIEWS.angles, (23, 37), pixel_pitch=0.5, **how)
         if beam == "parallel" else Geometry.cone(VIEWS.angles, (23, 37), 1.0, 200.0, 400.0, **how)
     )  # fmt: skip
     means = np.array([[1.0, -2.0, 3.0], [-2.0, 1.0, -4.0], [3.0, 2.0, 1.0]])
@@ -152,7 +152,7 @@ def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) 
 
 
 def test_a_detector_too_small_to_be_binned_is_told_by_name() -> None:
-    one = Geometry.parallel(VIEWS.angles, (1, 18), 0.5)
+    one = Geometry.parallel(VIEWS.angles, (1, 18), pixel_pitch=0.5)
     problem = make_problem(np.ones((3, 1, 18), np.float32), one, Grid.matching(one), 1.0, Cpu())
     with pytest.raises(ValueError, match=r"coarse=2 joins 2 x 2 pixels, and the detector has 1 x 18: .* 1 or less"):
         coarser(problem, 2, "l1", 0.25)
@@ -161,11 +161,11 @@ def test_a_detector_too_small_to_be_binned_is_told_by_name() -> None:
 def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     same = {"shifts": [[1.0, 2.0]] * 3, "roll": 0.1, "tilt": 0.2}
-    leaning = Geometry.parallel(VIEWS.angles, (12, 18), 0.5, **same)  # type: ignore[arg-type]
+    leaning = Geometry.parallel(VIEWS.angles, (12, 18), pixel_pitch=0.5, **same)  # type: ignore[arg-type]
     later = extend(make_problem(data, leaning, GRID, 0.3, Cpu()), data[:1], np.array([1.3])).geometry
     assert later.shifts.tolist() == [[1.0, 2.0]] * 4
     assert later.roll.tolist() == [0.1] * 4 and later.tilt.tolist() == [0.2] * 4
-    shifted = Geometry.parallel(VIEWS.angles, (12, 18), 0.5, shifts=[[0, 0], [1, 0], [0, 0]])
+    shifted = Geometry.parallel(VIEWS.angles, (12, 18), pixel_pitch=0.5, shifts=[[0, 0], [1, 0], [0, 0]])
     with pytest.raises(ValueError, match="shifts differ from view to view"):
         extend(make_problem(data, shifted, GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
 

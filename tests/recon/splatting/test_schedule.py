@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 import recon
+from recon.base.decisions import Decisions
 from recon.base.kernel import Kernel
 from recon.splatting import optimise as fit
+from recon.splatting.finish import Asked
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.schedule import DEFAULT_STEPS, SHORT_STEPS, Schedule, residual_over_noise
+from recon.splatting.schedule import ASKED_AT, DEFAULT_STEPS, SHORT_STEPS, Schedule, residual_over_noise
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
+from recon.voxels.held_out_weight import Preferred
+from recon.voxels.voxel_problem import VoxelProblem
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -54,6 +58,41 @@ def test_a_shortened_fit_goes_on_from_its_rates_to_the_last_ones() -> None:
     assert schedule.steps == SHORT_STEPS and after[0] == before[-1] and after[-1] == 1.0
     assert (np.diff(before + after[1:]) > 0).all()
     assert vars(Schedule.resumed(Schedule(DEFAULT_STEPS, by_content=True), schedule.arrays())) == vars(schedule)
+
+
+def test_a_fit_that_is_not_worth_its_steps_ends_after_a_hundred() -> None:
+    schedule = Schedule(DEFAULT_STEPS, by_content=True)
+    schedule.told(Asked(True, 2.0, 0.5), ASKED_AT)
+    assert schedule.steps == DEFAULT_STEPS
+    schedule.told(Asked(False, 2.0, 0.5), ASKED_AT)
+    assert schedule.steps == 100
+    after = [schedule.fraction(step, 0.0) for step in range(ASKED_AT, 101)]
+    assert after[0] == ASKED_AT / DEFAULT_STEPS and after[-1] == 1.0 and (np.diff(after) > 0).all()
+    assert vars(Schedule.resumed(Schedule(DEFAULT_STEPS, by_content=True), schedule.arrays())) == vars(schedule)
+
+
+@pytest.mark.parametrize(("of_fit", "worth"), [(0.97, True), (0.99, False)])
+def test_a_fit_is_worth_its_steps_where_it_helps_to_predict_views(
+    of_fit: float, worth: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Residuals of views held out: 1 with total variation alone. The weight is the same in the finish, found once."""
+    searches: list[float] = []
+
+    def search(problem: VoxelProblem, first: float) -> Preferred:
+        searches.append(first)
+        return Preferred(first, 1.0)
+
+    for module in ("recon.splatting.finish", "recon.voxels.held_out_weight"):
+        monkeypatch.setattr(f"{module}.preferred_weight", search)
+    monkeypatch.setattr("recon.splatting.finish.residuals_of_rounds", lambda *_: [1.1, of_fit])
+    monkeypatch.setattr("recon.splatting.finish.bregman_weight", lambda *_: None)
+    decide = Decisions()
+    control = recon.RunControl(decide=decide)
+    found = recon.reconstruct(CLEAN + 0.01 * NOISE, VIEWS, TINY, control=control)
+    assert found.settings["steps"] == (DEFAULT_STEPS if worth else 100)
+    assert decide.made["weight"] == [[pytest.approx(searches[0])]] and len(searches) == 1
+    asked = recon.reconstruct(CLEAN + 0.01 * NOISE, VIEWS, replace(TINY, steps=60))
+    assert asked.settings["steps"] == 60 and len(searches) == 2
 
 
 def test_a_fit_taken_up_again_is_shortened_as_the_one_that_was_not_left() -> None:

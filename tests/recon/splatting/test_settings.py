@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,9 @@ def test_a_kernel_goes_by_its_name() -> None:
         assert FitSettings(kernel=kernel.value).kernel is kernel  # type: ignore[arg-type]
 
 
+_WITHOUT_LIMITS = {noise: 3e5 * noise**2 / 24 for noise in (1e-4, 2e-3, 4e-3, 0.1)}
+
+
 @pytest.mark.parametrize(("noise", "weight"), [(1e-4, 0.02), (2e-3, 0.05), (4e-3, 0.2), (0.1, 0.25)])
 def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generator, noise: float, weight: float) -> None:
     """3e5 times its variance, over 24 pixels a Gaussian; and the same on pixels binned two by two."""
@@ -47,6 +52,9 @@ def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generato
     rough = coarser(problem, 2, settings.loss, settings.ssim_weight)
     assert tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
     assert tv_weight(FitSettings(tv_weight=0.0), problem, count) == 0
+    sharp = replace(problem, change=0.32)  # noise counts by the change of matter: half of it, beyond 0.16
+    assert tv_weight(settings, sharp, count) == pytest.approx(np.clip(_WITHOUT_LIMITS[noise] / 4, 0.02, 0.25), rel=0.1)
+    assert tv_weight(settings, replace(problem, change=0.1), count) == tv_weight(settings, problem, count)
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,9 @@ TURNED = {
 }
 WIDE = RayWidth(pixel=1, blur=0.6, arc=0.3)
 # Every way to a projection: a beam and what a Gaussian gives a ray of it.
-STRAIGHT = Geometry.parallel(ANGLES, SHAPE, 0.5, 13.3)
-LEANING = Geometry.parallel(ANGLES, SHAPE, 0.5, 13.3, **TURNED)
-CONE = Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, 13.3, **TURNED)
+STRAIGHT = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=0.5, axis_col=13.3)
+LEANING = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=0.5, axis_col=13.3, **TURNED)
+CONE = Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, axis_col=13.3, **TURNED)
 PATHS = {
     "straight": (STRAIGHT, RayModel()),
     "leaning": (LEANING, RayModel()),
@@ -222,7 +222,7 @@ def test_views_that_share_memory_give_what_views_of_their_own_give(
 def test_without_gradients_the_memory_is_that_of_the_images_however_many_views(random_gaussians: Make) -> None:
     gaussians, peaks = random_gaussians(2000), []
     for n_views in (4, 64):
-        geometry = Geometry.parallel(np.linspace(0, np.pi, n_views), (8, 8), 0.5)
+        geometry = Geometry.parallel(np.linspace(0, np.pi, n_views), (8, 8), pixel_pitch=0.5)
         tracemalloc.start()
         project(gaussians, geometry)
         peaks.append(tracemalloc.get_traced_memory()[1])

@@ -27,7 +27,7 @@ from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 
 SHAPE, PITCH = (24, 36), 0.1
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
-VIEWS = Geometry.parallel(ANGLES, SHAPE, PITCH)
+VIEWS = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH)
 GRID = Grid.matching(VIEWS)
 
 
@@ -315,9 +315,9 @@ def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(
 def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np.ndarray) -> None:
     for name, own in (("shifts", [[0, 0], [3, 0]]), ("roll", [0, 0.1]), ("tilt", [0, 0.1])):
         with pytest.raises(ValueError, match=f"{name} differ from view to view"):
-            StreamingFit(Geometry.parallel([0, 1], SHAPE, PITCH, **{name: own}), GRID)  # type: ignore[arg-type]
+            StreamingFit(Geometry.parallel([0, 1], SHAPE, pixel_pitch=PITCH, **{name: own}), GRID)  # type: ignore[arg-type]
     # An axis elsewhere and the same shift of all views are one thing.
-    told = Geometry.parallel([0.0], SHAPE, PITCH, axis_col=VIEWS.axis_col - 5, shifts=[[5, 0]])
+    told = Geometry.parallel([0.0], SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col - 5, shifts=[[5, 0]])
     found = []
     for template in (VIEWS, told):
         model = StreamingFit(template, GRID, gaussians=500, now=StepClock())
@@ -338,7 +338,7 @@ def test_the_count_follows_the_grid() -> None:
 def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray, phantom: Phantom) -> None:
     """Half a circle of views about an axis that is off by d shows the sample off by 4 d / π across its middle."""
     truth, off = phantom.attenuation(GRID), 0.8
-    wrong = Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=VIEWS.axis_col + off)
+    wrong = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + off)
     model = StreamingFit(wrong, GRID, 0, gaussians=1500, now=StepClock())
     model.add_views(data, ANGLES)
     model.advance(4.0)
@@ -353,7 +353,7 @@ def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray
 
 def _disturbed(data: np.ndarray, truth: np.ndarray, batches: list[np.ndarray], axis_off: float = 0.0) -> float:
     """PSNR in dB of a stream of these batches of views, whose axis is corrected once half of the views are there."""
-    template = Geometry.parallel(ANGLES, SHAPE, PITCH, axis_col=VIEWS.axis_col + axis_off)
+    template = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH, axis_col=VIEWS.axis_col + axis_off)
     model = StreamingFit(template, GRID, 0, gaussians=1500, now=StepClock())
     for batch in batches:
         model.add_views(data[batch], ANGLES[batch])

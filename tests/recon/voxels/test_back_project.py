@@ -76,7 +76,7 @@ def test_ray_by_ray_is_the_plain_sum(rng: np.random.Generator) -> None:
 def test_gridding_is_the_same_volume(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, filter: Filter, most: float
 ) -> None:
-    geometry = Geometry.parallel(rng.permutation(400) * np.pi / 400, (2, 256), 0.02, axis_col=124.3)
+    geometry = Geometry.parallel(rng.permutation(400) * np.pi / 400, (2, 256), pixel_pitch=0.02, axis_col=124.3)
     views = resolution_pattern(geometry, rng)
     rays, gridded = both_ways(monkeypatch, views, geometry, filter)
     difference = in_all_views(np.abs(gridded - rays), geometry, Grid.matching(geometry))
@@ -88,7 +88,7 @@ def test_gridding_in_a_box_of_smaller_voxels_with_moved_views(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
     shifts = np.stack((rng.uniform(-2, 2, 300), np.zeros(300)), 1)
-    geometry = Geometry.parallel(np.arange(300) * np.pi / 300, (2, 200), 0.1, axis_col=95.0, shifts=shifts)
+    geometry = Geometry.parallel(np.arange(300) * np.pi / 300, (2, 200), pixel_pitch=0.1, axis_col=95.0, shifts=shifts)
     views = resolution_pattern(geometry, rng)
     grid = Grid((2, 121, 90), 0.06, (0.0, 1.3, -2.2))
     rays, gridded = both_ways(monkeypatch, views, geometry, "hann", grid)

@@ -14,7 +14,7 @@ from tests.recon.voxels.balls import ball_views
 SHAPE, PITCH = (8, 48), 0.5
 ANGLES = np.radians(np.arange(0, 180, 3.0))
 PARTS = (np.arange(ANGLES.size) >= 42).astype(np.int64)
-GEOMETRY = Geometry.parallel(ANGLES, SHAPE, PITCH)
+GEOMETRY = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=PITCH)
 KNOWN = np.ones(SHAPE, np.bool_)
 MOVED = Displacement(0.9 * PITCH, -0.6 * PITCH, 0.7 * PITCH, np.radians(1.0))
 

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.voxels.emission import Emission, attenuation_factors, mlem
+from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
 from recon.voxels.projector import Projector
 
 F32 = np.float32
@@ -17,7 +17,7 @@ F32 = np.float32
 def toy(seed: int = 0) -> tuple[Emission, Grid, np.ndarray]:
     """16 views of 2 x 7 pixels, Poisson counts; and A as a dense matrix."""
     rng = np.random.default_rng(seed)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 16, endpoint=False), (2, 7), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 16, endpoint=False), (2, 7), pixel_pitch=1.0)
     grid = Grid.matching(geometry)
     activity = rng.uniform(5, 40, grid.shape).astype(F32) * (rng.random(grid.shape) < 0.6)
     shape = (16, 2, 7)
@@ -68,7 +68,7 @@ def test_without_background_each_iteration_keeps_the_counts() -> None:
 
 def phantom() -> tuple[Volume, Volume, Geometry]:
     """Activity 1 in water of radius 24 mm, with a hot rod of 4 and two cold ones, of air and of Teflon."""
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), (1, 64), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 90, endpoint=False), (1, 64), pixel_pitch=1.0)
     grid = Grid.matching(geometry)
     _, y, x = (np.asarray(axis) for axis in np.meshgrid(*grid.coordinates(), indexing="ij"))
     body, hot, air, teflon = (
@@ -109,6 +109,37 @@ def test_subsets_reach_in_one_iteration_what_takes_as_many_without() -> None:
     assert np.sqrt(np.mean((ordered - activity.data) ** 2)) < 0.35
 
 
+def test_weighted_squares_have_the_gradient_and_the_curvature_of_the_likelihood() -> None:
+    """At even counts, whose smoothed mean is their mean: by differences of Σ mean - y log(mean) in float64."""
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 4, endpoint=False), (2, 7))
+    s, b, y = (np.full((4, 2, 7), value, F32) for value in (0.4, 3.0, 23.0))
+    lines, weights = weighted_lines(Emission(y, geometry, s, b))
+
+    def descent(p: float) -> float:
+        return 0.4 * p + 3.0 - 23.0 * np.log(0.4 * p + 3.0)
+
+    at, h = (23.0 - 3.0) / 0.4, 0.01
+    np.testing.assert_allclose(lines, at, rtol=1e-6)
+    assert (descent(at + h) - descent(at - h)) / (2 * h) == pytest.approx(0, abs=1e-6)
+    np.testing.assert_allclose(weights, (descent(at + h) - 2 * descent(at) + descent(at - h)) / h**2, rtol=1e-3)
+
+
+def test_lines_of_few_counts_are_not_lowered_by_their_weights() -> None:
+    """A weight by each line's own count favours the low ones; that of its neighbours does not. Blind lines weigh 0."""
+    geometry, rng = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (16, 32)), np.random.default_rng(0)
+    s = rng.uniform(0.2, 0.6, (40, 16, 32)).astype(F32)
+    s[:, 3] = 0
+    b = np.full_like(s, 2.0)
+    y = rng.poisson(s * 20 + b).astype(F32)
+    lines, weights = weighted_lines(Emission(y, geometry, s, b))
+    assert not weights[:, 3].any() and np.isfinite(lines).all()
+    assert np.average(lines, weights=weights) == pytest.approx(20, rel=0.03)
+    own = s**2 / np.maximum(y, 1)
+    assert np.average(lines, weights=own) < 18
+    rays = lines[weights > 0] - 20
+    assert np.mean(rays**2 * weights[weights > 0]) == pytest.approx(1, abs=0.1)  # inverse variances
+
+
 def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
     emission, grid, _ = toy()
     calls: list[int] = []
@@ -122,6 +153,11 @@ def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
         mlem(Emission(0 * emission.counts, emission.geometry), grid)
     with pytest.raises(ValueError, match="no line sees the grid"):
         mlem(Emission(emission.counts, emission.geometry, 0 * emission.counts), grid)
+    with pytest.raises(ValueError, match=r"survival is 1e-38 at most, so that activity would be about .*e\+38"):
+        mlem(Emission(emission.counts, emission.geometry, np.full_like(emission.counts, 1e-38)), grid)
+    for iterations, subsets, said in ((0, 1, "iterations .* got 0"), (1, 17, "1 to 16, .* got 17"), (1, 0, "got 0")):
+        with pytest.raises(ValueError, match=said):
+            mlem(emission, grid, iterations, subsets)
     blind = np.where(np.arange(16)[:, None, None] == 3, 0, np.ones_like(emission.counts))
     with pytest.raises(ValueError, match="lines have counts and the mean 0"):
         mlem(Emission(emission.counts + 1, emission.geometry, blind.astype(F32)), grid)

@@ -64,7 +64,7 @@ def test_windows_at_nyquist(window: str, at_nyquist: float) -> None:
 @pytest.mark.parametrize("window", ["ram-lak", "shepp-logan", "hann"])
 @pytest.mark.parametrize(("density", "pitch"), [(1.0, 1.0), (0.4, 0.05)])
 def test_uniform_disc_has_its_density(window: str, density: float, pitch: float) -> None:
-    geometry = Geometry.parallel(half_turn(180), (3, 101), pitch)
+    geometry = Geometry.parallel(half_turn(180), (3, 101), pixel_pitch=pitch)
     volume = fbp(disc_views(geometry, 30 * pitch, (0, 0), density=density), geometry, filter=window)  # type: ignore[arg-type]
     middle = volume[:, 40:61, 40:61]
     assert np.abs(middle / density - 1).max() < 0.01
@@ -74,7 +74,7 @@ def test_uniform_disc_has_its_density(window: str, density: float, pitch: float)
 
 def test_disc_away_from_the_axis_with_a_shifted_axis_and_random_angles(rng: np.random.Generator) -> None:
     angles = rng.uniform(-np.pi, 3 * np.pi, 400)
-    geometry = Geometry.parallel(angles, (1, 120), 0.1, axis_col=63.3)
+    geometry = Geometry.parallel(angles, (1, 120), pixel_pitch=0.1, axis_col=63.3)
     volume = fbp(disc_views(geometry, 1.5, (1.7, -0.8)), geometry)
     _, y, x = Grid.matching(geometry).coordinates()
     inside = np.hypot(x[None] - 1.7, y[:, None] + 0.8) < 1.0
@@ -84,7 +84,7 @@ def test_disc_away_from_the_axis_with_a_shifted_axis_and_random_angles(rng: np.r
 def test_blob_lands_on_its_voxel() -> None:
     """u = x cos θ + y sin θ, columns grow with u, rows and volume indices grow with z, y, x."""
     angles = np.deg2rad(np.arange(0, 180, 2.0))
-    geometry = Geometry.parallel(angles, (21, 64), 0.2, axis_col=30.0)
+    geometry = Geometry.parallel(angles, (21, 64), pixel_pitch=0.2, axis_col=30.0)
     x, y, z, sigma = 2.5, -1.1, 0.8, 0.6
     u = (np.arange(64) - 30.0) * 0.2
     v = (np.arange(21) - 10) * 0.2
@@ -117,7 +117,7 @@ def test_agrees_with_skimage(window: str) -> None:
 
 def test_any_grid_samples_the_same_volume() -> None:
     """A box off the axis holds what the full grid holds at the same places."""
-    geometry = Geometry.parallel(half_turn(60), (7, 50), 0.2, axis_col=23.4)
+    geometry = Geometry.parallel(half_turn(60), (7, 50), pixel_pitch=0.2, axis_col=23.4)
     views = disc_views(geometry, 2.5, (0.4, 0.2), rows=slice(2, 6))
     whole = Grid.matching(geometry)
     box = Grid((3, 5, 10), 0.2, centre=(0.2, 0.5, -0.4))

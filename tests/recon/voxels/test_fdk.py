@@ -70,7 +70,7 @@ def test_a_ball_anywhere_with_offsets_shifts_and_random_angles(rng: np.random.Ge
     """Off the axis, off the middle plane, the axis off the detector's middle; 400 views in random order and turn."""
     angles = rng.permutation(circle(120)) + 2 * np.pi * rng.integers(-2, 3, 120)
     shifts = rng.uniform(-3, 3, (120, 2))
-    geometry = Geometry.cone(angles, (70, 90), 0.1, 12.0, 20.0, 41.3, axis_row=30.8, shifts=shifts)
+    geometry = Geometry.cone(angles, (70, 90), 0.1, 12.0, 20.0, axis_col=41.3, axis_row=30.8, shifts=shifts)
     centre = (0.6, -0.5, 0.35)
     grid = Grid((30, 34, 36), 0.05, (0.3, -0.45, 0.55))
     volume = fdk(ball_views(geometry, 0.7, centre), geometry, grid)
@@ -86,7 +86,7 @@ def test_a_ball_anywhere_with_offsets_shifts_and_random_angles(rng: np.random.Ge
 @pytest.mark.parametrize("axis_col", [14.0, 75.0])
 def test_a_detector_beside_the_axis_sees_twice_its_half(axis_col: float) -> None:
     """A wide field: balls on the axis and where one half of the turn alone sees them, and air between them."""
-    geometry = Geometry.cone(circle(240), (24, 90), 0.1, 30.0, 40.0, axis_col)
+    geometry = Geometry.cone(circle(240), (24, 90), 0.1, 30.0, 40.0, axis_col=axis_col)
     grid, centre = Grid.matching(geometry), (3.2, -1.5, 0.0)
     assert grid.shape[2] == pytest.approx(2 * 75.5, abs=1)
     volume = fdk(ball_views(geometry, 0.7, centre) + ball_views(geometry, 0.6, (0, 0, 0)), geometry, grid)
@@ -108,7 +108,7 @@ def test_progress_counts_layers_up_to_all(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_far_source_is_fbp() -> None:
     angles = circle(60)
     far = Geometry.cone(angles, (9, 40), 0.1, 1e5, 1e5)
-    near = Geometry.parallel(angles, (9, 40), 0.1)
+    near = Geometry.parallel(angles, (9, 40), pixel_pitch=0.1)
     views = ball_views(far, 1.0, (0.3, 0.2, 0.05))
     grid = Grid((5, 30, 30), 0.1, (0.02, 0, 0))
     np.testing.assert_allclose(fdk(views, far, grid), fbp(views, near, grid), atol=2e-3)

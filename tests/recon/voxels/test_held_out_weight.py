@@ -43,7 +43,7 @@ def foam() -> tuple[F32, Geometry, Grid, F32]:
     struts, texture = (gaussian_filter(rng.normal(size=shape), s) for s in (1.5, 0.6))
     _, y, x = np.indices(shape) - 31.5
     truth = np.where((struts > 0.3 * struts.std()) & (np.hypot(x, y) < 29), 0.7 + 0.08 * texture / texture.std(), 0)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
     grid = Grid.matching(geometry)
     clean = Projector(geometry, grid).forward(truth.astype(np.float32))
     scale = 2 / clean.max()
@@ -69,7 +69,7 @@ def test_a_texture_survives(
 def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
     monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:
-    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
     _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
     truth = (np.hypot(x, y) < 25).astype(np.float32)
     data = Projector(geometry, Grid.matching(geometry)).forward(truth)
@@ -82,7 +82,7 @@ def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
 
 def test_faint_matter_around_metal_is_more_even_than_in_fbp(rng: np.random.Generator) -> None:
     """By its noise alone the scan gets a weight for the metal, whose edges are most of the variation."""
-    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), 1.0)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, VIEWS, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
     _, y, x = np.indices((ROWS, COLS, COLS)) - 31.5
     truth = np.where(np.hypot(x, y) < 26, 0.002, 0) + np.where(np.hypot(x - 4, y) < 5, 0.2, 0)
     data = Projector(geometry, Grid.matching(geometry)).forward(truth.astype(np.float32))
@@ -96,8 +96,8 @@ def test_faint_matter_around_metal_is_more_even_than_in_fbp(rng: np.random.Gener
 def cracked() -> tuple[F32, Geometry]:
     """A disc with a straight crack two pixels wide and 0.9 deep, from 80 views of 300 photons a pixel."""
     rng = np.random.default_rng(2)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 80, endpoint=False), (ROWS, COLS), 1.0)
-    fine = Geometry.parallel(geometry.angles, (ROWS, 2 * COLS), 0.5)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 80, endpoint=False), (ROWS, COLS), pixel_pitch=1.0)
+    fine = Geometry.parallel(geometry.angles, (ROWS, 2 * COLS), pixel_pitch=0.5)
     _, y, x = (np.indices((ROWS, 2 * COLS, 2 * COLS)) - 63.5) / 2
     truth = np.where((abs(y) < 1) & (abs(x) < 14), 0.1, 1.0) * (np.hypot(x, y) < 27) * 0.028
     clean = Projector(fine, Grid((ROWS, 2 * COLS, 2 * COLS), 0.5, slice_pitch=0.5)).forward(truth.astype(np.float32))
@@ -125,7 +125,9 @@ def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
 def test_the_weight_with_the_smallest_error_is_found(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error that is a parabola of log μ has its vertex where a parabola through three points has it."""
     _errors(best, monkeypatch)
-    assert preferred_weight(_views(), 3.0) == pytest.approx(3.0 * best)
+    found = preferred_weight(_views(), 3.0)
+    assert found is not None and found.weight == pytest.approx(3.0 * best)
+    assert 1 <= found.residual <= 1 + math.log(math.sqrt(2)) ** 2
 
 
 @pytest.mark.parametrize(
@@ -141,13 +143,24 @@ def test_two_runs_are_taken_where_they_predict_unseen_views_better(
     assert bregman_weight(_views(), 2.0) == found
 
 
+def test_one_run_is_not_tried_again_where_two_are_clearly_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[bool] = []
+
+    def error(weight: float, twice: bool = False) -> float:
+        tried.append(twice)
+        return 2.0
+
+    monkeypatch.setattr("recon.voxels.held_out_weight._Trial", Mock(of=lambda problem: error))
+    assert bregman_weight(_views(), 2.0, 1.9) is None and tried == [True]
+
+
 def _errors(best: float, monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Mock(of=lambda problem: lambda weight: 1 + math.log(weight / (3.0 * best)) ** 2)
     monkeypatch.setattr("recon.voxels.held_out_weight._Trial", trial)
 
 
 def _views() -> Mock:
-    return Mock(**{"projector.geometry": Geometry.parallel(np.linspace(0, 3, 40), (4, 8), 1.0)})
+    return Mock(**{"projector.geometry": Geometry.parallel(np.linspace(0, 3, 40), (4, 8), pixel_pitch=1.0)})
 
 
 @dataclass
@@ -225,7 +238,7 @@ def test_the_weight_of_a_cone_is_left_to_the_noise(coarse_cone: tuple[F32, Geome
 
 def test_one_view_of_eight_is_held_out_and_the_others_are_not() -> None:
     angles = np.random.default_rng(0).permutation(np.linspace(0, np.pi, 80, endpoint=False))
-    seen, unseen = split_views(Geometry.parallel(angles, (4, 8), 1.0))
+    seen, unseen = split_views(Geometry.parallel(angles, (4, 8), pixel_pitch=1.0))
     assert unseen.size == 10 and sorted([*seen, *unseen]) == list(range(80))
     np.testing.assert_allclose(np.diff(np.sort(angles[unseen])), np.pi / 10)
     assert LEAST_VIEWS == 16
@@ -236,7 +249,7 @@ def test_a_slab_is_where_most_matter_is_and_sees_its_own_slices() -> None:
     data[:, 20:30] = 1
     rows = busiest_rows(data, 10)
     assert rows == slice(20, 30)
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 3), (40, 8), 0.5)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 3), (40, 8), pixel_pitch=0.5)
     views, box = slab_of(geometry, Grid.matching(geometry), rows.start, rows.stop)
     volume = np.random.default_rng(1).random((40, 8, 8)).astype(np.float32)
     whole = Projector(geometry, Grid.matching(geometry)).forward(volume)
@@ -252,3 +265,18 @@ def test_views_held_out_that_weigh_nothing_in_the_busiest_rows_leave_the_weight_
     weights[split_views(geometry)[1], :ROWS] = 0
     found = recon.reconstruct(data, geometry, FistaTv(iterations=1), grid=grid, use=recon.DataUse(weights=weights))
     assert np.isfinite(found.volume.data).all()
+
+
+@pytest.mark.parametrize(
+    ("errors", "steadily", "sweeps"),
+    [
+        ([1.0, 0.97, 0.95], True, 24), ([1.0, 0.95, 0.97], True, 8), ([1.0, 0.995, 0.992], True, 8), ([], True, 8),
+        ([1.0, 0.95, 0.97], False, 24), ([1.0, 0.995, 0.996], False, 8), ([1.0, 1.1], False, 8), ([], False, 8),
+    ],
+)  # fmt: skip
+def test_more_sweeps_have_to_bring_unseen_views_nearer(
+    errors: list[float], steadily: bool, sweeps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Round for round; after a fit that was ended early any round counts."""
+    monkeypatch.setattr("recon.voxels.held_out_weight.residuals_of_rounds", lambda *_: errors)
+    assert preferred_sweeps(_views(), np.zeros(1, np.float32), 1.0, 8, steadily=steadily) == sweeps

@@ -45,7 +45,7 @@ def blocks(grid: Grid, scale: float = 1.0) -> NDArray[np.float32]:
 
 def parallel_case(n_views: int = 7, noise: float = 0.0) -> tuple[Projector, NDArray[np.float32], NDArray[np.float32]]:
     """Projector, truth and its projections, with white noise of a share of their largest value."""
-    geometry = Geometry.parallel(np.arange(n_views) * np.pi / n_views + 0.1, (6, 20), 0.5, 9.2)
+    geometry = Geometry.parallel(np.arange(n_views) * np.pi / n_views + 0.1, (6, 20), pixel_pitch=0.5, axis_col=9.2)
     projector = Projector(geometry, Grid((6, 18, 17), 0.5))
     truth = blocks(projector.grid)
     views = projector.forward(truth)

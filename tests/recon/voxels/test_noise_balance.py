@@ -39,7 +39,7 @@ def _grains() -> tuple[F32, F32]:
         centre = radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-6, 6)
         near = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 + (z - centre[2]) ** 2
         volume[near < rng.uniform(2, 6) ** 2] = 0.05
-    views = Geometry.parallel(VIEWS.angles, (24, 128), 0.5)
+    views = Geometry.parallel(VIEWS.angles, (24, 128), pixel_pitch=0.5)
     data = Projector(views, fine).forward(volume).reshape(48, 12, 2, 64, 2).mean(axis=(2, 4))
     return volume.reshape(12, 2, 64, 2, 64, 2).mean(axis=(1, 3, 5)), data.astype(np.float32)
 

@@ -10,21 +10,23 @@ import pytest
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
-from recon.voxels.ordered_fista import bregman, ordered_fista
+from recon.voxels.ordered_fista import Subsets, bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.voxel_problem import VoxelProblem
 
-VIEWS = Geometry.parallel(np.linspace(0, np.pi, 48, endpoint=False), (4, 48), 1.0)
+VIEWS = Geometry.parallel(np.linspace(0, np.pi, 48, endpoint=False), (4, 48), pixel_pitch=1.0)
 PROJECTOR = Projector(VIEWS, Grid.matching(VIEWS))
 _Y, _X, _ = np.indices((48, 48, 4)) - 23.5
 DISC = (np.hypot(_X, _Y) < 12).astype(np.float32)
-SETTINGS = {"subsets": 2, "tv_steps": 10}
 
 
 def _problem(noise: float = 0.0, go_on: Callable[[int, float], bool] = lambda *_: True) -> VoxelProblem:
     data = PROJECTOR.forward_lines(DISC)
     data += np.random.default_rng(0).normal(0, noise, data.shape).astype(np.float32)
     return VoxelProblem(PROJECTOR, data, None, True, np.random.default_rng(1), go_on)
+
+
+SUBSETS = Subsets.of(_problem(), 2)
 
 
 def _left(problem: VoxelProblem, x: F32) -> float:
@@ -34,8 +36,8 @@ def _left(problem: VoxelProblem, x: F32) -> float:
 def test_a_disc_gets_its_contrast_back() -> None:
     """Total variation lowers a disc and keeps its shape; the sum of views and residual is the higher by as much."""
     inside = np.hypot(_X, _Y) < 9
-    once = ordered_fista(_problem(), DISC.copy(), 400.0, sweeps=20, **SETTINGS)
-    twice = bregman(_problem(), DISC.copy(), 400.0, sweeps=20, **SETTINGS)
+    once = ordered_fista(_problem(), DISC.copy(), 400.0, SUBSETS, sweeps=20, tv_steps=10)
+    twice = bregman(_problem(), DISC.copy(), 400.0, SUBSETS, sweeps=20, tv_steps=10)
     lost, still = (1 - float(x[inside].mean()) for x in (once, twice))
     assert lost > 0.1
     assert abs(still) < 0.15 * lost
@@ -45,26 +47,43 @@ def test_a_disc_gets_its_contrast_back() -> None:
 def test_the_second_run_explains_the_views_no_less(weight: float) -> None:
     problem = _problem(noise=2.0)
     once, twice = (
-        run(problem, np.full_like(DISC, 0.1), weight, sweeps=10, **SETTINGS) for run in (ordered_fista, bregman)
-    )  # fmt: skip
+        run(problem, np.full_like(DISC, 0.1), weight, SUBSETS, sweeps=10, tv_steps=10)
+        for run in (ordered_fista, bregman)
+    )
     assert _left(problem, twice) < _left(problem, once)
 
 
 def test_sweeps_are_counted_through_both_runs_and_a_stop_ends_both() -> None:
     seen: list[int] = []
-    bregman(_problem(go_on=lambda sweep, _: not seen.append(sweep)), DISC.copy(), 1.0, sweeps=2, **SETTINGS)
+    bregman(_problem(go_on=lambda sweep, _: not seen.append(sweep)), DISC.copy(), 1.0, SUBSETS, sweeps=2, tv_steps=9)
     assert seen == [1, 2, 3, 4]
     seen.clear()
-    bregman(_problem(go_on=lambda sweep, _: bool(seen.append(sweep))), DISC.copy(), 1.0, sweeps=2, **SETTINGS)
+    bregman(_problem(go_on=lambda sweep, _: bool(seen.append(sweep))), DISC.copy(), 1.0, SUBSETS, sweeps=2, tv_steps=9)
     assert seen == [1]
 
 
 def test_equal_rows_stay_equal_slices() -> None:
     """A heavy weight, three dual steps and momentum do not amplify differences between slices that rounding made."""
-    views = Geometry.parallel(VIEWS.angles[::2], (9, 48), 1.0)
+    views = Geometry.parallel(VIEWS.angles[::2], (9, 48), pixel_pitch=1.0)
     projector = Projector(views, Grid.matching(views))
     data = projector.forward_lines(np.repeat(DISC[:, :, :1], 9, axis=2))
     problem = VoxelProblem(projector, data, None, True, np.random.default_rng(1), lambda *_: True)
     start = np.full((48, 48, 9), 0.1, np.float32)
-    found = ordered_fista(problem, start, 500.0, sweeps=30, subsets=2, tv_steps=3)
+    found = ordered_fista(problem, start, 500.0, Subsets.of(problem, 2), sweeps=30, tv_steps=3)
     assert np.ptp(found, axis=2).max() < 1e-3
+
+
+def test_the_step_is_safe_for_the_subset_that_weighs_most() -> None:
+    """1 / step is at least the largest eigenvalue of AᵀWA of each subset, by a dense matrix in float64."""
+    views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (1, 9))
+    projector = Projector(views, Grid.matching(views))
+    data = projector.forward_lines(np.ones((9, 9, 1), np.float32))
+    for weight in (None, np.random.default_rng(0).uniform(0.1, 3, data.shape).astype(np.float32)):
+        made = Subsets.of(VoxelProblem(projector, data, weight, True, np.random.default_rng(1), lambda *_: True), 2)
+        units = np.eye(81, dtype=np.float32).reshape(81, 9, 9, 1)
+        for some, part in zip(made.views, made.projectors, strict=True):
+            a = np.stack([part.forward_lines(unit).ravel() for unit in units], 1).astype(np.float64)
+            w = np.ones(len(a)) if weight is None else weight[some].ravel().astype(np.float64)
+            largest = np.linalg.eigvalsh(a.T @ (w[:, None] * a))[-1]
+            heaviest = weight is None or weight[some].sum() == max(weight[v].sum() for v in made.views)
+            assert not heaviest or largest * (1 - 1e-5) <= 1 / made.step < 1.2 * largest

@@ -22,8 +22,8 @@ _GRID = Grid((40, 60, 60), 0.03)
 def _views(cone: bool, n: int = 180) -> Geometry:
     angles = np.arange(n) * 2 * np.pi / n
     if cone:
-        return Geometry.cone(angles, (60, 80), 0.045, 10.0, 15.0, 40.3)
-    return Geometry.parallel(angles, (60, 80), 0.03, 40.3)
+        return Geometry.cone(angles, (60, 80), 0.045, 10.0, 15.0, axis_col=40.3)
+    return Geometry.parallel(angles, (60, 80), pixel_pitch=0.03, axis_col=40.3)
 
 
 def _error(volume: np.ndarray) -> float:

@@ -34,7 +34,7 @@ def _gaussian_case(
     angles: list[float], axis_col: float, pitch: float, centre: tuple[float, float], sigma: float
 ) -> tuple[Volume, Geometry, np.ndarray]:
     """A Gaussian blob at (x, y) = centre (voxels): its line integrals are a Gaussian in u, sigma sqrt(2π) high."""
-    geometry = Geometry.parallel(angles, (3, 48), pitch, axis_col)
+    geometry = Geometry.parallel(angles, (3, 48), pixel_pitch=pitch, axis_col=axis_col)
     grid = Grid((3, 40, 44), pitch)
     _, y, x = grid.coordinates()
     x0, y0, s = centre[0] * pitch, centre[1] * pitch, sigma * pitch
@@ -63,11 +63,11 @@ def cases(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
     lean = draw(st.sampled_from([0.0, 0.03125, 1.25]))
     roll, tilt = ([number(-lean, lean) for _ in range(views)] for _ in range(2))
     if draw(st.booleans()):
-        geometry = Geometry.cone(angles, detector, number(0.5, 3), 20.0, number(20, 60), axis_col,
+        geometry = Geometry.cone(angles, detector, number(0.5, 3), 20.0, number(20, 60), axis_col=axis_col,
                                  axis_row=axis_row, shifts=shifts, roll=roll, tilt=tilt)  # fmt: skip
     else:
-        geometry = Geometry.parallel(angles, detector, number(0.5, 2), axis_col, axis_row=axis_row, shifts=shifts,
-                                     roll=roll, tilt=tilt)  # fmt: skip
+        geometry = Geometry.parallel(angles, detector, pixel_pitch=number(0.5, 2), axis_col=axis_col, axis_row=axis_row,
+                                     shifts=shifts, roll=roll, tilt=tilt)  # fmt: skip
     shape = draw(st.tuples(st.integers(1, 7), st.integers(1, 8), st.integers(1, 8)))
     centre = (number(-2, 2), number(-2, 2), number(-2, 2))
     slice_pitch = number(0.5, 2) if draw(st.booleans()) else None
@@ -113,10 +113,10 @@ def slices(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
     cols, shifts = draw(st.integers(1, 60)), [number(-3, 3), number(-3, 3)]
     axis_col, box = number(-5, 65), draw(st.tuples(st.integers(1, 50), st.integers(1, 50)))
     if draw(st.booleans()):
-        views = Geometry.fan(angles, cols, number(0.5, 3), 50.0, number(60, 120), axis_col, shifts=shifts)
+        views = Geometry.fan(angles, cols, number(0.5, 3), 50.0, number(60, 120), axis_col=axis_col, shifts=shifts)
     else:
         moved = np.stack([shifts, [0.0, 0.0]], axis=1)
-        views = Geometry.parallel(angles, (1, cols), number(0.25, 3), axis_col, shifts=moved)
+        views = Geometry.parallel(angles, (1, cols), pixel_pitch=number(0.25, 3), axis_col=axis_col, shifts=moved)
     return views, Grid((1, *box), number(0.5, 1.25), (0.0, number(-5, 5), number(-5, 5))), draw(st.integers(0, 2**31))
 
 
@@ -153,7 +153,9 @@ def test_the_transpose_is_exact_at_a_working_size(cone: bool, lean: float, rng: 
     """Many jobs a thread, more slices than one job takes: no thread writes where another does."""
     angles = np.arange(37) * 0.37
     shape = (300, 40)
-    geometry = Geometry.cone(angles, shape, 0.1, 40.0, 60.0) if cone else Geometry.parallel(angles, shape, 0.05)
+    geometry = (
+        Geometry.cone(angles, shape, 0.1, 40.0, 60.0) if cone else Geometry.parallel(angles, shape, pixel_pitch=0.05)
+    )
     geometry = replace(geometry, roll=lean * np.sin(angles), tilt=lean * np.cos(angles))
     projector = Projector(geometry, Grid((290, 30, 36), 0.055))
     volume = rng.random(projector.grid.shape, dtype=np.float32)
@@ -195,7 +197,9 @@ def test_calls_hold_all_jobs_once_and_few_samples(monkeypatch: pytest.MonkeyPatc
 def test_tiles_make_no_difference(rng: np.random.Generator) -> None:
     """Rays through many tiles, along their edges too, more slices than a job takes: the explicit matrix, whatever the
     number of threads, to the bit."""
-    geometry = Geometry.parallel([0.0, np.pi / 2, np.pi / 4, 0.3, 1.2, 2.0, 2.9], (75, 84), 1.0, 42.5)
+    geometry = Geometry.parallel(
+        [0.0, np.pi / 2, np.pi / 4, 0.3, 1.2, 2.0, 2.9], (75, 84), pixel_pitch=1.0, axis_col=42.5
+    )
     projector, matrix = Projector(geometry, Grid((75, 97, 66))), system_matrix(geometry.rows(0, 1), Grid((1, 97, 66)))
     volume = rng.random(projector.grid.shape, dtype=np.float32)
     views = rng.random(projector.projection_shape, dtype=np.float32)
@@ -280,11 +284,11 @@ def test_an_ellipsoid_projects_to_its_chords(cone: bool, lean: float) -> None:
     roll, tilt = lean * np.array([1, 0, -1, 0.5, 0.7]), lean * np.array([0, 1, 0.3, -1, 0.7])
     if cone:
         geometry = Geometry.cone(
-            angles, (44, 50), 0.06, 6.0, 9.0, 26.2, axis_row=19.3, shifts=shifts, roll=roll, tilt=tilt
+            angles, (44, 50), 0.06, 6.0, 9.0, axis_col=26.2, axis_row=19.3, shifts=shifts, roll=roll, tilt=tilt
         )
     else:
         geometry = Geometry.parallel(
-            angles, (44, 50), 0.04, 26.2, axis_row=19.3, shifts=shifts, roll=roll, tilt=tilt
+            angles, (44, 50), pixel_pitch=0.04, axis_col=26.2, axis_row=19.3, shifts=shifts, roll=roll, tilt=tilt
         )  # fmt: skip
     axes, centre = np.array([0.5, 0.35, 0.6]), np.array([0.12, -0.2, 0.1])
     grid = Grid((60, 64, 62), 0.025, (0.05, -0.1, 0.05))
@@ -304,9 +308,9 @@ def test_leaning_views_of_voxels_are_those_of_gaussians(cone: bool) -> None:
     angles = np.linspace(0, 2 * np.pi, 7, endpoint=False)
     lean = {"shifts": np.full((7, 2), (1.4, -2.3)), "roll": 0.2 * np.cos(angles), "tilt": 0.1 * np.sin(angles) - 0.05}
     if cone:
-        geometry = Geometry.cone(angles, (40, 44), 0.06, 8.0, 12.0, 21.0, **lean)
+        geometry = Geometry.cone(angles, (40, 44), 0.06, 8.0, 12.0, axis_col=21.0, **lean)
     else:
-        geometry = Geometry.parallel(angles, (40, 44), 0.04, 21.0, **lean)
+        geometry = Geometry.parallel(angles, (40, 44), pixel_pitch=0.04, axis_col=21.0, **lean)
     blobs = Gaussians.from_physical(
         np.array([[0.2, -0.1, 0.15], [-0.25, 0.2, -0.1]]), np.array([0.12, 0.1]), np.array([1.0, 2.0])
     )
@@ -326,7 +330,7 @@ def test_views_that_hardly_lean_are_straight_ones(cone: bool, rng: np.random.Gen
     straight = (
         Geometry.cone(angles, shape, 0.08, 5.0, 8.0, shifts=shifts)
         if cone
-        else Geometry.parallel(angles, shape, 0.05, shifts=shifts)
+        else Geometry.parallel(angles, shape, pixel_pitch=0.05, shifts=shifts)
     )
     volume = rng.random(grid.shape, dtype=np.float32)
     expected = Projector(straight, grid).forward(volume)
@@ -337,7 +341,7 @@ def test_views_that_hardly_lean_are_straight_ones(cone: bool, rng: np.random.Gen
 def test_parallel_chords_agree_with_the_simulator() -> None:
     """Written by other hands from another formula (chords of packed solids)."""
     body = Ellipsoid((0.5, 0.35, 0.6), 1.0, (0.12, -0.2, 0.1))
-    geometry = Geometry.parallel([0.3, 1.9], (40, 50), 0.04)
+    geometry = Geometry.parallel([0.3, 1.9], (40, 50), pixel_pitch=0.04)
     expected = np.stack(
         [Phantom.of([body]).line_integrals(a, Detector.centred((40, 50), 0.04)) for a in geometry.angles]
     )
@@ -349,7 +353,7 @@ def test_parallel_chords_agree_with_the_simulator() -> None:
 def test_a_uniform_box_seen_face_on_is_its_thickness() -> None:
     grid = Grid((1, 10, 20), 0.5)
     volume = Volume(np.full(grid.shape, 2.0, np.float32), grid)
-    geometry = Geometry.parallel([0.0, np.pi / 2], (1, 21), 0.5)
+    geometry = Geometry.parallel([0.0, np.pi / 2], (1, 21), pixel_pitch=0.5)
     across_y, across_x = project(volume, geometry)[:, 0, 10]
     assert across_y == pytest.approx(2.0 * 10 * 0.5)
     assert across_x == pytest.approx(2.0 * 20 * 0.5, rel=1e-6)
@@ -359,8 +363,8 @@ def test_a_far_source_is_a_parallel_beam(rng: np.random.Generator) -> None:
     angles, shape = [0.2, 2.5], (9, 12)
     grid = Grid((7, 10, 11), 0.9, (0.3, 0.1, -0.2))
     volume = Volume(rng.random(grid.shape, dtype=np.float32), grid)
-    parallel = project(volume, Geometry.parallel(angles, shape, 1.0, 5.2, axis_row=3.3))
-    cone = project(volume, Geometry.cone(angles, shape, 1.0, 1e6, 1e6, 5.2, axis_row=3.3))
+    parallel = project(volume, Geometry.parallel(angles, shape, pixel_pitch=1.0, axis_col=5.2, axis_row=3.3))
+    cone = project(volume, Geometry.cone(angles, shape, 1.0, 1e6, 1e6, axis_col=5.2, axis_row=3.3))
     np.testing.assert_allclose(cone, parallel, rtol=2e-4, atol=2e-4)
 
 

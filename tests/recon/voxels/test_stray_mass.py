@@ -19,7 +19,7 @@ def views(count: int, cone: bool) -> Geometry:
     angles = np.linspace(0, 2 * np.pi if cone else np.pi, count, endpoint=False)
     if cone:
         return Geometry.cone(angles, (32, 38), 0.06, 8.0, 12.0)
-    return Geometry.parallel(angles, (32, 38), 0.04)
+    return Geometry.parallel(angles, (32, 38), pixel_pitch=0.04)
 
 
 def scan(geometry: Geometry, rng: np.random.Generator, noise: float = 0.003) -> np.ndarray:

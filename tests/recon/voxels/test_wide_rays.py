@@ -22,8 +22,8 @@ from recon.voxels.projector import Projector, data_residual, views_of_exposure
 from tests.recon.voxels.balls import ball_views
 
 ANGLES = np.arange(9) * 0.37
-PARALLEL = Geometry.parallel(ANGLES, (40, 36), 0.05)
-SHIFTED = Geometry.parallel(ANGLES, (40, 36), 0.05, shifts=np.tile((0.3, -0.7), (9, 1)))
+PARALLEL = Geometry.parallel(ANGLES, (40, 36), pixel_pitch=0.05)
+SHIFTED = Geometry.parallel(ANGLES, (40, 36), pixel_pitch=0.05, shifts=np.tile((0.3, -0.7), (9, 1)))
 CONE = Geometry.cone(ANGLES, (40, 36), 0.08, 40.0, 60.0)
 WIDTH = RayWidth(pixel=1, blur=0.7, arc=0.2)
 CASES = {
@@ -98,7 +98,7 @@ def test_rows_and_bins_of_skewed_views_keep_the_angles_of_their_rows() -> None:
 
 
 def test_gaussians_and_voxels_see_the_same_skew() -> None:
-    views = Geometry.parallel(ANGLES, (40, 36), 0.05).seen_with(RayWidth(), 5e-3)
+    views = Geometry.parallel(ANGLES, (40, 36), pixel_pitch=0.05).seen_with(RayWidth(), 5e-3)
     centres = np.array([(0.4, 0.2, -0.8), (-0.5, 0.1, 0.8)])
     g = Gaussians.from_physical(centres, np.full((2, 3), 0.12), [1.0, 1.0])
     grid = Grid.matching(views)

@@ -133,6 +133,8 @@ def test_motion_blur_smears_along_the_path_of_the_stage() -> None:
         bench.camera.arm(1)
         bench.line.schedule([Pulse(start + 0.02, 0.8)])
     sharp, smeared = still.take(1)[0], blurred.take(1)[0]
+    middle = 0.08 * math.cos(1.0) + 0.02 * math.sin(1.0)  # 0.8 rad at the pulse, 1.2 at the end of its 10 ms
+    assert _column(sharp) == pytest.approx(still.camera.detector.axis_col + middle / 4.6e-3, abs=0.1)
     u = [0.08 * math.cos(a) + 0.02 * math.sin(a) for a in np.linspace(0.8, 1.2, 41)]
     assert _column(smeared) == pytest.approx(blurred.camera.detector.axis_col + np.mean(u) / 4.6e-3, abs=0.15)
     assert (smeared.counts < FULL).sum() > 1.2 * (sharp.counts < FULL).sum()

@@ -20,7 +20,8 @@ from tests.simulators import shots
 def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: int) -> None:
     scene = replace(shots.scene("photon_noise"), axis_offset_px=3.4)
     asked = replace(scene.detector, shape=(64, 96), binning=binning, readout=readout)
-    scan = Scan.of(replace(scene, detector=asked), seed=7)
+    # Without effects of motion its stage stands in an exposure, as its file says; an instrument's turns on.
+    scan = Scan.of(replace(scene, detector=asked, scan=replace(scene.scan, fly=False)), seed=7)
     of = scan.frame(25).shot
     settings = CameraSettings(asked.exposure_s, TriggerSource.EXTERNAL, scan.roi, binning, readout)
     view = CameraView(scan.scene, settings, asked.pixel_size_um * 1e-3, 7, of.angle_at, connected=scan.start)
@@ -30,6 +31,14 @@ def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: in
         assert seen["detector"][name] == pytest.approx(value, rel=1e-12), name
     assert seen.pop("row_period") == pytest.approx(expected.pop("row_period"), rel=1e-12)
     assert {**seen, "detector": None} == {**expected, "detector": None}
+
+
+@pytest.mark.parametrize(("effects", "seen"), [((), 0.42), (("motion_blur",), 0.4), (("rolling_shutter",), 0.4)])
+def test_a_frame_without_motion_shows_the_middle_of_its_exposure(effects: tuple[str, ...], seen: float) -> None:
+    """Effects of motion ask for the moments of the exposure themselves, from the trigger on."""
+    settings = CameraSettings(0.01, TriggerSource.EXTERNAL, (0, 0, 64, 96))
+    view = CameraView(shots.scene(*effects), settings, 4.6e-3, 1, lambda time: 0.4 + 4.0 * (time - 1000.0), 0.0)
+    assert view.shot(Exposed(0, 0, 1000.0, 0.4, 1000.1, True, True, 0)).angle == pytest.approx(seen)
 
 
 def test_without_a_roi_it_is_the_whole_sensor() -> None:

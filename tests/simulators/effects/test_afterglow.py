@@ -17,7 +17,7 @@ from simulators.frame.shot import Moments
 from tests.simulators import shots
 
 CONVERSION = sensor.CONVERSION["standard"]
-TRIGGER = Moments.at_trigger(60)
+TRIGGER = Moments.once(60)
 
 
 def _mean(moments: Moments, rate: float) -> NDArray[np.float64]:

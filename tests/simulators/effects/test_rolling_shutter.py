@@ -24,7 +24,7 @@ def test_rolling_shutter_shows_each_row_at_its_own_time() -> None:
     scene = shots.scene("rolling_shutter")
     skewed = shots.frame(scene, angle_at=_fast)
     for row in (21, 30, 37):  # rows that the ellipsoid casts its shadow on
-        depth = shots.depth(scene, _fast(1000.0 + row // 2 * LINE))[row]
+        depth = shots.depth(scene, _fast(1000.0 + 0.01 / 2 + row // 2 * LINE))[row]  # of the middle of its exposure
         assert np.abs(depth - shots.depth(scene, 0.4)[row]).max() > 0.01
         np.testing.assert_allclose(skewed[row] * CONVERSION / 4000, np.exp(-depth), atol=2e-5)
 
@@ -35,7 +35,7 @@ def test_two_rows_are_read_in_a_line_time_from_the_first_row_down(binning: int, 
     timing = orca_quest.timing(CameraSettings(0.01, TriggerSource.EXTERNAL, binning=binning, readout=readout))
     rows = timing.shape[0]
     shot = shots.shot(row_period=timing.row_period, binning=binning)
-    times = RollingShutter().moments(Moments.at_trigger(rows), shot).times[0]
+    times = RollingShutter().moments(Moments.once(rows), shot).times[0]
     for row in range(0, rows, 7):
         pair = row * binning // 2  # the first of the sensor's pairs that the row is made of
         assert times[row] == pytest.approx(pair * orca_quest.LINE_TIME[readout], abs=1e-12)

@@ -33,10 +33,10 @@ SHAPE = (20, 26)
 TURNED = {"axis_row": 8.0, "shifts": ((0.4, -1.3), (1.2, 0.7)), "roll": (0.2, -0.1), "tilt": -0.3}
 ANGLES = (0.4, -2.7)
 GEOMETRIES = {
-    "straight": Geometry.parallel(ANGLES, SHAPE, 0.5, 11.3, shifts=((0.4, -1.3), (1.2, 0.7))),
-    "turned": Geometry.parallel(ANGLES, SHAPE, 0.5, 11.3, **TURNED),
-    "cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, 11.3),
-    "turned cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, 11.3, **TURNED),
+    "straight": Geometry.parallel(ANGLES, SHAPE, pixel_pitch=0.5, axis_col=11.3, shifts=((0.4, -1.3), (1.2, 0.7))),
+    "turned": Geometry.parallel(ANGLES, SHAPE, pixel_pitch=0.5, axis_col=11.3, **TURNED),
+    "cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, axis_col=11.3),
+    "turned cone": Geometry.cone(ANGLES, SHAPE, 0.8, 25.0, 40.0, axis_col=11.3, **TURNED),
 }
 UNIT = 0.7
 

@@ -20,7 +20,9 @@ from recon.kernels.cpu.rays import CpuRays
 F32 = NDArray[np.float32]
 
 SHAPE = (33, 41)
-WIDE = Geometry.cone([0.4], SHAPE, 0.8, 14.0, 30.0, 18.3, axis_row=14.0, shifts=[[0.4, -1.3]], roll=0.2, tilt=-0.3)
+WIDE = Geometry.cone(
+    [0.4], SHAPE, 0.8, 14.0, 30.0, axis_col=18.3, axis_row=14.0, shifts=[[0.4, -1.3]], roll=0.2, tilt=-0.3
+)
 
 
 UNIT = 0.7

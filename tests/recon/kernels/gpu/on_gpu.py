@@ -51,11 +51,13 @@ def parallel(shape: tuple[int, int] = SHAPE) -> Geometry:
 
 
 def leaned() -> Geometry:
-    return Geometry.parallel([2.5], SHAPE, 0.5, axis_row=8.2, shifts=[[1.3, -0.8]], roll=0.2, tilt=0.3)
+    return Geometry.parallel([2.5], SHAPE, pixel_pitch=0.5, axis_row=8.2, shifts=[[1.3, -0.8]], roll=0.2, tilt=0.3)
 
 
 def cone(shape: tuple[int, int] = SHAPE) -> Geometry:
-    return Geometry.cone([0.4], shape, 1.1, 22.0, 45.0, shape[1] / 2 - 1.1, shifts=[[-0.6, 0.4]], roll=-0.1, tilt=0.2)
+    return Geometry.cone(
+        [0.4], shape, 1.1, 22.0, 45.0, axis_col=shape[1] / 2 - 1.1, shifts=[[-0.6, 0.4]], roll=-0.1, tilt=0.2
+    )
 
 
 def project_raw(*arguments: Any) -> Tensor:

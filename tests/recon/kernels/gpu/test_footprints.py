@@ -138,7 +138,7 @@ def test_what_misses_the_image_or_is_too_faint_has_no_gradient() -> None:
 def test_a_needle_keeps_its_digits(aspect: float) -> None:
     # Askew and longer than the image: the expanded quadratic form would lose it in float32.
     g = Gaussians.from_physical([[0.1, 0.2, -0.3]], [[0.03 * aspect, 0.03, 0.03]], [1.0], [[0.9, 0.1, 0.35, 0.2]])
-    geometry = Geometry.parallel([0.3], (24, 24), 0.05)
+    geometry = Geometry.parallel([0.3], (24, 24), pixel_pitch=0.05)
     raw, double = raw_of(g, DEVICE), in_double(g)
     found = project_raw(*raw, g.density_unit, geometry, *WHOLE, AFFINE)
     expected = reference_view(double, geometry, 0)

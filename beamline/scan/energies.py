@@ -1,0 +1,167 @@
+"""Energies: a series of scans of one sample, one for each energy, in a folder of its own; it can go on later.
+
+Each scan has a run folder of the usual kind in the series' folder, so that whatever reads a run reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from beamline.config.load import Config, at_energies, load, resolved_yaml
+from beamline.core.errors import ConfigError
+from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
+from beamline.core.stop import StopRequest
+from beamline.instrument.connect import connect
+from beamline.instrument.simulated import clock_of
+from beamline.scan.live_process import Commands
+from beamline.scan.preflight import dry_run, refuse_violations
+from beamline.scan.resume import NoFrame, NothingMissing, NotJoined, ResumableRun, open_for_resume, recover_run
+from beamline.scan.run import RunResult, run_scan
+from beamline.scan.run_folder import CONFIG, SCAN, create_run_folder
+from beamline.storage.parts import JOINED
+from drivers.base.clock import SystemClock
+from drivers.manual import Ask
+
+
+@dataclass(frozen=True)
+class SeriesRun:
+    """A finished series.
+
+    Attributes:
+        folder: of the series.
+        scans: keV and the scan file of each energy.
+        results: of the scans that were taken now.
+    """
+
+    folder: Path
+    scans: tuple[tuple[float, Path], ...]
+    results: tuple[RunResult, ...]
+
+
+def is_series(folder: Path) -> bool:
+    """Whether it is the folder of a series of energies."""
+    if not (folder / CONFIG).is_file() or (folder / SCAN).exists():
+        return False
+    return load(folder / CONFIG, environment={}).scan.energies is not None
+
+
+def scans_in(folder: Path) -> list[Path]:
+    """The scan file of each energy of a series that has one, in the order of the configuration."""
+    return [_file_of(run) for run in _runs(folder, load(folder / CONFIG, environment={})) if run is not None]
+
+
+def run_energies(
+    config: Config,
+    place: Path | None,
+    sinks: Sequence[Sink],
+    stop: StopRequest,
+    commands: Callable[[Config, ResumableRun | None], Commands],
+    *,
+    series: Path | None = None,
+    ask: Ask | None = None,
+) -> SeriesRun:
+    """Scan at each of `scan.energies`, one after the other, with devices that stay connected.
+
+    Args:
+        place: the folder in which the series gets its own; None: the configured one.
+        sinks: get the events of all scans.
+        stop: ends the scan that runs, and with it the series.
+        commands: of the reconstruction of each scan.
+        series: the folder of a series that goes on: scans that lack nothing stay, one that ended early goes on.
+        ask: as of `run_scan`.
+
+    Raises:
+        ConfigError: a limit is violated at one of the energies; nothing has moved.
+        What `run_scan` raises: the scans before it are complete, and a warning names the folder that can go on.
+    """
+    refuse_violations(dry_run(config, series or place).timeline)
+    each = at_energies(config)
+    with ExitStack() as held:
+        jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
+        last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
+        clock = None if config.simulation is None else clock_of(config.simulation.clock, not_before=last)
+        instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))
+        folder = series or _new_folder(config, place or Path(config.storage.folder))
+        scans: list[tuple[float, Path]] = []
+        results: list[RunResult] = []
+        for n, (one, job) in enumerate(zip(each, jobs, strict=True), 1):
+            energy = one.scan.energy or 0.0
+            if isinstance(job, Path):
+                scans.append((energy, job))
+                continue
+            _tell(StateEntered("energies", f"Energy {n} of {len(each)}: {energy:.7g} keV"), sinks)
+            how = commands(one, job)
+            try:
+                taken = run_scan(
+                    one, job or folder, [_but_done(sinks)], stop,
+                    live=how.live, afterwards=how.afterwards, instrument=instrument,
+                )  # fmt: skip
+            except BaseException:
+                _after_failure(folder, n, len(each), sinks)
+                raise
+            results.append(taken)
+            scans.append((energy, taken.path))
+    return SeriesRun(folder, tuple(scans), tuple(results))
+
+
+def _new_folder(config: Config, place: Path) -> Path:
+    folder = create_run_folder(place, f"{config.sample.name}_energies", SystemClock().now())
+    (folder / CONFIG).write_text(resolved_yaml(config), encoding="utf-8")
+    return folder
+
+
+def _runs(series: Path, config: Config) -> list[Path | None]:
+    """The newest run folder of each energy of a series; None: there is none."""
+    if not is_series(series):
+        raise ConfigError(f"{series} is no folder of a series of energies. Nothing was changed.")
+    found = dict[float | None, Path]()
+    for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
+        found[load(run / CONFIG, environment={}).scan.energy] = run
+    return [found.get(energy) for energy in config.scan.energies or ()]
+
+
+def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
+    """What there is to do: nothing (its scan file), the rest of a run, or a scan anew (None)."""
+    if run is None:
+        return None
+    try:
+        return held.enter_context(open_for_resume(run))
+    except NoFrame:
+        return None
+    except NotJoined:
+        recover_run(run)
+    except NothingMissing:
+        pass
+    return _file_of(run)
+
+
+def _file_of(run: Path) -> Path:
+    return run / (JOINED if (run / JOINED).is_file() else SCAN)
+
+
+def _but_done(sinks: Sequence[Sink]) -> Sink:
+    """A scan of the series is not the end of the command."""
+
+    def pass_on(event: Event) -> None:
+        if not isinstance(event, RunDone):
+            for sink in sinks:
+                sink(event)
+
+    return pass_on
+
+
+def _tell(event: Event, sinks: Sequence[Sink]) -> None:
+    for sink in sinks:
+        sink(replace(event, time=SystemClock().now()))
+
+
+def _after_failure(folder: Path, n: int, of: int, sinks: Sequence[Sink]) -> None:
+    """Say how the series can go on; remove its folder where no scan has one in it."""
+    if any(path.is_dir() for path in folder.iterdir()):
+        _tell(Warned(f"The series ended at energy {n} of {of}: `beamline scan --resume {folder}` goes on."), sinks)
+        return
+    (folder / CONFIG).unlink()
+    folder.rmdir()
