@@ -61,7 +61,6 @@ def test_the_residual_is_that_of_the_series_in_the_views() -> None:
     projector = Projector(views.geometry, found.grid)
     model = np.stack([projector.subset([v]).forward(found.at(t))[0] for v, t in enumerate(views.times)])
     left = np.linalg.norm(model - views.projections) / np.linalg.norm(views.projections)
-    print(left, found.residual)
     assert left == pytest.approx(found.residual, rel=0.15)  # that of the last sweep, while its steps go on
 
 
