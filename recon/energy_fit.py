@@ -1,4 +1,4 @@
-"""Steps of the one fit of `recon.spectral` and `recon.series`: volumes of which each view sees its own sum."""
+"""Steps of the one fit of `recon.spectral` and `recon.series`. Each view sees a sum of volumes with its own shares."""
 
 from __future__ import annotations
 
