@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.registration import register_energies
-    from recon.series import Series, TimedViews, fit_series
+    from recon.series import TimedViews, TimedVolumes, fit_series
     from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
@@ -82,10 +82,10 @@ __all__ = [
     "RunControl",
     "Sart",
     "SaxNerf",
-    "Series",
     "Sirt",
     "StreamingFit",
     "TimedViews",
+    "TimedVolumes",
     "Volume",
     "WithoutRings",
     "attenuation_factors",
@@ -114,7 +114,7 @@ _LAZY = {
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
     "register_energies": "recon.registration",
-    **dict.fromkeys(("Series", "TimedViews", "fit_series"), "recon.series"),
+    **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
     "EnergyViews": "recon.energy_fit",
     **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",

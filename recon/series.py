@@ -60,7 +60,7 @@ class TimedViews:
 
 
 @dataclass(frozen=True, eq=False)
-class Series:
+class TimedVolumes:
     """A volume that changes, linear between knots in time, and moves.
 
     Attributes:
@@ -104,7 +104,7 @@ def fit_series(
     sweeps: int = 60,
     seed: int = 0,
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
-) -> Series:
+) -> TimedVolumes:
     """Volumes at evenly spaced times that explain all views in one least-squares fit with total variation.
 
         min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
@@ -151,7 +151,7 @@ def fit_series(
         moves = moves and moves.on(moves.shape, past)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), moves)
     volumes, residual = fitted(fit, weights, sweeps, go_on)
-    return Series(times, volumes, grid, residual, moves)
+    return TimedVolumes(times, volumes, grid, residual, moves)
 
 
 def _of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:

@@ -12,7 +12,7 @@ import recon
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.series import Series, TimedViews, _of_moments, fit_series, hats
+from recon.series import TimedViews, TimedVolumes, _of_moments, fit_series, hats
 from recon.voxels.projector import Projector
 
 SIDE, ROWS = 40, 4
@@ -92,7 +92,7 @@ def mean_psnr(at: dict[float, F32]) -> float:
     )
 
 
-def of_sub_scans(views: TimedViews, parts: int) -> Series:
+def of_sub_scans(views: TimedViews, parts: int) -> TimedVolumes:
     """FISTA-TV of each part of the scan, linear in time between their middles."""
     edges = np.arange(parts + 1) * views.times.size // parts
     cut = [np.arange(a, b) for a, b in itertools.pairwise(edges)]
@@ -101,7 +101,7 @@ def of_sub_scans(views: TimedViews, parts: int) -> Series:
         for at in cut
     ]
     times: F64 = np.array([views.times[at].mean() for at in cut])
-    return Series(times, np.stack(volumes), Grid.matching(views.geometry), 0.0)
+    return TimedVolumes(times, np.stack(volumes), Grid.matching(views.geometry), 0.0)
 
 
 def test_one_fit_beats_sub_scans_and_one_volume_of_all_views() -> None:

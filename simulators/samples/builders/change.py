@@ -18,7 +18,7 @@ _Seconds = Annotated[float, Field(ge=0, le=1e6)]
 _Over = Annotated[float, Field(gt=0, le=1e6)]
 
 
-class Change(Protocol):
+class ChangeInTime(Protocol):
     """A change of a sample with time."""
 
     def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
