@@ -24,6 +24,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_by_views import axis_by_views
+    from recon.energy_fit import EnergyViews
     from recon.fields.methods import NAF, IntraTomo, SaxNerf
     from recon.prep.align import AxisEstimate, find_axis
     from recon.prep.correct import CorrectionSettings, Projections, References, correct
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     from recon.prep.rings import WithoutRings, remove_rings
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.registration import register_energies
-    from recon.spectral import EnergyViews, Materials, fit_materials
+    from recon.series import TimedViews, TimedVolumes, fit_series
+    from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
     from recon.splatting.r2 import R2
@@ -82,6 +84,8 @@ __all__ = [
     "SaxNerf",
     "Sirt",
     "StreamingFit",
+    "TimedViews",
+    "TimedVolumes",
     "Volume",
     "WithoutRings",
     "attenuation_factors",
@@ -89,6 +93,7 @@ __all__ = [
     "correct",
     "find_axis",
     "fit_materials",
+    "fit_series",
     "mlem",
     "project",
     "reconstruct",
@@ -109,7 +114,9 @@ _LAZY = {
     "Reconstruction": "recon.reconstruction",
     "reconstruct": "recon.reconstruction",
     "register_energies": "recon.registration",
-    **dict.fromkeys(("EnergyViews", "Materials", "fit_materials"), "recon.spectral"),
+    **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
+    "EnergyViews": "recon.energy_fit",
+    **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
     **dict.fromkeys(("Emission", "attenuation_factors", "mlem", "weighted_lines"), "recon.voxels.emission"),

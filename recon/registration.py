@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F64
 from recon.base.binning import bin_views
-from recon.spectral import EnergyViews
+from recon.energy_fit import EnergyViews
 from recon.voxels.displacement import Displacement, displaced, displacements, judge
 from recon.voxels.held_out_weight import busiest_rows
 

@@ -7,92 +7,23 @@ all views of all energies determine the few volumes of the materials.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
-from recon.base.decisions import Decisions
-from recon.base.geometry import Geometry
 from recon.base.volume import Grid
-from recon.kernels.cpu.mixtures import nonnegative_mix
-from recon.kernels.cpu.vectors import combine
+from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
-from recon.voxels.ordered_fista import subsets_of
-from recon.voxels.projector import Projector, projection_lines
-from recon.voxels.tv import TotalVariationProx, difference_weights
-from recon.voxels.voxel_problem import Momentum, largest_eigenvalue
 
-_SUBSETS, _TV_STEPS = 9, 3
 _ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _FIRST = 0.1  # the first weight, over the largest gradient at zero
+_ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
 _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
-_LEAST_SINGULAR = 1e-4  # of the largest singular value: less, and energies do not tell materials apart
-_NOTHING = 1e-20  # singular value of materials that attenuate nothing
 TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
-
-
-@dataclass(frozen=True, eq=False)
-class EnergyViews:
-    """Views of one sample at several energies, and what materials attenuate there.
-
-    Attributes:
-        projections: line integrals, float32 [view, row, col], finite.
-        geometry: of all views.
-        energy: [view], index of the energy of each view.
-        cross_sections: float64 [energy, material], attenuation of each material at density 1, such as 1/mm.
-        weight: of each ray [view, row, col]; None: one.
-
-    Raises:
-        ValueError: shapes or indices do not fit, values are not finite, or the energies do not tell materials apart.
-    """
-
-    projections: F32
-    geometry: Geometry
-    energy: NDArray[np.intp]
-    cross_sections: F64
-    weight: F32 | None = None
-
-    def __post_init__(self) -> None:
-        wanted = (self.geometry.n_views, *self.geometry.detector_shape)
-        for name, array in (("projections", self.projections), ("weight", self.weight)):
-            if array is not None and array.shape != wanted:
-                raise ValueError(f"{name} must have the geometry's shape {wanted}, got {array.shape}")
-        if not np.isfinite(self.projections).all():
-            raise ValueError("projections must be finite: give rays that were not measured the weight 0 and any value")
-        n, materials = self.cross_sections.shape
-        if self.energy.shape != wanted[:1] or self.energy.min() < 0 or self.energy.max() >= n:
-            raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {wanted[0]} views")
-        seen = self.cross_sections[np.unique(self.energy)]
-        if not np.isfinite(seen).all():
-            raise ValueError("cross_sections must be finite")
-        values = np.linalg.svd(seen, compute_uv=False)
-        if len(seen) < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
-            raise ValueError(
-                f"views of {len(seen)} energies do not tell {materials} materials apart: give more energies, or fewer "
-                "materials"
-            )
-
-    def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:
-        """Some views, and neighbouring rows of them."""
-        first, stop, _ = rows.indices(self.projections.shape[1])
-        weight = None if self.weight is None else self.weight[views, rows]
-        geometry = self.geometry.select(views).rows(first, stop)
-        return EnergyViews(self.projections[views, rows], geometry, self.energy[views], self.cross_sections, weight)
-
-    def parted(self, n: int) -> NDArray[np.intp]:
-        """The part 0 ... n - 1 of each view: each part sees all energies, and directions all around."""
-        part, energies = np.empty(self.geometry.n_views, np.intp), len(self.cross_sections)
-        angles = np.mod(self.geometry.angles, self.geometry.period)
-        for energy in range(energies):
-            own = np.flatnonzero(self.energy == energy)
-            part[own[np.argsort(angles[own], kind="stable")]] = (energy * n // energies + np.arange(own.size)) % n
-        return part
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,154 +85,29 @@ def fit_materials(
     """
     grid = grid or Grid.matching(views.geometry)
     n = views.cross_sections.shape[1]
-    weights = _weights_by_views(views, grid, seed, go_on, stop) if tv_weight is None else np.full(n, tv_weight)
-    fit, residual = _Fit(views, grid, np.random.default_rng(seed), stop), 1.0
-    for sweep, residual in enumerate(fit.sweeps(weights, sweeps), 1):
-        if not go_on(sweep, residual):
-            break
-    return Materials(fit.densities(), grid, weights, residual)
+    weights = weights_by_views(views, grid, seed, go_on, stop) if tv_weight is None else np.full(n, tv_weight)
+    fit = EnergyFit(views, grid, np.random.default_rng(seed), stop=stop)
+    densities, residual = fitted(fit, weights, sweeps, go_on)
+    return Materials(densities, grid, weights, residual)
 
 
-class _StoppedError(Exception):
-    """`stop` interrupted a step."""
-
-
-class _Part(NamedTuple):
-    """Views of one energy in one subset: data and weight as lines [view, col, row]."""
-
-    energy: int
-    projector: Projector
-    data: F32
-    weight: F32 | None
-
-
-@dataclass(eq=False)
-class _Fit:
-    """The volumes of `fit_materials`, and its steps.
-
-    Attributes:
-        z: float32 [component, y, x, z].
-        subsets: of the views; each has all energies.
-        _to, _back: from densities to components, and back.
-        _u: U [energy, component].
-        step: 1 / L. L bounds the curvature of a subset: the largest eigenvalue of AᵀWA where a view of energy e weighs
-            |U[e]|². That is a bound since A has no negative entry, so |A Σ U z| <= |U| A |z|.
-    """
-
-    views: EnergyViews
-    grid: Grid
-    rng: np.random.Generator
-    stop: Callable[[], bool] = lambda: False
-    z: F32 = field(init=False)
-    subsets: list[list[_Part]] = field(init=False)
-    step: float = field(init=False)
-    _begun: bool = field(default=False, init=False)
-
-    def __post_init__(self) -> None:
-        views = self.views
-        counts = np.bincount(views.energy, minlength=len(views.cross_sections))
-        seen = np.sqrt(counts / counts.max())[:, None]
-        u, values, mix = np.linalg.svd(seen * views.cross_sections, full_matrices=False)
-        self._to = values[:, None] * mix
-        self._back = mix.T / values
-        self._u = np.divide(u, seen, out=np.zeros_like(u), where=seen > 0)
-        whole, data = Projector(views.geometry, self.grid), projection_lines(views.projections)
-        weight = np.ones_like(data) if views.weight is None else projection_lines(views.weight)
-        self._norm = math.sqrt(float(np.vdot(data, weight * data))) or 1.0  # views of nothing leave nothing
-        subset = views.parted(subsets_of(views.geometry, _SUBSETS))
-        self.subsets = []
-        for number in range(subset.max() + 1):
-            own = [np.flatnonzero((subset == number) & (views.energy == e)) for e in range(counts.size)]
-            self.subsets.append(
-                [
-                    _Part(e, whole.subset(at), data[at], None if views.weight is None else weight[at])
-                    for e, at in enumerate(own)
-                    if at.size
-                ]
-            )
-        largest = np.flatnonzero(subset == np.argmax(np.bincount(subset)))
-        heights = (self._u**2).sum(1)[views.energy[largest]].astype(np.float32)
-        self.step = 1 / largest_eigenvalue(whole.subset(largest), heights[:, None, None] * weight[largest])
-        nz, ny, nx = self.grid.shape
-        self.z = np.zeros((values.size, ny, nx, nz), np.float32)
-
-    def descent(self, subset: list[_Part], out: F32) -> float:
-        """Minus the gradient of the views of a subset at z, into `out`. Returns their weighed sum of squares.
-
-        Raises:
-            _StoppedError: `stop` said so.
-        """
-        out[...] = 0
-        squares, image = 0.0, np.empty(self.z.shape[1:], np.float32)
-        for part in subset:
-            if self._begun and self.stop():
-                raise _StoppedError
-            image[...] = 0
-            for share, component in zip(self._u[part.energy], self.z, strict=True):
-                combine(1.0, image, float(share), component, image)
-            residual = part.data - part.projector.forward_lines(image)
-            weighted = residual if part.weight is None else part.weight * residual
-            squares += float(np.vdot(residual, weighted))
-            part.projector.adjoint_lines(weighted, image)
-            for share, component in zip(self._u[part.energy], out, strict=True):
-                combine(1.0, component, float(share), image, component)
-        return squares
-
-    def sweeps(self, weights: F64, n: int) -> Iterator[float]:
-        """n times about nine steps from z, which see all views equally often; gives the residual of each nine. After a
-        stop z is that before the step that it interrupts."""
-        _, ny, nx, nz = self.z.shape
-        differences, count = difference_weights(self.grid), len(self.subsets)
-        prox = [TotalVariationProx((ny, nx, nz), differences, False, _TV_STEPS) for _ in self.z]
-        ahead, descent = Momentum(self.z, Decisions()), np.empty_like(self.z)
-        for sweep in range(n):
-            squares = 0.0
-            order = [number for _ in range(_SUBSETS // count) for number in self.rng.permutation(count)]
-            for at, number in enumerate(order):
-                try:
-                    squares += self.descent(self.subsets[number], descent)
-                except _StoppedError:
-                    nonnegative_mix(self.z, self._back, self._to)  # momentum may have gone below 0
-                    return
-                self._begun = True
-                combine(1.0, self.z, self.step, descent, self.z)
-                for component, near, weight in zip(self.z, prox, weights, strict=True):
-                    near(component, float(weight) * self.step / count)
-                    near.turn()
-                nonnegative_mix(self.z, self._back, self._to)
-                if at + 1 < len(order):
-                    ahead(self.z)
-            yield math.sqrt(squares * count / len(order)) / self._norm
-            if sweep + 1 < n:
-                ahead(self.z)
-
-    def residual_of(self, densities: F32) -> float:
-        """What densities [material, z, y, x] leave of all views, over the norm of the views."""
-        self.z = np.ascontiguousarray(np.einsum("km,mzyx->kyxz", self._to.astype(np.float32), densities))
-        out = np.empty_like(self.z)
-        return math.sqrt(sum(self.descent(subset, out) for subset in self.subsets)) / self._norm
-
-    def steepest(self) -> float:
-        """The largest entry of the gradient at z."""
-        out, total = np.empty_like(self.z), np.zeros_like(self.z)
-        for subset in self.subsets:
-            self.descent(subset, out)
-            total += out
-        return float(np.abs(total).max())
-
-    def densities(self) -> F32:
-        """[material, z, y, x]."""
-        return np.ascontiguousarray(np.einsum("mk,kyxz->mzyx", self._back.astype(np.float32), self.z))
-
-
-def _weights_by_views(
-    views: EnergyViews, grid: Grid, seed: int, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+def weights_by_views(
+    views: EnergyViews,
+    grid: Grid,
+    seed: int,
+    go_on: Callable[[int, float], bool],
+    stop: Callable[[], bool] = lambda: False,
+    *,
+    alike: bool = False,
 ) -> F64:
     """Weights of total variation [component], by one view in eight held out.
 
     First one weight for all components, halved until it predicts worse. The first component, which holds what energies
     have in common, keeps the best one. The others hold differences: less structure, and the same noise. So they get the
     heaviest weight that predicts within 1 % of the best.
+
+    Args:
+        alike: all components keep one weight.
     """
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     rows = slice(None)
@@ -309,7 +115,7 @@ def _weights_by_views(
         rows = busiest_rows(views.projections, _ROWS)
         grid = slab_of(views.geometry, grid, *rows.indices(views.projections.shape[1])[:2])[1]
     fit, judge = (
-        _Fit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop)
+        EnergyFit(views.select(np.flatnonzero(chosen), rows), grid, np.random.default_rng(seed), stop=stop)
         for chosen in (~held_out, held_out)
     )
 
@@ -317,7 +123,7 @@ def _weights_by_views(
 
     def left(weights: F64) -> float:
         nonlocal going
-        for residual in fit.sweeps(weights, _TRIAL_SWEEPS):
+        for residual in fit.sweeps(weights, (_ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS):
             if not (going := go_on(0, residual)):
                 return math.inf
         if stop():
@@ -335,7 +141,7 @@ def _weights_by_views(
         if worse == 2:
             break
         weights = weights / 2
-    heavier = np.r_[1.0, np.full(len(weights) - 1, 2.0)]
+    heavier = np.r_[2.0 if alike else 1.0, np.full(len(weights) - 1, 2.0)]
     ladder = [best * heavier**octave for octave in range(_HEAVIER)]
     residuals: list[float] = []
     for weights in ladder:

@@ -30,8 +30,9 @@ from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.clock import Clock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.energy_fit import EnergyViews
 from recon.registration import register_energies
-from recon.spectral import TRIAL_SWEEPS, EnergyViews, Materials, fit_materials
+from recon.spectral import TRIAL_SWEEPS, Materials, fit_materials
 from recon.voxels.displacement import Displacement
 
 _SWEEPS = 20

@@ -1,7 +1,9 @@
-"""Sample: the interface of all phantoms, of solids, of voxels or of materials under a spectrum."""
+"""Sample: the interface of all phantoms, of solids, of voxels or of materials; and a sample that changes with time."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -34,3 +36,38 @@ class Sample(Protocol):
 
     def labels(self, grid: Grid) -> NDArray[np.uint8]:
         """Label at each voxel's centre, uint8 [z, y, x]: an index into `names`, counted from 1, or 0 for air."""
+
+
+@dataclass(frozen=True, eq=False)
+class Changing:
+    """A sample that changes while it is scanned; as a `Sample` it is what it is at first.
+
+    Attributes:
+        at: the sample so many seconds after the camera was connected.
+        start: at 0 s.
+    """
+
+    at: Callable[[float], Sample]
+    start: Sample
+
+    @property
+    def radius(self) -> float:
+        return self.start.radius
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.start.names
+
+    def line_integrals(self, angle: ArrayLike | Pose, detector: Detector) -> NDArray[np.float64]:
+        return self.start.line_integrals(angle, detector)
+
+    def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
+        return self.start.attenuation(grid, supersample)
+
+    def labels(self, grid: Grid) -> NDArray[np.uint8]:
+        return self.start.labels(grid)
+
+
+def sample_at(sample: Sample, seconds: float) -> Sample:
+    """The sample so many seconds after the camera was connected."""
+    return sample.at(seconds) if isinstance(sample, Changing) else sample

@@ -16,6 +16,7 @@ from simulators.effects.chain import StepHook
 from simulators.frame.pose import Pose
 from simulators.frame.sensor import digitise, largest_count
 from simulators.frame.shot import Image, Shot
+from simulators.samples.sample import sample_at
 from simulators.scenes.scene import Scene
 
 
@@ -71,11 +72,12 @@ def _transmission(
     """open_beam x exp(-line integral) with the sample's pose at one moment of each row, mean over a pixel's rays."""
     pose = scene.chain.pose(Pose(angles), times, shot)
     now, rays = shot.later(float(times[0])), scene.chain.rays
+    sample = sample_at(scene.sample, shot.elapsed + float(times[0]))
 
     def through(row: float, col: float) -> Image:
         detector = shot.detector.aimed(row, col)
         with on_step("line_integrals"):
-            depth = scene.sample.line_integrals(pose, detector)
+            depth = sample.line_integrals(pose, detector)
         depth = scene.chain.apply(Domain.OPTICAL_DEPTH, depth, replace(now, detector=detector), on_step)
         with on_step("beer_lambert"):
             np.exp(np.negative(depth, out=depth), out=depth)

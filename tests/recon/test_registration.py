@@ -10,8 +10,9 @@ import pytest
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
+from recon.energy_fit import EnergyViews
 from recon.registration import STEPS, register_energies
-from recon.spectral import EnergyViews, fit_materials
+from recon.spectral import fit_materials
 from tests.bench.quality_cases import seen_by_simulator
 
 SIDE, ROWS, PITCH, EACH, PHOTONS = 48, 16, 1.1e-3, 10, 5000

@@ -11,9 +11,10 @@ import pytest
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.energy_fit import EnergyFit, EnergyViews
 from recon.methods import by_name
 from recon.reconstruction import reconstruct
-from recon.spectral import TRIAL_SWEEPS, EnergyViews, _Fit, fit_materials
+from recon.spectral import TRIAL_SWEEPS, fit_materials
 from recon.voxels.projector import Projector
 
 SECTIONS = np.array([[0.2, 1.0], [0.5, 0.9], [1.0, 0.2], [0.9, 0.4]])  # [energy, material]
@@ -61,7 +62,7 @@ def test_densities_are_found_from_views_that_each_see_one_energy() -> None:
 
 def test_the_descent_is_minus_the_gradient(rng: np.random.Generator) -> None:
     views = views_of(balls(16, 2), 3, noise=0.1)
-    fit = _Fit(views, Grid.matching(views.geometry), rng)
+    fit = EnergyFit(views, Grid.matching(views.geometry), rng)
     at, along = (rng.standard_normal(fit.z.shape).astype(np.float32) for _ in range(2))
 
     def half_squares(z: F32) -> float:
@@ -81,7 +82,7 @@ def test_the_descent_is_minus_the_gradient(rng: np.random.Generator) -> None:
 def test_components_and_densities_are_one_to_one(rng: np.random.Generator) -> None:
     """C D = U z at each energy: what the views see does not depend on the coordinates."""
     views = views_of(balls(), 4)
-    fit = _Fit(views, Grid.matching(views.geometry), rng)
+    fit = EnergyFit(views, Grid.matching(views.geometry), rng)
     fit.z = rng.standard_normal(fit.z.shape).astype(np.float32)
     seen = np.einsum("em,mzyx->ezyx", SECTIONS, fit.densities())
     components = np.einsum("ek,kyxz->ezyx", fit._u, fit.z)
@@ -90,7 +91,7 @@ def test_components_and_densities_are_one_to_one(rng: np.random.Generator) -> No
 
 def test_each_subset_has_all_energies_and_directions_all_around() -> None:
     views = views_of(balls(), 36)
-    fit = _Fit(views, Grid.matching(views.geometry), np.random.default_rng(0))
+    fit = EnergyFit(views, Grid.matching(views.geometry), np.random.default_rng(0))
     assert len(fit.subsets) == 9
     for subset in fit.subsets:
         assert [part.energy for part in subset] == [0, 1, 2, 3]
@@ -140,7 +141,7 @@ def test_an_energy_with_more_views_counts_more() -> None:
     some = views_of(balls(), 12)
     kept = np.flatnonzero((some.energy != 3) | (np.arange(48) % 8 == 3))
     views = some.select(kept, slice(None))
-    fit = _Fit(views, Grid.matching(views.geometry), np.random.default_rng(0))
+    fit = EnergyFit(views, Grid.matching(views.geometry), np.random.default_rng(0))
     gram = fit._u[views.energy].T @ fit._u[views.energy]
     np.testing.assert_allclose(gram / gram[0, 0], np.eye(2), atol=1e-12)
 

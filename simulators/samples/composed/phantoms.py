@@ -13,7 +13,7 @@ from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import SOLIDS
 from simulators.samples.builders.piece import Piece, PieceBuilder
 from simulators.samples.composed.parts import Part, sample_of
-from simulators.samples.sample import Sample
+from simulators.samples.sample import Changing, Sample
 
 if TYPE_CHECKING:
     from simulators.light.palette import Palette
@@ -101,14 +101,30 @@ def _pieces(cls: str) -> _Builder:
 
     def sample(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
         kind = getattr(import_module(f"simulators.samples.builders.{cls.lower()}"), cls)
-        settings: PieceBuilder = build(kind, where, {key: mapping[key] for key in mapping if key != "materials"})
-        pieces = settings.pieces()
-        if beam.has_energy and not settings.attenuation:
-            material_of = {**settings.default_materials, **settings.made_of}
-            return _of_materials(where, pieces, material_of, mapping.get("materials"), beam)
-        if settings.made_of or "materials" in mapping:
+        rest = {key: mapping[key] for key in mapping if key not in ("materials", "change")}
+        settings: PieceBuilder = build(kind, where, rest)
+        first = settings.pieces()
+        of_materials = beam.has_energy and not settings.attenuation
+        if not of_materials and (settings.made_of or "materials" in mapping):
             raise SceneError(f"{where}: materials need a beam with energies (energy_kev) and no attenuation")
-        return _grey(pieces, {**settings.default_attenuation, **settings.attenuation})
+
+        def made_of(pieces: Sequence[Piece]) -> Sample:
+            if of_materials:
+                material_of = {**settings.default_materials, **settings.made_of}
+                return _of_materials(where, pieces, material_of, mapping.get("materials"), beam)
+            return _grey(pieces, {**settings.default_attenuation, **settings.attenuation})
+
+        if "change" not in mapping:
+            return made_of(first)
+        from simulators.samples.builders.change import CHANGES
+
+        change = choose(f"{where}.change", CHANGES, mapping["change"])
+
+        def at(seconds: float) -> Sample:
+            with located(f"{where}.change"):
+                return made_of(change.at(first, seconds))
+
+        return Changing(at, at(0.0))
 
     return sample
 

@@ -1,0 +1,83 @@
+"""The motion of a sample while it is scanned, learnt on coarse voxels.
+
+One volume, displaced, explains all views of a sample that only moves. So volume and motion improve each other in turns,
+first on voxels so coarse that the motion is short.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from recon.base.arrays import F32, F64
+from recon.base.volume import Grid
+from recon.energy_fit import EnergyFit, EnergyViews
+from recon.voxels.motion import Motion, Seen, improved
+from recon.voxels.projector import Projector, projection_lines
+
+_WIDTH = 24  # voxels across of the finer level; the coarser one has half as many
+_LEVELS = ((2, 8), (1, 6))  # voxels in those of the finer level, and turns
+_SWEEPS = 6  # of a turn, which go on from the last one
+_KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
+_HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
+MOTION_SWEEPS = sum(turns for _, turns in _LEVELS) * _SWEEPS
+
+
+def learnt_motion(views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool]) -> Motion | None:
+    """The motion on the voxels of `Grid.matching`; None: stopped.
+
+    Args:
+        views: each `energy` is a moment, each material a knot of the densities.
+        times: [moment], 0 ... 1.
+        weights: of total variation of the densities' components.
+        go_on: called with (0, residual) after each sweep.
+    """
+    binning = max(1, round(views.geometry.detector_shape[1] / _WIDTH))
+    alone = replace(views, cross_sections=np.ones((times.size, 1)))
+    motion: Motion | None = None
+    for wide, turns in _LEVELS:
+        some = _binned(alone, binning * wide)
+        grid = Grid.matching(some.geometry)
+        nz, ny, nx = grid.shape
+        motion = (
+            Motion.none((ny, nx, nz), times, _KNOTS, _CONTROLS) if motion is None else motion.on((ny, nx, nz), times)
+        )
+        fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion), _seen(some, grid)
+        for _ in range(turns):
+            for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), _SWEEPS):
+                if not go_on(0, residual):
+                    return None
+            motion = improved(motion, seen, fit.image)
+            fit.move(motion)
+    assert motion is not None
+    nz, ny, nx = Grid.matching(views.geometry).shape
+    return motion.on((ny, nx, nz), times)
+
+
+def _binned(views: EnergyViews, n: int) -> EnergyViews:
+    """Mean of n x n pixels; of their weights, too."""
+    n = max(1, min(n, *views.geometry.detector_shape))
+
+    def mean(images: F32) -> F32:
+        count, rows, cols = images.shape
+        part = images[:, : rows // n * n, : cols // n * n].reshape(count, rows // n, n, cols // n, n)
+        return np.asarray(part.mean((2, 4), dtype=np.float32), np.float32)
+
+    geometry = views.geometry.binned(n)
+    if views.weight is None:
+        return replace(views, projections=mean(views.projections), geometry=geometry)
+    weight = mean(views.weight)
+    data = np.divide(mean(views.projections * views.weight), np.maximum(weight, np.float32(1e-6)), dtype=np.float32)
+    return replace(views, projections=data, geometry=geometry, weight=weight)
+
+
+def _seen(views: EnergyViews, grid: Grid) -> list[Seen]:
+    whole, data = Projector(views.geometry, grid), projection_lines(views.projections)
+    weight = None if views.weight is None else projection_lines(views.weight)
+    return [
+        Seen(int(e), whole.subset(at), data[at], None if weight is None else weight[at])
+        for e in np.unique(views.energy)
+        for at in [np.flatnonzero(views.energy == e)]
+    ]

@@ -1,0 +1,168 @@
+"""One fit of a sample that changes while it is scanned: volumes at a few times, between which it changes linearly.
+
+Views of a short time are too few for a volume, and one volume of all views shows a sample that never was. So all views
+determine the volumes of all times in one fit, with total variation of what they share and of how they differ.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from recon.base.arrays import F32, F64
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid
+from recon.energy_fit import EnergyFit, EnergyViews, fitted
+from recon.learnt_motion import learnt_motion
+from recon.spectral import weights_by_views
+from recon.voxels.held_out_weight import ONE_IN
+from recon.voxels.motion import Motion, moved
+from recon.voxels.projector import volume_lines, volume_slices
+
+_MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
+_MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
+_LEAST_VIEWS = 12  # for each volume: views held out must see it, too
+_LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
+
+
+@dataclass(frozen=True, eq=False)
+class TimedViews:
+    """Views of a sample that changes.
+
+    Attributes:
+        projections: line integrals, float32 [view, row, col], finite.
+        geometry: of all views.
+        times: float64 [view], when each was exposed; any unit and origin.
+        weight: of each ray [view, row, col]; None: one.
+
+    Raises:
+        ValueError: times that are not one a view, not finite, or all the same.
+    """
+
+    projections: F32
+    geometry: Geometry
+    times: F64
+    weight: F32 | None = None
+
+    def __post_init__(self) -> None:
+        n = self.geometry.n_views
+        if self.times.shape != (n,) or not np.isfinite(self.times).all() or np.ptp(self.times) == 0:
+            raise ValueError(f"times must be {n} finite numbers, one a view, that are not all the same")
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and the last time."""
+        return float(self.times.min()), float(self.times.max())
+
+
+@dataclass(frozen=True, eq=False)
+class TimedVolumes:
+    """A volume that changes, linear between knots in time, and moves.
+
+    Attributes:
+        times: float64 [knot], in the unit of the views' times, evenly from the first view to the last.
+        volumes: float32 [knot, z, y, x], attenuation in 1/mm (1/px where the pitch is 1), 0 or more; before it moves.
+            `at` has what is seen.
+        grid: of each volume.
+        residual: norm of what the volumes leave of the views, over the norm of the views.
+        motion: from where each place takes its value; None: nothing moves.
+    """
+
+    times: F64
+    volumes: F32
+    grid: Grid
+    residual: float
+    motion: Motion | None = None
+
+    def at(self, time: float) -> F32:
+        """The volume [z, y, x] at a time; before the first and after the last knot that of the knot."""
+        before = np.tensordot(hats(time, self.times)[0].astype(np.float32), self.volumes, 1)
+        if self.motion is None:
+            return before
+        past = np.clip((time - self.times[0]) / np.ptp(self.times), 0, 1)
+        now = self.motion.on(self.motion.shape, np.array([past]))
+        return volume_slices(moved(volume_lines(before), now.at(0)))
+
+
+def hats(at: ArrayLike, knots: F64) -> F64:
+    """Shares [time, knot] of linear interpolation between even knots; those of the ends beyond them."""
+    place = np.interp(np.atleast_1d(at), knots, np.arange(knots.size))
+    return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(knots.size)))
+
+
+def fit_series(
+    views: TimedViews,
+    knots: int,
+    grid: Grid | None = None,
+    *,
+    motion: bool = False,
+    tv_weight: float | None = None,
+    sweeps: int = 60,
+    seed: int = 0,
+    go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
+) -> TimedVolumes:
+    """Volumes at evenly spaced times that explain all views in one least-squares fit with total variation.
+
+        min ½ Σ_v |A_v W(t_v) Σ_k h_k(t_v) x_k - p_v|² + Σ_j μ_j TV(z_j),    x_k >= 0
+
+    h_k are hats: the volume is linear in time between knots. W displaces it, smooth in space and time, and is 1 in the
+    middle of the scan (`recon.voxels.motion`). This is the problem of `fit_materials`, with knots for materials and the
+    hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they have in common.
+    Steps, memory and `go_on` are as there.
+
+    Args:
+        knots: volumes, 2 or more.
+        grid: of the volumes, with the motion as `Grid.matching`; None: as the geometry has it.
+        motion: learn how the sample moves, too. It helps a sample that settles; one that only changes its densities
+            gets motions that are not there.
+        tv_weight: μ of all components, so that a sample that does not change has the weight of one volume of all views;
+            None: the one with which views held out are predicted best.
+
+    Raises:
+        ValueError: fewer than twelve views a volume, or fewer than six that are nearer to it than to any other.
+    """
+    n = views.geometry.n_views
+    if not 2 <= knots <= n // _LEAST_VIEWS:
+        raise ValueError(
+            f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
+        )
+    times = np.linspace(*views.span, knots)
+    near = (hats(views.times, times) > 0.5).sum(0)
+    if near.min() < _LEAST_NEAR:
+        k = int(near.argmin())
+        raise ValueError(
+            f"volume {k + 1} of {knots}, at time {times[k]:g}, has {near[k]} views within {np.diff(times)[0] / 2:g}, "
+            f"expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views before and after a gap apart"
+        )
+    energies, past = _of_moments(views, times, _MOMENTS * (knots - 1))
+    grid = grid or Grid.matching(views.geometry)
+    if tv_weight is None:
+        weights = weights_by_views(energies, grid, seed, go_on, alike=True)
+    else:
+        weights = np.full(knots, tv_weight / math.sqrt(past.size))
+    moves = None
+    if motion:
+        coarse, coarse_past = _of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
+        moves = learnt_motion(coarse, coarse_past, weights * math.sqrt(past.size / coarse_past.size), go_on)
+        moves = moves and moves.on(moves.shape, past)
+    fit = EnergyFit(energies, grid, np.random.default_rng(seed), moves)
+    volumes, residual = fitted(fit, weights, sweeps, go_on)
+    return TimedVolumes(times, volumes, grid, residual, moves)
+
+
+def _of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
+    """The views as of so many moments at most, of equal numbers of views; and the moments within the scan, 0 ... 1."""
+    n = views.geometry.n_views
+    moments = min(most, n)
+    moment = np.empty(n, np.intp)
+    moment[np.argsort(views.times, kind="stable")] = np.arange(n) * moments // n
+    at = np.bincount(moment, views.times) / np.bincount(moment)
+    shares = np.zeros((moments, times.size))
+    np.add.at(shares, moment, hats(views.times, times))
+    shares /= np.bincount(moment)[:, None]
+    past = (at - times[0]) / np.ptp(times)
+    return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past
