@@ -83,9 +83,10 @@ def test_a_frame_holds_the_sample_as_it_stood_earlier() -> None:
 
     scene = shots.scene({"kind": "afterglow", "shares": [0.5], "decay_times": [0.02], "samples": 8})
     seen = shots.frame(scene, angle_at=stage) * CONVERSION / 4000
+    middle = 1000.0 + shots.shot().exposure / 2
     ages = -0.02 * np.log1p(-(np.arange(400) + 0.5) / 400)
-    past = np.mean([np.exp(-depth(scene, stage(1000.0 - age))) for age in ages], axis=0)
-    now = np.exp(-depth(scene, 0.4))
+    past = np.mean([np.exp(-depth(scene, stage(middle - age))) for age in ages], axis=0)
+    now = np.exp(-depth(scene, stage(middle)))
     np.testing.assert_allclose(seen, 0.5 * now + 0.5 * past, atol=1.5e-3)
     assert np.abs(past - now).max() > 0.02
     flat = shots.frame(scene, sample=False)
