@@ -50,11 +50,11 @@ late = sorted(name for key, (name, n) in compiled().items() if n != before.get(k
 print("late:", *late)
 """
 _KINDS = {
-    "parallel": "views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, 0.5)",
+    "parallel": "views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, pixel_pitch=0.5)",
     "parallel, some views lean, all are shifted, weights": """
 loss, start, weighted = "poisson", "tv", True
 tilt = [0, 0, 0, 0.05, 0.05, 0]
-views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, 0.5, tilt=tilt, shifts=np.full((6, 2), 0.7))
+views = recon.Geometry.parallel(np.linspace(0, 3, 6), shape, pixel_pitch=0.5, tilt=tilt, shifts=np.full((6, 2), 0.7))
 """,
     "cone": "views = recon.Geometry.cone(np.linspace(0, 6, 12), shape, 0.2, 20.0, 40.0)",
     "cone, a short scan, rolled, exact rays": """
