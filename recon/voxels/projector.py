@@ -85,6 +85,15 @@ class Projector:
         """The same for some views only, in that order."""
         return Projector(self.geometry.select(views), self.grid)
 
+    def __call__(self, volume: F32) -> F32:
+        """A x, as `forward`."""
+        return self.forward(volume)
+
+    @property
+    def T(self) -> Callable[[F32], F32]:  # noqa: N802, the name that linear operators have
+        """Aᵀ: `adjoint`."""
+        return self.adjoint
+
     def forward(self, volume: F32) -> F32:
         """A x: volume [z, y, x] to projections [view, row, col]."""
         return projection_images(self.forward_lines(volume_lines(_fitting(volume, self.grid.shape, "volume"))))

@@ -413,3 +413,12 @@ def test_misfits_are_named() -> None:
         data_residual(volume, np.ones((2, 3, 48), np.float32), geometry)
     with pytest.raises(ValueError, match="all zero"):
         data_residual(volume, np.zeros((1, 3, 48), np.float32), geometry)
+
+
+def test_it_reads_as_a_matrix() -> None:
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 5, endpoint=False), (3, 12))
+    a = Projector(geometry, Grid.matching(geometry))
+    x = np.random.default_rng(0).random(a.grid.shape, dtype=np.float32)
+    y = np.random.default_rng(1).random(a.projection_shape, dtype=np.float32)
+
+    assert float((a(x) * y).sum()) == pytest.approx(float((x * a.T(y)).sum()), rel=1e-5)
