@@ -15,7 +15,6 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Done
 from beamline.core.signals import StopOnSignal
-from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import SystemClock
 
 if TYPE_CHECKING:
@@ -47,6 +46,8 @@ def refuse_others(context: click.Context, of_views: Collection[str], output: Pat
     Args:
         of_views: names of options that choose and correct views; these it takes.
     """
+    from beamline.storage.writers.recon_file import SUFFIXES  # here: help needs none of it
+
     for option in given(context):
         if option.name not in (*_TAKEN, *of_views):
             raise click.UsageError(
