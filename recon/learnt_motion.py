@@ -14,6 +14,7 @@ import numpy as np
 from recon.base.arrays import F32, F64
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews
+from recon.voxels.held_out_weight import ONE_IN
 from recon.voxels.motion import Motion, Seen, improved
 from recon.voxels.projector import Projector, projection_lines
 
@@ -22,17 +23,49 @@ _LEVELS = ((2, 8), (1, 6))  # voxels in those of the finer level, and turns
 _SWEEPS = 6  # of a turn, which go on from the last one
 _KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
 _HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
-MOTION_SWEEPS = sum(turns for _, turns in _LEVELS) * _SWEEPS
+_JUDGED, _JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
+MOTION_SWEEPS = sum(turns for _, turns in _LEVELS) * _SWEEPS  # of `learnt_motion`
+JUDGE_SWEEPS = MOTION_SWEEPS + 2 * _JUDGED_SWEEPS  # of `moves`
 
 
-def learnt_motion(views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool]) -> Motion | None:
+def moves(
+    views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+) -> tuple[float, float] | None:
+    """What volumes leave of views held out, where nothing moves and where they also move; None: stopped.
+
+    Of coarse voxels, each from seven of eight views. Arguments as of `learnt_motion`.
+    """
+    held_out = views.parted(ONE_IN) == ONE_IN // 2
+    binning = max(1, round(views.geometry.detector_shape[1] / _JUDGED))
+    seen, unseen = (views.select(np.flatnonzero(chosen), slice(None)) for chosen in (~held_out, held_out))
+    motion = learnt_motion(seen, times, weights, go_on, stop)
+    if motion is None:
+        return None
+    seen, unseen = _binned(seen, binning), _binned(unseen, binning)
+    grid, left = Grid.matching(seen.geometry), []
+    nz, ny, nx = grid.shape
+    for now in (None, motion.on((ny, nx, nz), times)):
+        fit = EnergyFit(seen, grid, np.random.default_rng(0), now, stop)
+        for residual in fit.sweeps(weights, _JUDGED_SWEEPS):
+            if not go_on(0, residual):
+                return None
+        if stop():
+            return None
+        left.append(EnergyFit(unseen, grid, np.random.default_rng(0), now).residual_of(fit.densities()))
+    return left[0], left[1]
+
+
+def learnt_motion(
+    views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
+) -> Motion | None:
     """The motion on the voxels of `Grid.matching`; None: stopped.
 
     Args:
         views: each `energy` is a moment, each material a knot of the densities.
         times: [moment], 0 ... 1.
         weights: of total variation of the densities' components.
-        go_on: called with (0, residual) after each sweep.
+        go_on: called with (0, residual) after each sweep; False ends it.
+        stop: asked many times within a sweep; True ends it.
     """
     binning = max(1, round(views.geometry.detector_shape[1] / _WIDTH))
     alone = replace(views, cross_sections=np.ones((times.size, 1)))
@@ -44,11 +77,13 @@ def learnt_motion(views: EnergyViews, times: F64, weights: F64, go_on: Callable[
         motion = (
             Motion.none((ny, nx, nz), times, _KNOTS, _CONTROLS) if motion is None else motion.on((ny, nx, nz), times)
         )
-        fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion), _seen(some, grid)
+        fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion, stop), _seen(some, grid)
         for _ in range(turns):
             for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), _SWEEPS):
                 if not go_on(0, residual):
                     return None
+            if stop():
+                return None
             motion = improved(motion, seen, fit.image)
             fit.move(motion)
     assert motion is not None

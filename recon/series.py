@@ -17,16 +17,19 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import learnt_motion
-from recon.spectral import weights_by_views
+from recon.learnt_motion import JUDGE_SWEEPS, MOTION_SWEEPS, learnt_motion, moves
+from recon.spectral import ALIKE_LONGER, weights_by_views
+from recon.spectral import TRIAL_SWEEPS as _WEIGHT_SWEEPS
 from recon.voxels.held_out_weight import ONE_IN
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import volume_lines, volume_slices
 
 _MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
 _MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
+_MOVES = 0.95  # of what volumes leave of views held out: a motion that leaves less is there
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
+TRIAL_SWEEPS = ALIKE_LONGER * _WEIGHT_SWEEPS + JUDGE_SWEEPS + MOTION_SWEEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,8 @@ class TimedVolumes:
         grid: of each volume.
         residual: norm of what the volumes leave of the views, over the norm of the views.
         motion: from where each place takes its value; None: nothing moves.
+        left_of_unseen: what coarse volumes without and with motion leave of views held out, as `residual`; None where
+            the motion was not chosen by them.
     """
 
     times: F64
@@ -77,6 +82,7 @@ class TimedVolumes:
     grid: Grid
     residual: float
     motion: Motion | None = None
+    left_of_unseen: tuple[float, float] | None = None
 
     def at(self, time: float) -> F32:
         """The volume [z, y, x] at a time; before the first and after the last knot that of the knot."""
@@ -97,13 +103,13 @@ def hats(at: ArrayLike, knots: F64) -> F64:
 def fit_series(
     views: TimedViews,
     knots: int,
-    grid: Grid | None = None,
     *,
-    motion: bool = False,
+    motion: bool | None = None,
     tv_weight: float | None = None,
     sweeps: int = 60,
     seed: int = 0,
     go_on: Callable[[int, float], bool] = lambda sweep, residual: True,
+    stop: Callable[[], bool] = lambda: False,
 ) -> TimedVolumes:
     """Volumes at evenly spaced times that explain all views in one least-squares fit with total variation.
 
@@ -112,13 +118,12 @@ def fit_series(
     h_k are hats: the volume is linear in time between knots. W displaces it, smooth in space and time, and is 1 in the
     middle of the scan (`recon.voxels.motion`). This is the problem of `fit_materials`, with knots for materials and the
     hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they have in common.
-    Steps, memory and `go_on` are as there.
+    Steps, memory, `go_on` and `stop` are as there; sweeps before those of the fit are `TRIAL_SWEEPS` at most.
 
     Args:
         knots: volumes, 2 or more.
-        grid: of the volumes, with the motion as `Grid.matching`; None: as the geometry has it.
-        motion: learn how the sample moves, too. It helps a sample that settles; one that only changes its densities
-            gets motions that are not there.
+        motion: learn how the sample moves, too; None: where views held out are predicted better with it. It helps a
+            sample that settles; one that only changes its densities gets motions that are not there.
         tv_weight: μ of all components, so that a sample that does not change has the weight of one volume of all views;
             None: the one with which views held out are predicted best.
 
@@ -139,19 +144,23 @@ def fit_series(
             f"expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views before and after a gap apart"
         )
     energies, past = _of_moments(views, times, _MOMENTS * (knots - 1))
-    grid = grid or Grid.matching(views.geometry)
+    grid = Grid.matching(views.geometry)
     if tv_weight is None:
-        weights = weights_by_views(energies, grid, seed, go_on, alike=True)
+        weights = weights_by_views(energies, grid, seed, go_on, stop, alike=True)
     else:
         weights = np.full(knots, tv_weight / math.sqrt(past.size))
-    moves = None
+    learnt, left = None, None
+    coarse, coarse_past = _of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
+    coarse_weights = weights * math.sqrt(past.size / coarse_past.size)
+    if motion is None:
+        left = moves(coarse, coarse_past, coarse_weights, go_on, stop)
+        motion = left is not None and left[1] < _MOVES * left[0]
     if motion:
-        coarse, coarse_past = _of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
-        moves = learnt_motion(coarse, coarse_past, weights * math.sqrt(past.size / coarse_past.size), go_on)
-        moves = moves and moves.on(moves.shape, past)
-    fit = EnergyFit(energies, grid, np.random.default_rng(seed), moves)
+        learnt = learnt_motion(coarse, coarse_past, coarse_weights, go_on, stop)
+        learnt = learnt and learnt.on(learnt.shape, past)
+    fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
     volumes, residual = fitted(fit, weights, sweeps, go_on)
-    return TimedVolumes(times, volumes, grid, residual, moves)
+    return TimedVolumes(times, volumes, grid, residual, learnt, left)
 
 
 def _of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:

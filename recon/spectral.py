@@ -19,7 +19,7 @@ from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
 
 _ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _FIRST = 0.1  # the first weight, over the largest gradient at zero
-_ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
+ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
 _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
@@ -123,7 +123,7 @@ def weights_by_views(
 
     def left(weights: F64) -> float:
         nonlocal going
-        for residual in fit.sweeps(weights, (_ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS):
+        for residual in fit.sweeps(weights, (ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS):
             if not (going := go_on(0, residual)):
                 return math.inf
         if stop():

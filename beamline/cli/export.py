@@ -59,6 +59,7 @@ def _output_path(text: str) -> Path:
 )
 @click.option("--gaussians", is_flag=True, help="The Gaussians behind the volume, as a .ply file.")
 @click.option("--poses", is_flag=True, help="Displacement, roll and tilt of its views, as a .csv that --poses reads.")
+@click.option("--at", type=click.IntRange(min=0), metavar="K", help="Of a series in time: its volume K, from 0 on.")
 @click.option("--dataset", help="Which array of an HDF5 file or .npz; default: the only one with three axes.")
 @json_option
 def export(
@@ -68,6 +69,7 @@ def export(
     window: tuple[float, float] | None,
     gaussians: bool,
     poses: bool,
+    at: int | None,
     dataset: str | None,
     as_json: bool,
 ) -> None:
@@ -86,8 +88,8 @@ def export(
             raise click.UsageError(f"-o {output}: {name} goes with the suffix {suffix}, and voxels with another.")
     for name, (wanted, _, export_part) in parts.items():
         if wanted:
-            if window is not None or bits != "32" or dataset is not None:
-                raise click.UsageError(f"{name} does not go with --bits, --window or --dataset.")
+            if window is not None or bits != "32" or dataset is not None or at is not None:
+                raise click.UsageError(f"{name} does not go with --bits, --window, --at or --dataset.")
             export_part(volume, output, as_json)
             return
     pixels = Pixels(int(bits), window)
@@ -99,7 +101,7 @@ def export(
     began = clock.now()
     with terminated_like_interrupted(), json_events(as_json) as sink:
         refuse_existing(output)
-        with opened_volume(volume, dataset) as record:
+        with opened_volume(volume, dataset, at) as record:
             if record.volume.data.dtype.kind != "f" and "window" in record.parameters:
                 raise DataError(
                     f"{volume} holds grey values of a window, not the volume itself. Export the volume it was made of."

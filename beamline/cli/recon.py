@@ -26,6 +26,7 @@ from beamline.cli.method_options import (
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
 from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option, parsed, refuse_shared, volume_path
 from beamline.cli.recipe import config_option, recipe_text, repeating
+from beamline.cli.recon_time import reconstruct_in_time, refuse_others, time_options
 from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
@@ -93,6 +94,7 @@ _SHEET = ".png"
 @selection_options
 @method_options
 @preset_option
+@time_options
 @heading(METHOD)
 @click.option(
     "--filter",
@@ -228,6 +230,8 @@ def recon(
     log: Path | None,
     verbose: bool,
     as_json: bool,
+    volumes: int | None,
+    moves: bool | None,
     **values: Any,
 ) -> None:
     """Reconstruct the scan in FILE: HDF5, multi-page TIFF, folder or .zip of TIFFs, .txrm.
@@ -238,6 +242,8 @@ def recon(
     and a report. Nothing is overwritten, and a failure leaves no partial file. From the first step or iteration on,
     the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. A volume in slabs
     keeps those that are finished, also where it is killed, in OUTPUT.partial.h5; --resume goes on from there.
+
+    --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
     from beamline.reconstruct.checkpoints import CheckpointOptions  # here: help needs none of it
     from beamline.reconstruct.finished import reconstruct_file
@@ -248,6 +254,19 @@ def recon(
 
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
+    if volumes is not None:
+        refuse_others(context, values, output)
+        refuse_shared({"FILE": file, "--output": output})
+        source, selection = chosen(file, seed, values)
+        target = output or Path(f"{file.stem}_time.h5")
+        in_time = ReconOptions(
+            source, OutputPaths(target, None), selection, seed=seed, unfinished=unfinished, memory=memory,
+            command=repeating(context, file, target),
+        )  # fmt: skip
+        reconstruct_in_time(in_time, volumes, moves, dry, as_json)
+        return
+    if moves is not None:
+        raise click.UsageError("--moves and --no-moves are of volumes in time: give --time N with them.")
     method = preset_of(method, preset)
     if method is None:
         method = DEFAULT if follow or any_setting or set(options_of_a_method(context)) - {"budget"} else AUTO

@@ -162,7 +162,7 @@ class OppositeCheck:
         )
         advice = (
             f"Against {other}, {change}. Look at both. A jump that `motion` saw in between is corrected by `beamline "
-            "recon`; a sample that crept or changed is not: reconstruct fewer views (--views), and scan again, faster."
+            "recon`. A sample that crept or changed is followed by `beamline recon --time N`; or scan again, faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 

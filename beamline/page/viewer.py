@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from beamline.core.errors import DataError
-from beamline.page.tiles import region_of, tile_of
+from beamline.page.tiles import number_of, region_of, tile_of
 from beamline.page.volume import ShownVolume, VolumeTile
 
 _Result = TypeVar("_Result")
@@ -62,17 +62,17 @@ class _Viewer:
         return JSONResponse(self._do(lambda volumes: [volume.facts() for volume in volumes]))
 
     def cut(self, request: Request) -> Response:
-        axis, index = _place(request)
-        return tile_of_volume(self._on(request, lambda volume: volume.cut(axis, index, region_of(request))))
+        axis, index, time = _place(request)
+        return tile_of_volume(self._on(request, lambda volume: volume.cut(axis, index, region_of(request), time)))
 
     def difference(self, request: Request) -> Response:
         """The second volume less the first one; DataError unless both have one shape."""
-        (axis, index), region = _place(request), region_of(request)
+        (axis, index, time), region = _place(request), region_of(request)
 
         def cuts(volumes: Sequence[ShownVolume]) -> list[VolumeTile]:
             if len({volume.shape for volume in volumes}) != 1 or len(volumes) != 2:
                 raise DataError("A difference is of two volumes of the same shape.")
-            return [volume.cut(axis, index, region) for volume in volumes]
+            return [volume.cut(axis, index, region, time) for volume in volumes]
 
         first, second = self._do(cuts)
         if first.values.shape != second.values.shape:  # one of them has scales
@@ -80,17 +80,17 @@ class _Viewer:
         return tile_of_volume(replace(first, values=second.values - first.values, ready=min(first.ready, second.ready)))
 
     def histogram(self, request: Request) -> Response:
-        return JSONResponse(self._on(request, ShownVolume.histogram))
+        return JSONResponse(self._on(request, lambda volume: volume.histogram(number_of(request, "time"))))
 
     def profile(self, request: Request) -> Response:
-        axis, index = _place(request)
+        axis, index, time = _place(request)
         try:
             line = [float(word) for word in request.query_params.get("line", "").split(",")]
             if len(line) != 4 or not all(abs(each) < 1e6 for each in line):
                 raise ValueError
         except ValueError:
             raise DataError("A profile is along a line: first row, first column, last row, last column.") from None
-        return JSONResponse(self._on(request, lambda volume: volume.profile(axis, index, line)))
+        return JSONResponse(self._on(request, lambda volume: volume.profile(axis, index, line, time)))
 
     def _on(self, request: Request, read: Callable[[ShownVolume], _Result]) -> _Result:
         which = int(request.path_params["which"])
@@ -103,5 +103,6 @@ class _Viewer:
         return self._do(read_it)
 
 
-def _place(request: Request) -> tuple[int, int]:
-    return int(request.path_params["axis"]), int(request.path_params["index"])
+def _place(request: Request) -> tuple[int, int, int]:
+    """Axis, index, and the number of the time, 0 without one."""
+    return int(request.path_params["axis"]), int(request.path_params["index"]), number_of(request, "time")

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from beamline.core.errors import DataError
-from beamline.page.slices import F32, HELD, slices_of
+from beamline.page.slices import F32, HELD, VolumeSlices, slices_of
 from beamline.page.tiles import TileRegion, bin_mean
-from beamline.storage.volumes.files import opened_volume
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.volumes.files import opened_volume, seconds_of
+from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 
 BINS = 256
 
@@ -73,14 +73,17 @@ class ShownVolume:
 
     def __init__(self, path: Path, held: int = HELD, fbp: bool = False, dataset: str | None = None) -> None:
         with ExitStack() as opened:
-            record = opened.enter_context(opened_volume(path, dataset))
+            seconds = () if dataset is not None else seconds_of(path)
+            record = opened.enter_context(opened_reconstruction(path, 0) if seconds else opened_volume(path, dataset))
             self.path, self._grid, self.has_fbp = path, record.volume.grid, record.fbp is not None
             values: Any = record.volume.data
             self._name = path.name if dataset is None else f"{path.name}::{dataset}"
             if fbp:
                 values, self._name = _fbp_of(path, record), f"{path.name}, FBP"
             self.shape: tuple[int, int, int] = values.shape
-            self._slices = slices_of(path, values, held)
+            each = [values] if record.series is None else record.series.each()
+            self._seconds = seconds
+            self._slices = [slices_of(path, one, held // len(each)) for one in each]
             self._length_unit, self._unit, self._parameters = record.length_unit, record.unit, record.parameters
             window: Any = record.parameters.get("window") if values.dtype.kind == "u" else None
             self._grey = None if window is None else (window[0], (window[1] - window[0]) / np.iinfo(values.dtype).max)
@@ -93,11 +96,11 @@ class ShownVolume:
 
     def read_more(self) -> bool:
         """Read one more slice for those across y and x; False: there is no more."""
-        return not self._closed and self._slices.read_more()
+        return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, length of a voxel along z, y, x and unit, unit of values, method, views, window."""
-        sample = self._sample()
+        """Name, shape, length of a voxel along z, y, x and unit, unit of values, method, views, window of all times."""
+        sample = np.concatenate([self._sample(time) for time in range(len(self._slices))])
         low, high = np.percentile(sample, (0.5, 99.8)) if sample.size else (0.0, 1.0)
         unit = self._length_unit
         return {
@@ -109,30 +112,30 @@ class ShownVolume:
             "unit": "" if unit == "px" else self._unit,
             "method": str(self._parameters.get("method", "")),
             "views": None if (views := self._parameters.get("n_views")) is None else int(views),
-            "coarse_bin": self._slices.bin,
-            "ready": self._slices.ready,
+            "seconds": self._seconds,
+            "coarse_bin": self._slices[0].bin,
             "window": _spread(float(low), float(high)),
         }
 
-    def cut(self, axis: int, index: int, region: TileRegion) -> VolumeTile:
-        """Part of a slice across an axis (0 z, 1 y, 2 x), binned to a tile.
+    def cut(self, axis: int, index: int, region: TileRegion, time: int = 0) -> VolumeTile:
+        """Part of a slice across an axis (0 z, 1 y, 2 x), binned to a tile. Of a series, at one of its times.
 
         Raises:
             DataError: there is no such slice.
         """
-        values, shown, bin_ = self._part(axis, index, region)
+        values, shown, bin_ = self._part(axis, index, region, time)
         factor = TileRegion(0, values.shape[0], 0, values.shape[1]).binning()
         tile = self._meant(bin_mean(values, (factor, factor)))
-        return VolumeTile(tile, shown, factor * bin_, 1.0 if axis == 0 else self._slices.ready)
+        return VolumeTile(tile, shown, factor * bin_, 1.0 if axis == 0 else self._at(time).ready)
 
-    def histogram(self) -> dict[str, list[float]]:
+    def histogram(self, time: int = 0) -> dict[str, list[float]]:
         """Centres of 256 bins over the values, and voxels in each (of a sample, where there are many)."""
-        sample = self._sample().astype(np.float64)  # in float32 a wide range overflows
+        sample = self._sample(time).astype(np.float64)  # in float32 a wide range overflows
         ends = (float(sample.min()), float(sample.max())) if sample.size else (0.0, 1.0)
         counts, edges = np.histogram(sample, BINS, _spread(*ends))
         return {"values": ((edges[1:] + edges[:-1]) / 2).tolist(), "voxels": counts.tolist()}
 
-    def profile(self, axis: int, index: int, line: Sequence[float]) -> dict[str, list[float]]:
+    def profile(self, axis: int, index: int, line: Sequence[float], time: int = 0) -> dict[str, list[float]]:
         """Distances and values along a line in a slice, linear between voxels, in steps of at most a voxel.
 
         Args:
@@ -140,7 +143,7 @@ class ShownVolume:
         """
         r0, c0, r1, c1 = line
         edges = (min(r0, r1) - 9, max(r0, r1) + 9, min(c0, c1) - 9, max(c0, c1) + 9)
-        values, shown, bin_ = self._part(axis, index, TileRegion(*(max(0, int(edge)) for edge in edges)))
+        values, shown, bin_ = self._part(axis, index, TileRegion(*(max(0, int(edge)) for edge in edges)), time)
         down, across = (step for i, step in enumerate(self._grid.spacing) if i != axis)
         n = int(np.clip(math.ceil(max(abs(r1 - r0), abs(c1 - c0))), 1, 10_000)) + 1
         rows, cols = np.linspace(r0, r1, n), np.linspace(c0, c1, n)
@@ -149,13 +152,17 @@ class ShownVolume:
         length = math.hypot((r1 - r0) * down, (c1 - c0) * across)
         return {"distance": np.linspace(0, length, n).tolist(), "values": np.nan_to_num(found).tolist()}
 
-    def _part(self, axis: int, index: int, region: TileRegion) -> tuple[NDArray[Any], TileRegion, int]:
+    def _at(self, time: int) -> VolumeSlices:
+        """At one of the times; a volume that does not change is the same at all."""
+        return self._slices[min(time, len(self._slices) - 1)]
+
+    def _part(self, axis: int, index: int, region: TileRegion, time: int) -> tuple[NDArray[Any], TileRegion, int]:
         if not (0 <= axis < 3 and 0 <= index < self.shape[axis]):
             raise DataError(f"Slice {index} across axis {axis} is not in a volume of {self.shape}.")
-        return self._slices.part(axis, index, region)
+        return self._at(time).part(axis, index, region)
 
-    def _sample(self) -> F32:
-        values = self._meant(self._slices.sample())
+    def _sample(self, time: int) -> F32:
+        values = self._meant(self._at(time).sample())
         return values[np.isfinite(values)]
 
     def _meant(self, values: NDArray[Any]) -> F32:

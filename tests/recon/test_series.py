@@ -72,7 +72,9 @@ def test_a_linear_change_is_found_from_views_without_noise() -> None:
     truth = np.stack([discs(0.0), discs(10.0)])
     whole = Projector(geometry, Grid.matching(geometry))
     data = np.einsum("vk,kvrc->vrc", hats(times, np.array([0.0, 10.0])), np.stack([whole.forward(x) for x in truth]))
-    found = fit_series(TimedViews(data.astype(np.float32), geometry, times), 2, tv_weight=0.01, sweeps=120)
+    found = fit_series(
+        TimedViews(data.astype(np.float32), geometry, times), 2, motion=False, tv_weight=0.01, sweeps=120
+    )
     assert psnr(found.volumes, truth) > 50
     assert psnr(found.at(5.0), truth.mean(0)) > 50
 
@@ -81,7 +83,7 @@ def test_a_scan_counts_at_most_so_many_moments_and_learns_the_same(monkeypatch: 
     views, found = views_of(60, noise=0.05), list[F32]()
     for most in (16, 64):
         monkeypatch.setattr("recon.series._MOMENTS", most)
-        found.append(fit_series(views, 3, tv_weight=0.5, sweeps=20).volumes)
+        found.append(fit_series(views, 3, motion=False, tv_weight=0.5, sweeps=20).volumes)
     assert psnr(found[0], found[1]) > 35
 
 
@@ -112,7 +114,7 @@ def test_one_fit_beats_sub_scans_and_one_volume_of_all_views() -> None:
     for parts in (2, 3, 4, 6):
         apart = of_sub_scans(views, parts)
         others.append(mean_psnr({t: apart.at(t) for t in times}))
-    found = fit_series(views, 4, tv_weight=0.35)
+    found = fit_series(views, 4, motion=False, tv_weight=0.35)
     assert mean_psnr({t: found.at(t) for t in times}) > max(others)
 
 
@@ -123,10 +125,40 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
         heard.append(sweep)
         return sweep < 3
 
-    first = fit_series(views, 3, tv_weight=0.05, go_on=go_on)
-    assert np.array_equal(first.volumes, fit_series(views, 3, tv_weight=0.05, go_on=lambda sweep, _: sweep < 3).volumes)
+    first = fit_series(views, 3, motion=False, tv_weight=0.05, go_on=go_on)
+    assert np.array_equal(
+        first.volumes, fit_series(views, 3, motion=False, tv_weight=0.05, go_on=lambda sweep, _: sweep < 3).volumes
+    )
     assert heard == [1, 2, 3]
     assert first.volumes.dtype == np.float32
+
+
+def test_views_held_out_tell_a_sample_that_moves_from_one_that_changes_in_place() -> None:
+    fading = views_of(60, noise=0.05)
+    projector = Projector(fading.geometry, Grid.matching(fading.geometry))
+    still = discs(0.0)
+    settled = [np.roll(still, round(5 * t / 10), 2) for t in fading.times]  # by five voxels of forty
+    seen = np.stack([projector.subset([v]).forward(x)[0] for v, x in enumerate(settled)])
+    for views, moving in ((fading, False), (replace(fading, projections=seen.astype(np.float32)), True)):
+        found = fit_series(views, 3, tv_weight=0.15, sweeps=2)
+        assert found.left_of_unseen is not None
+        without, with_motion = found.left_of_unseen
+        assert (found.motion is not None) == (with_motion < without) == moving
+
+
+@pytest.mark.parametrize("asked", [1, 40])
+def test_a_stop_within_a_sweep_gives_volumes(asked: int) -> None:
+    """Also while the weight is tried."""
+    calls = list[int]()
+
+    def stop() -> bool:
+        calls.append(1)
+        return len(calls) >= asked
+
+    found = fit_series(views_of(48, noise=0.05), 3, stop=stop)
+    assert np.isfinite(found.volumes).all()
+    assert found.volumes.min() > -1e-6  # rounding
+    assert len(calls) < asked + 8
 
 
 @pytest.mark.parametrize("knots", [1, 3])

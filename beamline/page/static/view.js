@@ -1,4 +1,5 @@
 // One volume, or two with their difference: slices across z, y, x with one zoom each, grey window, profile, histogram.
+// Of a series in time: a slider for the time, and a player.
 import { NAMES, PLANES, Picture, debounce, fetchTile, position, usualWindow, windowSliders } from "./picture.js";
 
 const $ = (name) => document.getElementById(name);
@@ -66,12 +67,15 @@ function follow(row, axis) {
   }
 }
 
+/** Number of the time that is shown, in a volume that may not change. */
+const timeIn = (facts) => Math.round(Number($("time").value) * Math.max(0, facts.seconds.length - 1) / Math.max(1, Number($("time").max)));
+
 async function showSlice(row, axis) {
-  const index = indexIn(row.facts, axis), extent = PLANES[axis].map((i) => row.facts.shape[i]), picture = row.pictures[axis];
+  const index = indexIn(row.facts, axis), time = timeIn(row.facts), extent = PLANES[axis].map((i) => row.facts.shape[i]), picture = row.pictures[axis];
   const [r0, r1, c0, c1] = picture.tile ? picture.seen() : [0, extent[0], 0, extent[1]];
   try {
-    const tile = await fetchTile(`${row.url(axis, index)}?region=${r0},${r1},${c0},${c1}`);
-    if (index !== indexIn(row.facts, axis)) return;
+    const tile = await fetchTile(`${row.url(axis, index)}?region=${r0},${r1},${c0},${c1}&time=${time}`);
+    if (index !== indexIn(row.facts, axis) || time !== timeIn(row.facts)) return;
     if (!row.window) { const high = Math.max(...usualWindow(tile).map(Math.abs)); setWindow(row, [-high, high]); }
     picture.window = row.window;
     picture.show(tile, extent, tile.region);
@@ -93,6 +97,42 @@ async function showAxis(axis) {
   $(`where${axis}`).textContent = position(volumes[0], axis, Number($(`at${axis}`).value));
   await Promise.all(rows.map((row) => showSlice(row, axis)));
   if (profiled && profiled.axis === axis) showProfile();
+}
+
+async function showTime() {
+  const { seconds } = volumes.find((each) => each.seconds.length > Number($("time").max));
+  $("when").textContent = `${Number(seconds[Number($("time").value)].toPrecision(4))} s`;
+  await Promise.all([0, 1, 2].map(showAxis));
+}
+
+let player = 0;  // number of the player that runs, 0: none
+function play() {
+  const own = player ? 0 : Date.now();
+  player = own;
+  $("play").textContent = own ? "Pause" : "Play";
+  if (own) playOn(own); else showHistogram();
+}
+
+async function playOn(own) {
+  while (player === own) {
+    $("time").value = (Number($("time").value) + 1) % (Number($("time").max) + 1);
+    await Promise.all([showTime(), new Promise((done) => setTimeout(done, 400))]);
+  }
+}
+
+function startTimes() {
+  const last = Math.max(...volumes.map((each) => each.seconds.length)) - 1;
+  if (last < 1) return;
+  $("times").hidden = false;
+  $("time").max = last;
+  const show = debounce(async () => { await showTime(); showHistogram(); }, 40), step = (by) => { $("time").value = Number($("time").value) + by; show(); };
+  $("time").addEventListener("input", show);
+  $("play").addEventListener("click", play);
+  document.addEventListener("keydown", (event) => {
+    const act = { " ": play, ",": () => step(-1), ".": () => step(1) }[event.key];
+    if (!act || event.target.matches("button, input:not([type=range])")) return;
+    event.preventDefault(); act();
+  });
 }
 
 let setDifference = null;
@@ -140,7 +180,7 @@ async function showProfile() {
   const { axis, line, row } = profiled;
   const found = await Promise.all(volumes.map((facts, which) => {
     const scaled = line.map((value, i) => { const side = PLANES[axis][i % 2]; return value * facts.shape[side] / row.facts.shape[side]; });
-    return json(`api/profile/${which}/${axis}/${indexIn(facts, axis)}?line=${scaled.join(",")}`);
+    return json(`api/profile/${which}/${axis}/${indexIn(facts, axis)}?line=${scaled.join(",")}&time=${timeIn(facts)}`);
   }));
   const distance = found[0].distance;  // of the same line in steps of the first volume's voxels
   const lines = found.map((each, i) => ({ name: volumes[i].name, values: distance.map((d, k) => each.values[Math.round(k * (each.values.length - 1) / Math.max(distance.length - 1, 1))]) }));
@@ -150,7 +190,7 @@ async function showProfile() {
 }
 
 async function showHistogram() {
-  const found = await Promise.all(volumes.map((_, which) => json(`api/histogram/${which}`)));
+  const found = await Promise.all(volumes.map((facts, which) => json(`api/histogram/${which}?time=${timeIn(facts)}`)));
   const x = [...new Set(found.flatMap((each) => each.values))].sort((a, b) => a - b);
   const lines = found.map((each, i) => { const at = new Map(each.values.map((value, k) => [value, each.voxels[k] || null])); return { name: volumes[i].name, values: x.map((value) => at.has(value) ? at.get(value) : undefined) }; });
   draw("histogram", volumes[0].unit || "value", "voxels", x, lines, { x: { time: false }, y: { distr: 3 } });
@@ -159,23 +199,25 @@ async function showHistogram() {
 async function start() {
   volumes = await json("api/volumes");
   const [first, second] = volumes;
-  $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.shape.join(" x ")} voxels${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
+  $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.seconds.length ? `${each.seconds.length} times ` : ""}${each.shape.join(" x ")} voxels${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
   document.title = volumes.map((each) => each.name).join(", ");
   volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `api/slice/${which}/${axis}/${index}`));
   const setRange = windowSliders($("window"), (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); });
   const [low, high] = first.window;
   for (const row of rows) row.window = first.window;
   setRange([low - (high - low), high + (high - low)], first.window);
-  if (second && first.shape.join() === second.shape.join()) {
+  const several = volumes.map((each) => each.seconds).filter((each) => each.length);
+  if (second && first.shape.join() === second.shape.join() && several.every((each) => each.length === several[0].length)) {
     $("difference-window").hidden = false;
-    const row = addRow(`${second.name} less ${first.name}`, { ...first, window: null }, (axis, index) => `api/difference/${axis}/${index}`);
+    const row = addRow(`${second.name} less ${first.name}`, { ...first, window: null, seconds: several[0] || [] }, (axis, index) => `api/difference/${axis}/${index}`);
     setDifference = windowSliders($("difference-window"), (window) => { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); });
   }
   for (let axis = 0; axis < 3; axis++) {
     Object.assign($(`at${axis}`), { max: first.shape[axis] - 1, value: Math.floor(first.shape[axis] / 2) });
     $(`at${axis}`).addEventListener("input", debounce(() => showAxis(axis), 40));
   }
-  await Promise.all([0, 1, 2].map(showAxis));
+  startTimes();
+  await ($("times").hidden ? Promise.all([0, 1, 2].map(showAxis)) : showTime());
   await showHistogram();
 }
 

@@ -87,6 +87,11 @@ class ScanSource(ABC):
         return None
 
     @property
+    def times(self) -> NDArray[np.float64] | None:
+        """float64 [frame], s at the trigger, NaN where unknown; None where the file says nothing."""
+        return None
+
+    @property
     def shifts(self) -> NDArray[np.float64] | None:
         """float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it.
 

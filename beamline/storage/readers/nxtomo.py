@@ -192,6 +192,13 @@ class NXtomoSource(ScanSource):
         return np.where(values > 0, values, np.nan)
 
     @property
+    def times(self) -> NDArray[np.float64] | None:
+        with hdf5.readable(self.path):
+            seconds = self._seconds(self._places.entry, "frame_log/time")
+        seconds[[*self._altered]] = np.nan
+        return seconds if np.isfinite(seconds).any() else None
+
+    @property
     def replaces(self) -> NDArray[np.int64] | None:
         with hdf5.readable(self.path):
             if not self._ours:
@@ -269,13 +276,12 @@ class NXtomoSource(ScanSource):
         """The frames from `first` on, with all that the file knows about each."""
         self.require_counts()
         with hdf5.readable(self.path):
-            time = self._seconds(self._places.entry, "frame_log/time")
+            time = np.full(self.n, np.nan) if (known := self.times) is None else known
             trigger = self._column("frame_log/trigger", count_in_blocks(self.image_key))
             framestamp = self._column("frame_log/framestamp", np.full(self.n, -1))
             replaces = self._replaces() if self._ours else np.full(self.n, -1)
             for column in (trigger, framestamp):
                 column[[*self._altered]] = -1
-            time[[*self._altered]] = np.nan
         for i in range(first, self.n):
             yield Frame(
                 counts=self.read([i])[0],

@@ -98,6 +98,11 @@ class OverlaidSource(WrappedSource):
         return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
 
     @property
+    def times(self) -> NDArray[np.float64] | None:
+        known = self._base.times
+        return None if known is None else np.concatenate([np.full(len(self._front), np.nan), known])
+
+    @property
     def shifts(self) -> NDArray[np.float64] | None:
         known = self._base.shifts
         return None if known is None else np.concatenate([np.full((len(self._front), 2), np.nan), known])

@@ -23,7 +23,7 @@ from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.volume import volume_findings
-from beamline.storage.volumes.files import volume_format
+from beamline.storage.volumes.files import opened_volume, seconds_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_degrees
@@ -54,8 +54,11 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     findings = _as_hdf5(path) if kind is None else []
     try:
         if kind is not None:
-            with kind.open(path) as record, hdf5.readable(path):
-                return [*volume_findings(record)]
+            of_all: dict[Finding, None] = {}
+            for at in range(len(seconds_of(path))) or (None,):
+                with opened_volume(path, at=at) as record, hdf5.readable(path):
+                    of_all |= dict.fromkeys(volume_findings(record))
+            return [*of_all]
         with open_scan(scan) as source:
             findings += source_findings(source)
             findings += frames_as_written(source, deep)

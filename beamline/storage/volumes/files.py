@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,14 +10,16 @@ from pathlib import Path
 
 from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, whole_file
+from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.volume_file import SUFFIXES, read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
+from beamline.storage.volumes.nxtomoproc import NXtomoproc
 from beamline.storage.volumes.plain import Npy
 from beamline.storage.volumes.registry import formats
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction, volumes_in_time
 
 _BLOCK = 16  # slices read back at once: as high as a chunk of OME-Zarr
 
@@ -85,13 +88,30 @@ def volume_format(path: Path) -> VolumeFormat | None:
     return found
 
 
+def seconds_of(path: Path) -> tuple[float, ...]:
+    """When each of several volumes in time was, s from the first view on; empty where a file holds no such series."""
+    if not NXtomoproc().holds(path):
+        return ()
+    with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+        return tuple(file["entry/data/time"][:].tolist()) if volumes_in_time(file) else ()
+
+
 @contextmanager
-def opened_volume(path: Path, dataset: str | None = None) -> Iterator[ReconRecord]:
+def opened_volume(path: Path, dataset: str | None = None, at: int | None = None) -> Iterator[ReconRecord]:
     """Any volume file: ours is read where it is sliced along z, others as a whole (see `read_volume`).
+
+    Args:
+        at: number of one of several volumes in time.
 
     Raises:
         DataError: it cannot be read, or holds no volume.
     """
+    if at is not None:
+        with opened_reconstruction(path, at) as record:
+            assert record.series is not None
+            facts = {**record.parameters, "time_s": float(record.series.seconds[at])}
+            yield dataclasses.replace(record, series=None, parameters=facts)
+        return
     kind = None if dataset is not None else volume_format(path)
     if kind is not None:
         with kind.open(path) as record:

@@ -35,6 +35,33 @@ Value = str | int | float | bool | NDArray[Any]
 
 
 @dataclass(frozen=True, eq=False)
+class VolumesInTime:
+    """Volumes of a sample that changes.
+
+    Attributes:
+        seconds: float64 [time], from the first view on.
+        data: float32 [time, z, y, x], or a dataset of a file.
+    """
+
+    seconds: NDArray[np.float64]
+    data: Any
+
+    def each(self) -> list[Any]:
+        """The volumes, which are read where they are sliced along z."""
+        return [_OneOf(self.data, at) for at in range(len(self.seconds))]
+
+
+class _OneOf:
+    """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
+
+    def __init__(self, data: Any, at: int) -> None:
+        self._data, self._at, self.shape, self.dtype = data, at, data.shape[1:], data.dtype
+
+    def __getitem__(self, z: slice) -> NDArray[np.float32]:
+        return np.asarray(self._data[self._at, z])
+
+
+@dataclass(frozen=True, eq=False)
 class ReconRecord:
     """A volume and where it comes from.
 
@@ -47,6 +74,7 @@ class ReconRecord:
         history: equally long arrays, by name (step, seconds, loss ...); empty where there are no steps.
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
+        series: all volumes in time, where `volume` is one of several; None: it is the only one.
         is_share: the voxels are shares of the volume that a material fills, without a unit, and no attenuation.
         model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
     """
@@ -64,6 +92,7 @@ class ReconRecord:
     deviation: NDArray[np.float32] | None = None
     fbp: NDArray[np.float32] | None = None
     is_share: bool = False
+    series: VolumesInTime | None = None
 
     @property
     def unit(self) -> str:
@@ -107,15 +136,23 @@ def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
     _write_facts(entry, record)
     data = _group(entry, "data", "NXdata")
     data.attrs["signal"] = "data"
-    data.attrs["axes"] = ["z", "y", "x"]
+    times = [] if record.series is None else ["time"]
+    data.attrs["axes"] = [*times, "z", "y", "x"]
     # One slice a chunk: viewers page through z; gzip would cost minutes on large volumes and gain little on noise.
     shape = record.volume.grid.shape
-    stored = data.create_dataset("data", shape, np.float32, chunks=None if empty else (1, *shape[1:]))
+    voxels = [record.volume.data] if record.series is None else record.series.each()
+    several = () if record.series is None else (len(voxels),)
+    chunk = None if empty else (1, *shape[1:]) if record.series is None else (1, 1, *shape[1:])
+    stored = data.create_dataset("data", (*several, *shape), np.float32, chunks=chunk)
     if empty:
         stored[-1, -1, -1] = 0  # which allocates it
-    for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
-        stored[first : first + _SLAB] = record.volume.data[first : first + _SLAB]
-        file.require_taken()
+    for at, one in zip(np.ndindex(several), voxels, strict=True):
+        for first in range(0, 0 if empty else shape[0], _SLAB):  # so that a signal need not wait for the whole
+            stored[(*at, slice(first, first + _SLAB))] = one[first : first + _SLAB]
+            file.require_taken()
+    if record.series is not None:
+        data["time"] = record.series.seconds
+        data["time"].attrs["units"] = "s"
     beside = {
         DEVIATION: (record.deviation, "standard deviation of each voxel"),
         FBP: (record.fbp, "filtered back-projection of the same views"),
@@ -184,23 +221,36 @@ def read_reconstruction(path: Path) -> ReconRecord:
 
 
 @contextmanager
-def opened_reconstruction(path: Path) -> Iterator[ReconRecord]:
+def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRecord]:
     """As `read_reconstruction`, without voxels in memory: the volume's data are read where they are sliced along z.
 
+    Args:
+        at: number of one of several volumes in time.
+
     Raises:
-        DataError: if the file is missing or is not such a file.
+        DataError: if the file is missing or is not such a file, or `at` names none of its volumes.
     """
     with ExitStack() as stack:
         try:
             file = stack.enter_context(h5py.File(path, "r"))
             require_harmless(file)
-            record = _read_entry(file["entry"])
+            n = volumes_in_time(file)
+            if (at is None) != (n == 0) or (at is not None and not 0 <= at < n):
+                held = f"{n} volumes in time: name one by --at 0 to {n - 1} (`beamline export`)" if n else "one volume"
+                raise DataError(f"{path} holds {held}.")
+            record = _read_entry(file["entry"], at)
         except hdf5.ALTERED as error:
             raise DataError(f"{path} cannot be read as a reconstruction ({error}). Expected NXtomoproc.") from error
         yield record
 
 
-def _read_entry(entry: h5py.Group) -> ReconRecord:
+def volumes_in_time(file: h5py.File) -> int:
+    """How many volumes in time a file of ours has; 0: it has one volume alone."""
+    stored = file["entry/data/data"]
+    return int(stored.shape[0]) if stored.ndim == 4 else 0
+
+
+def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
     data, process = entry["data"], entry["reconstruction"]
     z, y, x = (np.asarray(data[name][:]) for name in ("z", "y", "x"))
     # An axis of one voxel says nothing about the voxel size, the longer one says it best; slices may be higher.
@@ -208,10 +258,14 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
     size = _pitch(max(y, x, key=len)) or height or 1.0
     pitch = None if height is None or math.isclose(height, size, rel_tol=1e-3) else height
     centre = tuple(float(a[0] + a[-1]) / 2 for a in (z, y, x))
-    grid = Grid(data["data"].shape, size, centre, pitch)  # type: ignore[arg-type]
+    stored, series = data["data"], None
+    if at is not None:
+        series = VolumesInTime(np.asarray(data["time"][:]), stored)
+        stored = series.each()[at]
+    grid = Grid(stored.shape, size, centre, pitch)  # type: ignore[arg-type]
     parameters = {name: value_of(node) for name, node in process["parameters"].items()}
     return ReconRecord(
-        volume=Volume(data["data"], grid),
+        volume=Volume(stored, grid),
         length_unit=str(data["x"].attrs["units"]),
         raw_file=str(parameters.pop("raw_file")),
         title=str(value_of(entry["title"])),
@@ -224,6 +278,7 @@ def _read_entry(entry: h5py.Group) -> ReconRecord:
         deviation=data.get(DEVIATION),
         fbp=data.get(FBP),
         is_share=data["data"].attrs.get("units") == "",
+        series=series,
     )
 
 

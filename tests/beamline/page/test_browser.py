@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.scan.control import state_of
 from beamline.scan.states import State
+from beamline.storage.volumes.base import bare_record
+from beamline.storage.writers.recon_file import VolumesInTime, write_reconstruction
 from tests.beamline.page.chromium import (
     BEAMLINE,
     MARKS,
@@ -112,6 +115,36 @@ def test_two_volumes_are_compared(browser: Browser, tmp_path: Path) -> None:
         browser.until(partial(drawn_in, "#profile canvas"), "the profile is drawn")
         first.send_keys("\ue00e")  # Page Up
         browser.until(lambda: browser.text("where0") == "6", "the next slice")
+        assert browser.complaints() == []
+
+
+def test_a_series_in_time_is_played(browser: Browser, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    volumes = np.stack([np.full((6, 8, 10), k, np.float32) for k in range(3)]) + rng.random((3, 6, 8, 10), np.float32)
+    series = VolumesInTime(np.array([0.0, 1.5, 3.0]), volumes)
+    first = bare_record(tmp_path, volumes[0], (1.0, 1.0, 1.0))
+    write_reconstruction(tmp_path / "series.h5", replace(first, series=series, parameters={"method": "series"}))
+    with viewed(tmp_path / "series.h5") as page:
+        browser.open(page.addresses.look)
+        browser.until(lambda: canvas_has_picture(browser, "slice00"), "a slice is drawn")
+        assert (browser.text("when"), browser.text("play")) == ("0 s", "Play")
+        body = browser.driver.find_element("tag name", "body")
+        body.send_keys(".")
+        browser.until(lambda: browser.text("when") == "1.5 s", "a step is shown")
+        assert browser.script("return document.getElementById('play').textContent") == "Play"
+        mean = (
+            "const c = document.getElementById('slice00'), d = c.getContext('2d').getImageData(0, 0, c.width, c.height)"
+        )
+        mean += ".data; let s = 0; for (let i = 0; i < d.length; i += 4) s += d[i]; return s * 4 / d.length;"
+        middle = float(str(browser.script(mean)))
+        body.send_keys(",")
+        browser.until(lambda: float(str(browser.script(mean))) < middle, "the first time is darker in the same window")
+        body.send_keys(" ")
+        assert browser.text("play") == "Pause"
+        browser.until(lambda: browser.text("when") == "3 s", "it plays to the end")
+        browser.until(lambda: browser.text("when") == "0 s", "and begins again")
+        browser.driver.find_element("id", "play").click()
+        assert browser.text("play") == "Play"
         assert browser.complaints() == []
 
 

@@ -22,7 +22,7 @@ from beamline.simulate.truth import Truth, write_truth
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
+from beamline.storage.writers.recon_file import VolumesInTime, read_reconstruction, write_reconstruction
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import BeamReading
 from recon.base.volume import Grid
@@ -142,7 +142,9 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
         events += [json.loads(line) for line in done.stdout.splitlines()]
     record = read_reconstruction(tmp_path / "bars.h5")
     write_reconstruction(tmp_path / "doubtful.h5", replace(record, fbp=record.volume.data))
-    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful")))
+    series = VolumesInTime(np.zeros(2), np.stack([record.volume.data] * 2))
+    write_reconstruction(tmp_path / "series.h5", replace(record, series=series))
+    volumes = paths(*(tmp_path / f"{name}.h5" for name in ("fbp", "r2", "bars", "doubtful", "series")))
     assert unmatched(volumes, names("Volume file")) == (set(), set())
     assert unmatched(paths(tmp_path / "checkpoint.h5"), names("Checkpoint")) == (set(), set())
     assert_on_the_page(events)

@@ -1,0 +1,77 @@
+"""`beamline recon --time N`: volumes in time from one scan."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamline.cli.option_groups import METHOD, heading
+from beamline.cli.options import together
+from beamline.cli.recipe import given, name_of
+from beamline.cli.terminal import counting, events_shown
+from beamline.core.errors import ScanStopped
+from beamline.core.events import Done
+from beamline.core.signals import StopOnSignal
+from drivers.base.clock import SystemClock
+
+if TYPE_CHECKING:
+    from beamline.reconstruct.options import ReconOptions
+
+_TAKEN = ("volumes", "moves", "seed", "output", "unfinished", "memory", "dry", "as_json")
+
+time_options = together(
+    heading(METHOD),
+    click.option(
+        "--time",
+        "volumes",
+        type=click.IntRange(min=2),
+        metavar="N",
+        help="Of a sample that changes while it is scanned: N volumes at even times, in one .h5, from one fit of all "
+        "views. Each needs twelve views or more.",
+    ),
+    click.option(
+        "--moves/--no-moves",
+        default=None,
+        help="With --time: matter moves, or only its density changes. Default: what views held out prefer.",
+    ),
+)
+
+
+def refuse_others(context: click.Context, of_views: Collection[str], output: Path | None) -> None:
+    """Raises UsageError for options that a fit of volumes in time does not take.
+
+    Args:
+        of_views: names of options that choose and correct views; these it takes.
+    """
+    from beamline.storage.writers.recon_file import SUFFIXES  # here: help needs none of it
+
+    for option in given(context):
+        if option.name not in (*_TAKEN, *of_views):
+            raise click.UsageError(
+                f"--time fits all volumes at once by a method of its own; --{name_of(option)} does not go with it."
+            )
+    if output is not None and output.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
+
+
+def reconstruct_in_time(options: ReconOptions, volumes: int, moves: bool | None, dry: bool, as_json: bool) -> None:
+    """Write the volumes, or say what they take."""
+    from beamline.reconstruct.time_series import InTime, reconstruct_series, series_needs  # here: help needs none of it
+
+    clock, wanted, found = SystemClock(), InTime(volumes, moves), None
+    with events_shown(as_json) as sink:
+        if dry:
+            needs = series_needs(options, wanted)
+        else:
+            found = reconstruct_series(
+                options, wanted, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)
+            )
+        said: Any = needs if found is None else found
+        sink(Done(said, time=clock.now()))
+    if not as_json:
+        click.echo("\n".join(needs.lines() if found is None else found.lines()))
+    if found is not None and found.ended_early:
+        raise ScanStopped(f"The fit was stopped early; {found.output} holds the volumes reached by then.")

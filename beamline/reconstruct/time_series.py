@@ -1,0 +1,223 @@
+"""One scan of a sample that changes while it is scanned: volumes in time, in one file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from beamline.core.errors import ConfigError
+from beamline.core.events import Sink, StateEntered
+from beamline.core.phases import Phases
+from beamline.core.signals import StopOnSignal
+from beamline.core.sinks import Warnings
+from beamline.core.text import size
+from beamline.projections.poses import stated_geometry
+from beamline.projections.prepare import prepare_projections
+from beamline.reconstruct.finished import require_finished
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.result import parameters_of
+from beamline.reconstruct.slabs import memory_of
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.writers.recon_file import ReconRecord, VolumesInTime, write_reconstruction
+from drivers.base.clock import Clock
+from recon.base.arrays import F64, I64
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.series import TRIAL_SWEEPS, TimedViews, fit_series
+
+_SWEEPS = 60
+_COPIES = 7  # of all line integrals: views, lines, of a part held out, as moments, binned, and weights
+_VOLUMES, _FIELDS = 8, 12  # volumes for each of the series, and of one: displacements, what is displaced
+
+
+@dataclass(frozen=True)
+class InTime:
+    """What is asked of a series.
+
+    Attributes:
+        volumes: 2 or more, at even times from the first view to the last.
+        moves: matter moves, too; None: where views held out are predicted better so.
+    """
+
+    volumes: int
+    moves: bool | None
+
+
+@dataclass(frozen=True)
+class SeriesNeeds:
+    """Bytes that a series takes in memory, may take, and takes on the disk; and its shape [time, z, y, x]."""
+
+    shape: tuple[int, int, int, int]
+    views: int
+    memory: int
+    allowed: int
+    output: int
+
+    @classmethod
+    def of(cls, options: ReconOptions, wanted: InTime, geometry: Geometry) -> SeriesNeeds:
+        voxels = 4 * math.prod(shape := Grid.matching(geometry).shape)
+        rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
+        memory = (_VOLUMES * wanted.volumes + _FIELDS) * voxels + _COPIES * rays
+        return cls((wanted.volumes, *shape), geometry.n_views, memory, memory_of(options), wanted.volumes * voxels)
+
+    def refuse(self) -> None:
+        """ConfigError where it takes more memory than it may."""
+        if self.memory > self.allowed:
+            raise ConfigError(
+                f"--time {self.shape[0]}: {self.shape[0]} volumes of {self.shape[1:]} voxels take {size(self.memory)} "
+                f"of memory, {size(self.allowed)} may be used. Give --bin or --rows. Nothing was written."
+            )
+
+    def lines(self) -> list[str]:
+        """For people."""
+        shape = " x ".join(str(n) for n in self.shape[1:])
+        return [
+            f"{'volumes':<10}{self.shape[0]} of {shape} voxels, from {self.views} views",
+            f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}",
+            f"{'disk':<10}{size(self.output)} for the result",
+            f"{'time':<10}not estimated; {_SWEEPS} sweeps, and {TRIAL_SWEEPS} at most before them",
+        ]
+
+
+def series_needs(options: ReconOptions, wanted: InTime) -> SeriesNeeds:
+    """What it takes, before any frame is read. ConfigError where the memory does not suffice, or options do not fit."""
+    with options.source.open() as source:
+        needs = SeriesNeeds.of(options, wanted, stated_geometry(source, options.selection))
+    needs.refuse()
+    return needs
+
+
+@dataclass(frozen=True)
+class SeriesDone:
+    """What was written.
+
+    Attributes:
+        seconds: of the volumes, from the first view on.
+        moves: the sample moves.
+        chosen: how that was chosen; empty where it was given.
+        ended_early: the volumes are those reached when it was stopped.
+    """
+
+    output: Path
+    shape: tuple[int, ...]
+    seconds: tuple[float, ...]
+    axis_col: float
+    residual: float
+    moves: bool
+    chosen: str
+    ended_early: bool
+
+    def lines(self) -> list[str]:
+        """For people."""
+        n, *shape = self.shape
+        return [
+            f"{'output':<10}{self.output}",
+            f"{'volumes':<10}{n} of {' x '.join(map(str, shape))}, {self.seconds[0]:.4g} to {self.seconds[-1]:.4g} s",
+            f"{'motion':<10}{'learnt' if self.moves else 'none'}{'; ' * bool(self.chosen)}{self.chosen}",
+            f"{'axis_col':<10}{self.axis_col:.2f}",
+            f"{'residual':<10}{self.residual:.4g}",
+        ]
+
+
+def reconstruct_series(
+    options: ReconOptions,
+    wanted: InTime,
+    sink: Sink,
+    clock: Clock,
+    counting: Callable[[str], Callable[[int, int], None]],
+    stop: StopOnSignal,
+) -> SeriesDone:
+    """Fit volumes in time to one scan, and write them.
+
+    From the first sweep of the fit on Ctrl-C ends it with the volumes so far; before that it interrupts.
+
+    Raises:
+        ConfigError: too little memory, or too few views. DataError: the scan cannot be reconstructed, or the output
+            exists. Nothing is written then.
+    """
+    options.target.refuse_existing()
+    began, warn, phases = clock.now(), Warnings(sink, clock), Phases(sink, clock)
+    with options.source.open() as source:
+        require_finished(source, options, warn)
+        facts = facts_of(source)
+        prepared = prepare_projections(
+            source, options.selection, warn,
+            check=lambda geometry: SeriesNeeds.of(options, wanted, geometry).refuse(), phases=phases,
+        )  # fmt: skip
+        times = _times(source, prepared.projections.view_ids, warn)
+    output = 4 * wanted.volumes * math.prod(Grid.matching(prepared.geometry).shape)
+    options.target.require_room(output)
+    phases.enter("reconstruction")
+    early, tried, progress = False, 0, counting("sweeps")
+    trials = counting("trial sweeps")
+
+    def go_on(sweep: int, residual: float) -> bool:
+        nonlocal early, tried, progress
+        if sweep:
+            stop.ready = True
+            progress(sweep, _SWEEPS)
+        else:
+            tried += 1
+            trials(tried, TRIAL_SWEEPS)
+            progress = counting("sweeps")
+        early = stopping()
+        return not early
+
+    weights = prepared.ray_weights()
+    data = prepared.projections.data if weights is None else np.where(weights > 0, prepared.projections.data, 0)
+    try:
+        with stop() as stopping:
+            views = TimedViews(np.asarray(data, np.float32), prepared.geometry, times, weights)
+            made = fit_series(
+                views, wanted.volumes, motion=wanted.moves, sweeps=_SWEEPS, seed=options.seed, go_on=go_on,
+                stop=stopping,
+            )  # fmt: skip
+            early = early or stopping()
+    except ValueError as error:
+        raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
+    chosen = ""
+    if made.left_of_unseen is not None:
+        still, moved = made.left_of_unseen
+        chosen = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
+        sink(StateEntered("chosen", f"{'Motion' if made.motion else 'No motion'}, by {chosen}.", time=clock.now()))
+    phases.enter("writing")
+    stop.ready = False
+    series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]))
+    shape, settings = series.data.shape, {"volumes": wanted.volumes, "moves": made.motion is not None, "chosen": chosen}
+    outcome = ReconOutcome(
+        Volume(series.data[0], made.grid), "series", clock.now() - began, (),
+        settings | {"view_seconds": times - times.min()} | ({"ended_early": True} if early else {}), options.filter,
+    )  # fmt: skip
+    context = ReportContext(facts, options.selection, options.command, options.seed, recipe=options.recipe)
+    record = ReconRecord(
+        volume=outcome.volume,
+        length_unit=prepared.length_unit,
+        raw_file=str(facts.path.resolve()),
+        title=f"{wanted.volumes} volumes in time of {facts.name}",
+        sample=facts.sample or "not stated",
+        time=clock.now(),
+        parameters=parameters_of(outcome, prepared, context),
+        metrics={"seconds": outcome.seconds, "residual": made.residual},
+        series=series,
+    )
+    write_reconstruction(options.target.output, record)
+    phases.end()
+    return SeriesDone(
+        options.target.output, shape, tuple(series.seconds.tolist()), prepared.axis_col, made.residual,
+        made.motion is not None, chosen, early,
+    )  # fmt: skip
+
+
+def _times(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
+    """s when each of these views was exposed; evenly in the order of the file where it does not say."""
+    known = source.times
+    if known is not None and np.isfinite(known[view_ids]).all():
+        return np.asarray(known[view_ids], np.float64)
+    period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
+    warn(f"The file does not say when each view was taken: they count as even, {period} s apart, in its order.")
+    return np.asarray(view_ids * float(period), np.float64)
