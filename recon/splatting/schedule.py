@@ -66,6 +66,13 @@ class Schedule:
         by_steps = before + (1 - before) * (step - at) / (self.steps - at) if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
+    def least(self, step: int, tried: bool) -> int:
+        """Steps after which the data may yet end the fit, `tried` by a trial of the finish; 0: they cannot."""
+        if not (self.by_content and self.steps and step < _LOOKED_AT):
+            return 0
+        least = _ENDED_AT if tried and step <= TRIAL_AT and self.trial is None else SHORT_STEPS
+        return least if least < self.steps else 0
+
     def look(self, state: FitState, problem: FitProblem) -> None:
         """Shorten the fit if its residual after 100 steps is near the noise of the views."""
         if not (self.by_content and state.step == _LOOKED_AT and self.steps and self.steps > SHORT_STEPS):
