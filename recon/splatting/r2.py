@@ -21,7 +21,7 @@ from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
-from recon.splatting.schedule import DEFAULT_STEPS
+from recon.splatting.schedule import DEFAULT_STEPS, ENDED_AT, SHORT_STEPS
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
@@ -87,6 +87,12 @@ class R2:
     def planned_steps(self) -> int | None:
         """Steps that end the fit; None where `seconds` alone do."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
+
+    @property
+    def least_steps(self) -> int | None:
+        if self.steps is not None or self.seconds is not None or self.finish_sweeps == 0:
+            return self.planned_steps
+        return ENDED_AT if self.finish is None and not self.early_stop else SHORT_STEPS
 
     @property
     def finish_sweeps(self) -> int:

@@ -141,7 +141,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         )  # fmt: skip
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
-    by_content = method.steps is None and method.seconds is None and sweeps > 0
+    by_content = method.least_steps != method.planned_steps
     wanted, trials, planned, seconds = method.finish, True, sweeps == 0 or method.seconds is None, method.seconds
     if seconds is not None:
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
