@@ -35,9 +35,9 @@ class R2:
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
-        steps: of the fit. 0 gives the starting point. None takes 400. It takes 200 where a finish follows and the noise
-            of the views hides the gain of more, and 100 where a trial finds that the finish makes up for more (see
-            `schedule.Schedule`). With `seconds` it takes as many as fit.
+        steps: of the fit. 0 gives the starting point. None takes 400. Where a finish
+            follows, it takes 200 if the noise of the views hides the gain of more (see `schedule.Schedule`). It takes
+            100 if a trial shows no gain of more. With `seconds` it takes as many as fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
             are too few for the start, a warning says so before it, and the start uses binned views.
