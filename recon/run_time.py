@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -78,27 +78,43 @@ class Extent:
         return sum(self.heights)
 
 
-def run_seconds(method: Method, extent: Extent, now: Clock) -> float:
+class RunTime(NamedTuple):
+    """Seconds that a run takes.
+
+    Attributes:
+        most: where a fit makes all of its steps.
+        least: where the data end it as early as they may; of other methods, `most`.
+    """
+
+    most: float
+    least: float
+
+
+def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
     """Seconds that the method takes, without reading and correction; `auto` is taken to choose its first candidate.
 
     Small runs are made of the scan's own beam, with its lean, its exposures and as many rows, if they are few.
     Iterations cost views times voxels, plus voxels for their work on the volume alone. A weight of total variation is
     chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover.
     """
-    if isinstance(method, IterativeMethod):
-        return _of_iterations(method, extent, now, method.iterations)
     if isinstance(method, FitMethod):
         return _of_fit(method, extent, now)
+    if isinstance(method, IterativeMethod):
+        seconds = _of_iterations(method, extent, now, method.iterations)
+        return RunTime(seconds, seconds)
     if isinstance(method, FieldMethod):
-        return _of_field(method, extent, now)
+        seconds = _of_field(method, extent, now)
+        return RunTime(seconds, seconds)
     candidates = candidates_of(method)
     if candidates[0] is method:
-        return _of_direct(method, extent, now)
+        seconds = _of_direct(method, extent, now)
+        return RunTime(seconds, seconds)
     first = Extent(extent.geometry, [min(32, max(extent.heights))])
     known = not extent.geometry.is_cone  # the weight that the first trial finds is that of the others
     tried = [first, *(replace(first, decided=known) for _ in candidates[1:])]
-    trials = sum(run_seconds(one, part, now) for one, part in zip(candidates, tried, strict=True))
-    return trials + run_seconds(candidates[0], extent, now)
+    parts = [run_seconds(one, part, now) for one, part in zip(candidates, tried, strict=True)]
+    parts.append(run_seconds(candidates[0], extent, now))
+    return RunTime(*(sum(seconds) for seconds in zip(*parts, strict=True)))
 
 
 def _of_iterations(method: Method, extent: Extent, now: Clock, sweeps: int, trials: int = CHOICE_SWEEPS) -> float:
@@ -181,7 +197,7 @@ def _of_field(method: FieldMethod, extent: Extent, now: Clock) -> float:
     return steps + short * beside / (rows * cols**2)
 
 
-def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:
+def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     """Steps cost a fixed time and one by their work, which small fits of two sizes tell apart."""
     tried = [_step_of_fit(extent, now, *size) for size in _FITS]
     (few, less), (many, more) = tried[0], tried[-1]
@@ -193,12 +209,14 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> float:
         count = _count(height, extent.cols) if given is None else given * height / extent.slices
         seconds += max(less + slope * (_work(voxels, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
-    steps = method.seconds if method.seconds is not None else (method.planned_steps or 0) * seconds * grown
-    finish = 0.0
+    planned, fewest = method.planned_steps or 0, method.least_steps or 0
+    most = method.seconds if method.seconds is not None else planned * seconds * grown
+    least = min(most, fewest * seconds * (grown if fewest == planned else 1))  # it ends before Gaussians are added
+    beside = _of_direct(Fbp(), extent, now)
     if method.finish != 0:
         sweeps, trials = _FINISH if method.finish is None else (method.finish, CHOICE_SWEEPS)
-        finish = _of_iterations(FistaTv(), extent, now, sweeps, trials)
-    return steps + finish + _of_direct(Fbp(), extent, now)
+        beside += _of_iterations(FistaTv(), extent, now, sweeps, trials)
+    return RunTime(most + beside, least + beside)
 
 
 def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[float, float]:

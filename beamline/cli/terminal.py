@@ -195,7 +195,8 @@ def trials(done: TrialReached, what: str = "trials") -> str:
 def fit(at: FitReached) -> str:
     """n/N, rate, views, Gaussians (iterations have none), residuals and time left."""
     word = at.unit or ("steps" if at.n_gaussians else "iterations")
-    parts = [f"{at.step}/{at.steps} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
+    of = f"{at.least} to {at.steps}" if at.least else at.steps
+    parts = [f"{at.step}/{of} {word}"] if at.steps else [f"{at.step} {word}"] if at.unit else []
     parts += [f"{at.per_s:.3g} {word.split()[0]}/s"] if at.per_s else []
     parts += [f"{at.n_views} views"]
     parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
@@ -204,7 +205,8 @@ def fit(at: FitReached) -> str:
     if at.held_out is not None and math.isfinite(at.held_out):
         parts.append(f"held out {at.held_out:.4f}")
     if at.eta_s is not None:
-        parts.append(f"{_clock_time(at.eta_s)} left")
+        early = f"{_clock_time((at.least - at.step) / at.per_s)} to " if at.least and at.per_s else ""
+        parts.append(f"{early}{_clock_time(at.eta_s)} left")
     return ", ".join(parts)
 
 

@@ -16,7 +16,7 @@ from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.slabs import slabs_of
 from recon.base.volume import Grid
-from recon.run_time import Extent, run_seconds
+from recon.run_time import Extent, RunTime, run_seconds
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Estimate:
         done: slices that a partial volume has.
         scratch: bytes on the disk of the output, while it works; 0: all at once in memory.
         output, free: bytes of the result, and bytes on its disk.
-        seconds: without reading and correction.
+        seconds: at most, without reading and correction.
+        least_seconds: where the data end a fit as early as they may; otherwise `seconds`.
     """
 
     method: str
@@ -47,17 +48,21 @@ class Estimate:
     output: int
     free: int
     seconds: float
+    least_seconds: float
 
     def lines(self) -> list[str]:
         in_slabs = f"in {count(self.slabs, 'slab')}; all at once would take {size(self.at_once)}"
         if self.done:
             in_slabs = f"in {count(self.slabs, 'slab')} that are left; {self.done} of {self.shape[0]} slices are there"
+        time = f"about {duration_text(self.seconds)}"
+        if self.least_seconds < self.seconds:
+            time = f"at most {time}; about {duration_text(self.least_seconds)} where the data end the fit early"
         how = in_slabs if self.scratch else "all at once"
         return [
             f"{'volume':<10}{' x '.join(str(n) for n in self.shape)} voxels by {self.method}, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}, {how}",
             f"{'disk':<10}{size(self.output)} for the result, {size(self.scratch)} meanwhile; {size(self.free)} free",
-            f"{'time':<10}about {duration_text(self.seconds)}, reading and correction not counted",
+            f"{'time':<10}{time}, reading and correction not counted",
         ]
 
 
@@ -105,14 +110,14 @@ def estimate(options: ReconOptions, clock: Clock) -> Estimate:
     heights = [slab.slices.stop - slab.slices.start for slab in left]
     extent = Extent(geometry, heights, decided=options.partial is not None)
     try:
-        seconds = run_seconds(needs.method, extent, clock.now) if left else 0.0
+        seconds = run_seconds(needs.method, extent, clock.now) if left else RunTime(0.0, 0.0)
     except ValueError as error:  # as the method itself refuses the views
         raise DataError(f"{source.path} cannot be reconstructed by {options.method.name}: {error}.") from error
-    seconds *= 1 + options.uncertainty  # error bars take at most as long as the volume
+    most, least = (each * (1 + options.uncertainty) for each in seconds)  # error bars take at most as long
     done = sum(slab.own.stop - slab.own.start for slab in slabs) - sum(s.own.stop - s.own.start for s in left)
     height = slabs[0].own.stop
     return Estimate(
         options.method.name, geometry.n_views, shape, needs.at_once, allowed,
         needs.at_once if fits else max(needs.slab(height), needs.least), len(left), done, scratch, output, free,
-        seconds,
+        most, least,
     )  # fmt: skip

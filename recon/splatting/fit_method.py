@@ -45,6 +45,10 @@ class FitMethod(Method, Protocol):
         """Number of steps of the fit; None if only `seconds` end it."""
 
     @property
+    def least_steps(self) -> int | None:
+        """The fewest after which the data may end the fit; `planned_steps` where they cannot."""
+
+    @property
     def finish_sweeps(self) -> int:
         """Sweeps of the finish; where views held out choose them, the fewest."""
 

@@ -21,7 +21,7 @@ from recon.splatting.density_control import DensityPolicy
 from recon.splatting.finish import SWEEPS
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import Start, default_count, place
-from recon.splatting.schedule import DEFAULT_STEPS
+from recon.splatting.schedule import DEFAULT_STEPS, ENDED_AT, SHORT_STEPS
 from recon.splatting.settings import FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
@@ -35,8 +35,9 @@ class R2:
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
-        steps: of the fit. 0 gives the starting point. None takes 400. It takes 200 where a finish follows and the noise
-            of the views hides the gain of more (see `schedule.Schedule`). With `seconds` it takes as many as fit.
+        steps: of the fit. 0 gives the starting point. None takes 400. Where a finish
+            follows, it takes 200 if the noise of the views hides the gain of more (see `schedule.Schedule`). It takes
+            100 if a trial shows no gain of more. With `seconds` it takes as many as fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. If they
             are too few for the start, a warning says so before it, and the start uses binned views.
@@ -87,6 +88,12 @@ class R2:
     def planned_steps(self) -> int | None:
         """Steps that end the fit; None where `seconds` alone do."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
+
+    @property
+    def least_steps(self) -> int | None:
+        if self.steps is not None or self.seconds is not None or self.finish_sweeps == 0:
+            return self.planned_steps
+        return ENDED_AT if self.finish is None and not self.early_stop else SHORT_STEPS
 
     @property
     def finish_sweeps(self) -> int:

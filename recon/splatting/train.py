@@ -141,7 +141,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         )  # fmt: skip
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
-    by_content = method.steps is None and method.seconds is None and sweeps > 0
+    by_content = method.least_steps != method.planned_steps
     wanted, trials, planned, seconds = method.finish, True, sweeps == 0 or method.seconds is None, method.seconds
     if seconds is not None:
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
@@ -163,7 +163,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         history.append(
             Progress(
                 state.step, schedule.steps or 0, at - begin, float(state.loss), float(state.residual), state.n,
-                seen.n_views, tracker.value,
+                seen.n_views, tracker.value, least=schedule.least(state.step, tries_finish),
             )
         )  # fmt: skip
         if control.on_progress is not None:

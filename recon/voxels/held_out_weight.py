@@ -248,20 +248,16 @@ def bregman_weight(problem: VoxelProblem, weight: float, residual: float | None 
     return factor * weight if best < (1 - _GAIN) * once else None
 
 
-def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int, *, steadily: bool = True) -> int:
+def preferred_sweeps(problem: VoxelProblem, start: F32, weight: float, sweeps: int) -> int:
     """Sweeps from `start` [y, x, z] with the weight μ that views held out prefer: `sweeps`, or three times these.
 
     A fit leaves some scans far from what the views tell (a foam: 20 dB, 24.0 after 8 sweeps, 25.1 after 24). It leaves
     others nearer than total variation alone comes (a teapot: 39.7 and 37.5 dB). Each round of `residuals_of_rounds` has
     to bring the others nearer, and all by one per cent, which parts the two (docs/notes/exploration.md). Where slices
-    are not those of rows: `sweeps`. Without `steadily`, for a fit that was ended early, any round may bring the one per
-    cent, and the last ones may lose some of it.
+    are not those of rows: `sweeps`.
     """
     errors = residuals_of_rounds(problem, start, weight, sweeps)
-    least = min(errors, default=math.inf)
-    nearer = bool(errors) and least < _NEARER * errors[0]
-    if steadily:
-        nearer = nearer and len(errors) == _ROUNDS and errors[-1] <= least
+    nearer = len(errors) == _ROUNDS and errors[-1] <= min(errors) and errors[-1] < _NEARER * errors[0]
     return _ROUNDS * sweeps if nearer else sweeps
 
 

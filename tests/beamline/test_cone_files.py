@@ -153,7 +153,7 @@ def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = list[Extent]()
-    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or 7.0)
+    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or (7.0, 7.0))
     found = beamline("recon", str(scan), "-m", "sirt", "-o", str(tmp_path / "out.h5"), "--dry-run")
     assert found.exit_code == 0 and "40 x 48 x 48 voxels by sirt, from 90 views" in found.stdout, found.output
     geometry = seen[0].geometry

@@ -1,5 +1,7 @@
 """The seconds that `recon --dry-run` expects beside those that a run takes, by beam and method, in CPU seconds.
 
+Of a fit it expects two figures; the one that counts is that of the steps which it took.
+
 Run with  pytest -m bench -s tests/bench/test_dry_run.py  (two minutes).
 """
 
@@ -12,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import recon
+from recon.base.choices import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Method
 from recon.base.ray_width import RayWidth
@@ -60,7 +63,11 @@ def test_a_run_takes_the_seconds_that_were_expected(beam: str, method: Method) -
     expected = run_seconds(method, Extent(geometry, [Grid.matching(geometry).shape[0]]), now)
     begin, repeats = now(), 3 if method.traits.direct else 1
     for _ in range(repeats):
-        recon.reconstruct(data, geometry, method)
+        found = recon.reconstruct(data, geometry, method)
     taken = (now() - begin) / repeats
-    print(f"\n{beam}, {method.name}: {expected:.2f} CPU s expected, {taken:.2f} taken, ratio {expected / taken:.2f}")
-    assert expected == pytest.approx(taken, rel=_WITHIN)
+    ended = isinstance(method, recon.R2) and found.settings["steps"] < DEFAULT_STEPS
+    which = expected.least if ended else expected.most
+    print(
+        f"\n{beam}, {method.name}: {which:.2f} CPU s expected, {taken:.2f} taken, ratio {which / taken:.2f}, {expected}"
+    )
+    assert which == pytest.approx(taken, rel=_WITHIN)

@@ -16,7 +16,7 @@ from recon.auto import Auto
 from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
-from recon.run_time import Extent, run_seconds
+from recon.run_time import Extent, RunTime, run_seconds
 
 
 def extent(views: int, cols: int, heights: Sequence[int], decided: bool = False) -> Extent:
@@ -27,15 +27,17 @@ def extent(views: int, cols: int, heights: Sequence[int], decided: bool = False)
 def test_fbp_takes_twice_as_long_for_two_slabs_and_a_choice_as_long_as_its_parts() -> None:
     one, two = extent(90, 64, [32]), extent(90, 64, [32, 32])
     seconds = [run_seconds(recon.Fbp(), each, itertools.count().__next__) for each in (one, two)]
-    assert seconds[1] == pytest.approx(2 * seconds[0])
-    assert run_seconds(Auto((recon.Fbp(),)), two, itertools.count().__next__) == pytest.approx(3 * seconds[0])
+    assert seconds[1].most == seconds[1].least == pytest.approx(2 * seconds[0].most)
+    assert run_seconds(Auto((recon.Fbp(),)), two, itertools.count().__next__).least == pytest.approx(
+        3 * seconds[0].least
+    )
 
 
 def test_iterations_cost_by_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where each run takes a second, whatever it does, an iteration costs nothing: what is left is one run."""
     monkeypatch.setattr(run_time, "_took", lambda *_: (1.0, {}, 0))
     few, many = (
-        run_seconds(recon.Sirt(iterations=n), extent(108, 64, [16]), itertools.count().__next__) for n in (3, 300)
+        run_seconds(recon.Sirt(iterations=n), extent(108, 64, [16]), itertools.count().__next__).most for n in (3, 300)
     )
     assert few == many == pytest.approx(1.0)
 
@@ -51,7 +53,7 @@ def test_iterations_cost_by_voxels_and_views(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(run_time, "_took", took)
     for views, cols, rows in ((90, 100, 8), (1800, 2048, 64)):
         found = run_seconds(recon.OsSirtTv(iterations=40), extent(views, cols, [rows]), itertools.count().__next__)
-        assert found == pytest.approx(1e-6 * cols**2 * (rows * (10 + 40 * (5 + views)) + 64 * views))
+        assert found.most == pytest.approx(1e-6 * cols**2 * (rows * (10 + 40 * (5 + views)) + 64 * views))
 
 
 def test_a_neural_field_costs_by_its_steps_and_slabs_and_ends_by_its_seconds() -> None:
@@ -59,7 +61,7 @@ def test_a_neural_field_costs_by_its_steps_and_slabs_and_ends_by_its_seconds() -
 
     def seconds(heights: list[int], **settings: Any) -> float:
         method = recon.NAF(rays=8, samples=4, levels=1, **settings)
-        return run_seconds(method, extent(108, 128, heights), itertools.count().__next__)
+        return run_seconds(method, extent(108, 128, heights), itertools.count().__next__).most
 
     volume = 1.0  # of sixteen rows
     assert seconds([16], steps=1200) == pytest.approx(100 + volume)
@@ -75,7 +77,7 @@ def test_what_another_slab_has_decided_costs_nothing(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(run_time, "_took", took)
     rest, whole = (
-        run_seconds(recon.FistaTv(), extent(72, 64, [16], decided), itertools.count().__next__)
+        run_seconds(recon.FistaTv(), extent(72, 64, [16], decided), itertools.count().__next__).most
         for decided in (True, False)
     )
     assert (rest, whole) == (1.0, 5.0)
@@ -88,7 +90,24 @@ def test_no_fit_takes_less_than_nothing_on_a_busy_machine(monkeypatch: pytest.Mo
     monkeypatch.setattr(run_time, "_of_direct", lambda *_: 0.0)
     clock = iter(itertools.accumulate(seconds for run in 2 * runs for seconds in (0, run)))
     fit = recon.R2(steps=1000, finish=0)
-    assert run_seconds(fit, extent(108, 128, [16]), clock.__next__) > 1000 * runs[-1] / 100
+    assert run_seconds(fit, extent(108, 128, [16]), clock.__next__).least > 1000 * runs[-1] / 100
+
+
+@pytest.mark.parametrize(
+    ("settings", "least"),
+    [({}, 100), ({"finish": 8}, 200), ({"early_stop": True}, 200), ({"steps": 400}, 500), ({"finish": 0}, 500)],
+)
+def test_the_time_of_a_fit_that_the_data_may_end_is_said_twice(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], least: float
+) -> None:
+    """Where a step takes a second, and a quarter more once Gaussians are added, and a finish takes none."""
+    monkeypatch.setattr(
+        run_time, "_step_of_fit", lambda *_: (run_time._work(16 * 128**2, run_time._count(16, 128)), 1.0)
+    )
+    monkeypatch.setattr(run_time, "_of_direct", lambda *_: 0.0)
+    monkeypatch.setattr(run_time, "_of_iterations", lambda *_: 0.0)
+    found = run_seconds(recon.R2(**settings), extent(108, 128, [16]), itertools.count().__next__)
+    assert found == pytest.approx(RunTime(500, least))
 
 
 def test_small_runs_are_of_the_scan_s_own_beam() -> None:

@@ -189,7 +189,7 @@ def test_a_dry_run_counts_moments_of_an_exposure_and_slices_that_views_step_over
     """Views of 200 rows; the later half stands 100 rows higher."""
     Path("poses.csv").write_text("view,shift_row_px\n" + "".join(f"{n},{100 * (n >= 30)}\n" for n in range(60)))
     seen = list[Extent]()
-    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or 7.0)
+    monkeypatch.setattr(estimate, "run_seconds", lambda method, extent, now: seen.append(extent) or (7.0, 7.0))
     dry = ("recon", "scan.h5", "-m", "sirt", "--dry-run", "-o", "out.h5")
     stepped = beamline(*dry, "--poses", "poses.csv")
     assert "300 x 48 x 48 voxels" in stepped.stdout and seen[-1].heights == [300], stepped.output

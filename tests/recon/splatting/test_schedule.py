@@ -62,20 +62,26 @@ def test_a_shortened_fit_goes_on_from_its_rates_to_the_last_ones() -> None:
 
 def test_a_fit_that_is_not_worth_its_steps_ends_after_a_hundred() -> None:
     schedule = Schedule(DEFAULT_STEPS, by_content=True)
-    schedule.after_trial(FinishTrial(True, 2.0, 0.5), TRIAL_AT)
-    assert schedule.steps == DEFAULT_STEPS
-    schedule.after_trial(FinishTrial(False, 2.0, 0.5), TRIAL_AT)
-    assert schedule.steps == 100
+    assert schedule.least(TRIAL_AT, True) == 100 and schedule.least(TRIAL_AT, False) == SHORT_STEPS
+    assert schedule.least(100, False) == Schedule(DEFAULT_STEPS).least(1, True) == 0
+    schedule.after_trial(FinishTrial(0, 2.0, 0.5), TRIAL_AT)
+    assert schedule.steps == DEFAULT_STEPS and schedule.least(TRIAL_AT + 1, True) == SHORT_STEPS
+    schedule.after_trial(FinishTrial(16, 2.0, 0.5), TRIAL_AT)
+    assert schedule.steps == 100 and schedule.least(TRIAL_AT + 1, True) == 0
     after = [schedule.fraction(step, 0.0) for step in range(TRIAL_AT, 101)]
     assert after[0] == TRIAL_AT / DEFAULT_STEPS and after[-1] == 1.0 and (np.diff(after) > 0).all()
     assert vars(Schedule.resumed(Schedule(DEFAULT_STEPS, by_content=True), schedule.arrays())) == vars(schedule)
 
 
-@pytest.mark.parametrize(("of_fit", "worth"), [(0.97, True), (0.99, False)])
+@pytest.mark.parametrize(
+    ("left", "sweeps"),
+    [([1.1, 0.99, 0.97], 0), ([1.3], 0), ([1.1, 1.02, 1.0], 24), ([1.1, 0.994, 0.99], 16), ([0.99, 1.0], 8)],
+)
 def test_a_fit_is_worth_its_steps_where_it_helps_to_predict_views(
-    of_fit: float, worth: bool, monkeypatch: pytest.MonkeyPatch
+    left: list[float], sweeps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Residuals of views held out: 1 with total variation alone. The weight is the same in the finish, found once."""
+    """Residuals of views held out, round for round: 1 with total variation alone. The finish of a fit that is ended
+    takes the sweeps of the trial, and its weight, which are found once; others ask for their sweeps again."""
     searches: list[float] = []
 
     def search(problem: VoxelProblem, first: float) -> Preferred:
@@ -84,12 +90,14 @@ def test_a_fit_is_worth_its_steps_where_it_helps_to_predict_views(
 
     for module in ("recon.splatting.finish", "recon.voxels.held_out_weight"):
         monkeypatch.setattr(f"{module}.preferred_weight", search)
-    monkeypatch.setattr("recon.splatting.finish.residuals_of_rounds", lambda *_: [1.1, of_fit])
+    monkeypatch.setattr("recon.splatting.finish.residuals_of_rounds", lambda *_: left)
+    monkeypatch.setattr("recon.splatting.finish.preferred_sweeps", lambda *_: 9)
     monkeypatch.setattr("recon.splatting.finish.bregman_weight", lambda *_: None)
     decide = Decisions()
     control = recon.RunControl(decide=decide)
     found = recon.reconstruct(CLEAN + 0.01 * NOISE, VIEWS, TINY, control=control)
-    assert found.settings["steps"] == (DEFAULT_STEPS if worth else 100)
+    assert found.settings["steps"] == (100 if sweeps else DEFAULT_STEPS)
+    assert found.settings["finish"] == (sweeps or 9)
     assert decide.made["weight"] == [[pytest.approx(searches[0])]] and len(searches) == 1
     asked = recon.reconstruct(CLEAN + 0.01 * NOISE, VIEWS, replace(TINY, steps=60))
     assert asked.settings["steps"] == 60 and len(searches) == 2
