@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, json_option, parsed
+from beamline.cli.options import POSITIVE, json_events, json_option, parsed
 from beamline.cli.terminal import events_shown
 from beamline.core.events import BenchDone, BenchStarted, Done, Event, TrialReached
 from beamline.core.machine import machine, machine_line

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from beamline.config.references import ReferencesSection, reference_limits
+from beamline.config.monitor import ReferencesSection, reference_limits
 from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest

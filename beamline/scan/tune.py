@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.config.load import Config, plan_of
-from beamline.config.references import reference_limits
+from beamline.config.monitor import reference_limits
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Sink
 from beamline.core.stop import StopRequest

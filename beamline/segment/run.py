@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import refuse_existing, whole_file, write_whole
-from beamline.core.version import version
+from beamline.core.shipped import version
 from beamline.segment.picture import picture_of
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.config.load import config_folder, load
-from beamline.config.references import reference_limits
+from beamline.config.monitor import reference_limits
 from beamline.core.errors import ConfigError, ReferencesError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
