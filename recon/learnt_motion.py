@@ -22,7 +22,6 @@ _LEVELS = ((2, 8), (1, 6))  # voxels in those of the finer level, and turns
 _SWEEPS = 6  # of a turn, which go on from the last one
 _KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
 _HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
-MOTION_SWEEPS = sum(turns for _, turns in _LEVELS) * _SWEEPS
 
 
 def learnt_motion(views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool]) -> Motion | None:

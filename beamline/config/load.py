@@ -269,11 +269,15 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
         )
 
 
+def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
+    """The configured region, binning and readout with an exposure (s) and a trigger source."""
+    camera = config.devices.camera
+    return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
+
+
 def _camera(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
     camera = config.devices.camera
-    settings = CameraSettings(
-        config.scan.exposure_s, TriggerSource.EXTERNAL, camera.roi, camera.binning, camera.readout
-    )
+    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     try:
         timing = camera.timing_of(settings)
     except ValueError as error:
