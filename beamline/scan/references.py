@@ -51,7 +51,7 @@ class ReferenceLog:
             planned: blocks that are over by now; references without any frame are missing.
         """
         missing = {
-            block.kind.name: f"None of the {block.n} {block.kind.name.lower()}s planned before the views came."
+            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the views did not come."
             for block in planned
             if block.kind in REFERENCES and not any(group[0].kind is block.kind for group in self._groups)
         }
