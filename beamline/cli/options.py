@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -109,3 +110,8 @@ def json_events(wanted: bool) -> Iterator[Sink]:
         if not (last and last[-1].event in ("done", "failed")):
             lines(Failed(user_message(error), exit_code(error), time=SystemClock().now()))
         raise
+
+
+def say(line: str) -> None:
+    """A line with the time of day, on stderr."""
+    click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
