@@ -16,7 +16,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.kernels.cpu.mixtures import nonnegative_mix
 from recon.kernels.cpu.vectors import combine
-from recon.voxels.motion import Motion, moved, moved_back
+from recon.voxels.motion import Motion, moved, moved_back, weighed
 from recon.voxels.ordered_fista import subsets_of
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.tv import TotalVariationProx, difference_weights
@@ -173,7 +173,7 @@ class EnergyFit:
                 u = None if self.motion is None else self.motion.at(part.energy)
                 lines = part.projector.forward_lines(moved(x, u))
                 lines *= np.float32((self._u[part.energy] ** 2).sum())
-                product += moved_back(part.projector.adjoint_lines(_weighed(lines, part)), u)
+                product += moved_back(part.projector.adjoint_lines(weighed(lines, part.weight)), u)
             bound = min(bound, float(np.divide(product, x, out=np.zeros_like(x), where=x > 0).max()))
             x = product / product.max()
         return bound
@@ -198,7 +198,7 @@ class EnergyFit:
                 combine(1.0, image, float(share), component, image)
             u = None if self.motion is None else self.motion.at(part.energy)
             residual = part.data - part.projector.forward_lines(moved(image, u))
-            weighted = _weighed(residual, part)
+            weighted = weighed(residual, part.weight)
             squares += float(np.vdot(residual, weighted))
             back = moved_back(part.projector.adjoint_lines(weighted, image), u)
             for share, component in zip(self._u[part.energy], out, strict=True):
@@ -250,10 +250,6 @@ class EnergyFit:
     def densities(self) -> F32:
         """[material, z, y, x]."""
         return np.ascontiguousarray(np.einsum("mk,kyxz->mzyx", self._back.astype(np.float32), self.z))
-
-
-def _weighed(lines: F32, part: _Part) -> F32:
-    return lines if part.weight is None else part.weight * lines
 
 
 def fitted(fit: EnergyFit, weights: F64, sweeps: int, go_on: Callable[[int, float], bool]) -> tuple[F32, float]:

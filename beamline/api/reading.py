@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from beamline.config.load import load, override_of
-from beamline.config.monitor import configured_checks
-from beamline.config.references import reference_limits
+from beamline.config.monitor import configured_checks, reference_limits
 from beamline.core.errors import DataError
 from beamline.core.files import parts_of
 from beamline.monitor.checks import CHECKS

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, json_option, parsed
+from beamline.cli.options import POSITIVE, json_events, json_option, parsed
 from beamline.cli.terminal import events_shown
 from beamline.core.events import BenchDone, BenchStarted, Done, Event, TrialReached
 from beamline.core.machine import machine, machine_line
@@ -98,19 +97,17 @@ def acquire(
 
 
 def _load(file: Path | None, shape: tuple[int, int] | None) -> Load:
-    from beamline.config.load import load
+    from beamline.config.load import camera_settings, load
     from beamline.config.models import StorageSection
     from beamline.config.monitor import configured_checks
     from beamline.doctor.rate import Load
-    from drivers.base.protocols import CameraSettings, TriggerSource
+    from drivers.base.protocols import TriggerSource
 
     if file is None:
         return Load(shape or orca_quest.SENSOR_SHAPE, StorageSection().preview_bin, StorageSection().flush_every)
     config = load(file)
     camera, storage = config.devices.camera, config.storage
-    settings = CameraSettings(
-        config.scan.exposure_s, TriggerSource.EXTERNAL, camera.roi, camera.binning, camera.readout
-    )
+    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     work = Load(
         camera.timing_of(settings).shape, storage.preview_bin, storage.flush_every, configured_checks(config.monitor)
     )

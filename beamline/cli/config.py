@@ -1,4 +1,4 @@
-"""`beamline config`: prints a template to edit, a configuration with all defaults, and the schema."""
+"""`beamline config`, `check`: prints a template, a configuration with all defaults, the schema, and a scan's plan."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.options import config_argument, set_option
+from beamline.cli.options import config_argument, json_events, json_option, set_option
+from beamline.core.events import Done
+from drivers.base.clock import SystemClock
 
 
 @click.group()
@@ -41,3 +43,28 @@ def print_schema() -> None:
     from beamline.config.load import schema
 
     click.echo(json.dumps(schema(), indent=2))
+
+
+@click.command()
+@config_argument
+@set_option
+@json_option
+def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Validate CONFIG. Nothing moves.
+
+    Prints the timeline of the scan: speed, taxi, angular step in counts, motion blur and rolling-shutter skew in
+    pixels, duration, bytes to write and free disk space.
+
+    Exit code: 0 valid, 2 wrong configuration or violated limit.
+    """
+    from beamline.config.load import load
+    from beamline.scan.preflight import dry_run, refuse_violations
+
+    with json_events(as_json) as sink:
+        worked = dry_run(load(file, overrides))
+        if not as_json:
+            click.echo("\n".join(worked.lines()))
+        refuse_violations(worked.timeline)
+        sink(Done(worked.data(), time=SystemClock().now()))
+    if not as_json:
+        click.echo(f"\n{file} is valid: no limit is violated.")

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import set_option
+from beamline.cli.options import json_events, set_option
 from beamline.core.events import Diagnosed, Done
 from beamline.core.signals import terminated_like_interrupted
 from beamline.doctor.check import Grade

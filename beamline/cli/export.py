@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import json_option, parsed, refuse_shared, volume_path
+from beamline.cli.options import json_events, json_option, parsed, refuse_shared, volume_path
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing

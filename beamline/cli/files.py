@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, json_option
+from beamline.cli.options import POSITIVE, json_events, json_option
 from beamline.cli.scan_options import light_asked, light_options, scan_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import DataError

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from contextlib import closing, suppress
-from datetime import datetime
 from pathlib import Path
 
 import click
 
+from beamline.cli.options import say
 from beamline.core.files import RUNS
 
 
@@ -26,9 +26,6 @@ def ioc(runs: Path, prefix: str, bind: str, control: bool) -> None:
     Exit code: 0 ended by Ctrl-C, 2 p4p is not installed, 5 the address cannot be listened at.
     """
     from beamline.epics.ioc import PERIOD, RunServer
-
-    def say(line: str) -> None:
-        click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)
 
     with closing(RunServer(runs, prefix, bind, control, say)) as server, suppress(KeyboardInterrupt):
         click.echo(f"{prefix}ScanStatus and others at {bind} (docs/epics.md). Ctrl-C ends this, not the scan.")

@@ -16,9 +16,9 @@ from beamline.core.errors import user_message
 from beamline.core.events import Event, Failed, ReconStarted, Sink, StateEntered
 from beamline.core.files import named_on_failure, refuse_existing
 from beamline.core.narration import sentence
+from beamline.core.shipped import version
 from beamline.core.sinks import while_it_works
 from beamline.core.text import printable
-from beamline.core.version import version
 from beamline.scan.run_folder import new_log
 from drivers.base.clock import SystemClock
 

@@ -1,20 +1,21 @@
-"""The command `beamline`: finds subcommands by name, imports only the one in use, and maps errors to exit codes."""
+"""The command `beamline`: imports the subcommand in use, maps errors to exit codes, and outlives a closed terminal."""
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 import warnings
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import click
 from click.exceptions import Abort, ClickException, Exit
 from click.shell_completion import CompletionItem
 
-from beamline.cli.lasting import Outputs
 from beamline.core.errors import (
     INTERRUPTED,
     BeamlineError,
@@ -24,8 +25,68 @@ from beamline.core.errors import (
     leave_traceback,
     user_message,
 )
+from beamline.core.shipped import version
 from beamline.core.text import printable
-from beamline.core.version import version
+
+_CLOSED = (errno.EPIPE, errno.EBADF, errno.EINVAL)
+"""Errors of a pipe without a reader (EINVAL on Windows). They are passed over: its reader has ended on purpose."""
+
+
+class _Lasting(io.FileIO):
+    """Accepts all output; after the first error it drops it."""
+
+    error: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        if self.error is None:
+            try:
+                return super().write(data)
+            except OSError as error:
+                self.error = error
+        return memoryview(data).nbytes
+
+
+class Outputs:
+    """Puts `sys.stdout` and `sys.stderr` on files that last. Both, and stdin, are open from now on.
+
+    The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
+    """
+
+    def __init__(self) -> None:
+        while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+            os.set_inheritable(number, True)
+        os.close(number)
+        sys.stdout = _lasting(sys.stdout) or _nowhere()
+        sys.stderr = _lasting(sys.stderr) or _nowhere()
+
+    def lost(self) -> str:
+        """Why stdout is incomplete; "" if it is complete, or its reader has closed it. Both are flushed."""
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        buffer = getattr(sys.stdout, "buffer", None)
+        error = getattr(getattr(buffer, "raw", buffer), "error", None)
+        return "" if error is None or error.errno in _CLOSED else error.strerror
+
+
+def _lasting(stream: TextIO | None) -> TextIO | None:
+    """The same stream without errors; the stream itself if the system has no file for it (console of Windows)."""
+    buffer = getattr(stream, "buffer", None)
+    raw = getattr(buffer, "raw", buffer)  # unbuffered (`python -u`) it is the same
+    if not (isinstance(stream, io.TextIOWrapper) and type(raw) is io.FileIO):
+        return stream
+    stream.flush()
+    lasting: Any = _Lasting(stream.fileno(), "w", closefd=False)
+    return io.TextIOWrapper(
+        lasting if raw is buffer else io.BufferedWriter(lasting),
+        stream.encoding,
+        stream.errors,
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+
+
+def _nowhere() -> TextIO:
+    return open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123 - as long as the process
 
 
 @dataclass(frozen=True)
@@ -43,11 +104,11 @@ class _Entry:
 
 _COMMANDS = {
     "demo": _Entry("demo", "Run a simulated scan with live reconstruction; writes a volume and a report."),
-    "check": _Entry("check", "Validate a configuration. Nothing moves.", files=False),
+    "check": _Entry("config", "Validate a configuration. Nothing moves.", files=False),
     "doctor": _Entry("doctor", "Check this computer: camera link, ports, disk, memory. Nothing moves.", files=False),
     "home": _Entry("home", "Search the stage's reference position. The stage turns."),
     "tune": _Entry("tune", "Take a few frames and say which exposure to take."),
-    "align": _Entry("align", "Take a pair of views and say axis, tilt and sharpness, with the corrections."),
+    "align": _Entry("tune", "Take a pair of views and say axis, tilt and sharpness, with the corrections."),
     "scan": _Entry("scan", "Run a scan, or print its plan with --dry-run."),
     "runs": _Entry("runs", "List the runs in a folder: sample, frames, state, size, flags.", files=False),
     "watch": _Entry("watch", "Show a run in the browser while it goes on, and afterwards."),
@@ -76,7 +137,7 @@ _COMMANDS = {
     "voxelise": _Entry("model", "Fill voxels of any size and box from the Gaussians behind a volume."),
     "surface": _Entry("surface", "Write the surface of a volume, or of its Gaussians, as a watertight mesh."),
     "render": _Entry("model", "Project the Gaussians behind a volume: views at any angle."),
-    "completion": _Entry("completion", "Print the completion script of a shell.", files=False),
+    "completion": _Entry("man", "Print the completion script of a shell.", files=False),
     "man": _Entry("man", "Print the manual page of a command.", files=False),
     "config": _Entry("config", "Print a configuration template, a complete configuration, or the schema.", files=False),
 }

@@ -1,4 +1,4 @@
-"""`beamline man`: the manual page of a command, made of its help."""
+"""`beamline man`, `completion`: the manual page of a command, made of its help, and the script for a shell."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from inspect import cleandoc
 from textwrap import dedent
 
 import click
+from click.shell_completion import get_completion_class
 
-from beamline.core.version import version
+from beamline.core.shipped import version
 
 _WHOLE = "\b"  # click's mark of a paragraph whose lines stay as they are
 
@@ -68,3 +69,13 @@ def _text(text: str) -> str:
     """Text in which nothing is a request or an escape."""
     escaped = text.replace("\\", "\\e").replace("-", "\\-").replace('"', "\\(dq")
     return f"\\&{escaped}" if escaped.startswith((".", "'")) else escaped
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+@click.pass_context
+def completion(ctx: click.Context, shell: str) -> None:
+    """Print the completion script of SHELL, which its start file evaluates (docs/commands.md)."""
+    kind = get_completion_class(shell)
+    assert kind is not None
+    click.echo(kind(ctx.find_root().command, {}, "beamline", "_BEAMLINE_COMPLETE").source())

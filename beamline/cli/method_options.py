@@ -70,7 +70,7 @@ def row_settings(methods: Sequence[str], options: dict[str, Any]) -> dict[str, d
     """Settings by method, of the options of `row_options` that were given; takes all of these out of `options`.
 
     Raises:
-        UsageError: an option that none of the methods takes.
+        UsageError: an option that no method takes.
     """
     given = {name: value for name in _ROW_SETTINGS if (value := options.pop(name)) is not None}
     for name in given:

@@ -63,8 +63,7 @@ def monitor(
     Exit code: 0 no alarm, 4 stopped, 7 alarms, or darks or flats with a fault.
     """
     from beamline.config.load import load
-    from beamline.config.monitor import configured_checks
-    from beamline.config.references import reference_limits
+    from beamline.config.monitor import configured_checks, reference_limits
     from beamline.monitor.checks import CHECKS
     from beamline.projections.flagged_frames import worst_frames
     from beamline.projections.rendered import rendered

@@ -1,15 +1,24 @@
-"""Arguments and options that several commands share, and how their values are parsed and compared."""
+"""Arguments and options that several commands share: how values are parsed and compared, and what --json prints."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import os
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import click
+from click.exceptions import ClickException, Exit
+
+from beamline.core.errors import exit_code, user_message
+from beamline.core.events import Event, Failed, Sink
+from beamline.core.sinks import JsonLines, fan_out
+from drivers.base.clock import SystemClock
 
 
 class FiniteRange(click.FloatRange):
@@ -83,3 +92,26 @@ def refuse_shared(files: Mapping[str, Path | None]) -> None:
     for one, other in itertools.combinations(named, 2):
         if named[one] == named[other] and {one, other} != {"--checkpoint", "--resume"}:
             raise click.UsageError(f"{one} and {other} are the same file, {files[other]}. Give two different files.")
+
+
+@contextmanager
+def json_events(wanted: bool) -> Iterator[Sink]:
+    """The sink for JSON on stdout, idle unless `wanted`. An error in the block becomes the event `failed`."""
+    if not wanted:
+        yield fan_out()
+        return
+    lines = JsonLines(sys.stdout)
+    last: list[Event] = []
+    try:
+        yield fan_out(last.append, lines)
+    except (Exit, ClickException):
+        raise
+    except (Exception, KeyboardInterrupt) as error:
+        if not (last and last[-1].event in ("done", "failed")):
+            lines(Failed(user_message(error), exit_code(error), time=SystemClock().now()))
+        raise
+
+
+def say(line: str) -> None:
+    """A line with the time of day, on stderr."""
+    click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import json_events
 from beamline.cli.log import LogLines, logged
 from beamline.cli.method_options import (
     SETTINGS,
@@ -24,7 +23,16 @@ from beamline.cli.method_options import (
     resumes_slabs,
 )
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
-from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, json_option, parsed, refuse_shared, volume_path
+from beamline.cli.options import (
+    NOT_NEGATIVE,
+    POSITIVE,
+    SEED,
+    json_events,
+    json_option,
+    parsed,
+    refuse_shared,
+    volume_path,
+)
 from beamline.cli.recipe import config_option, recipe_text, repeating
 from beamline.cli.recon_time import reconstruct_in_time, refuse_others, time_options
 from beamline.cli.selection_options import chosen, selection_options, steps_said

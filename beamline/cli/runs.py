@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from beamline.cli.json_output import json_events
+from beamline.cli.options import json_events
 from beamline.cli.watch import bind_option, port_option, serve_shown
 from beamline.core.errors import ConfigError
 from beamline.core.events import Done

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_option
+from beamline.cli.options import NOT_NEGATIVE, POSITIVE, SEED, FiniteRange, json_events, json_option
 from beamline.cli.recipe import Repeatable, repeating
 from beamline.core.errors import ConfigError
 from beamline.core.events import Done

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import json_option
+from beamline.cli.options import json_events, json_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import CostExplained, Done, Event, Sink

@@ -14,7 +14,7 @@ from typing import Self, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from beamline.cli.json_output import json_events
+from beamline.cli.options import json_events
 from beamline.core.events import (
     Counted,
     Done,

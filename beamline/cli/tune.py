@@ -1,4 +1,4 @@
-"""`beamline tune`: takes a few frames and says which exposure to take."""
+"""`beamline tune`, `align`: a few frames before a scan say which exposure to take, and where the axis is."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import FiniteRange, config_argument, json_option, set_option
+from beamline.cli.options import FiniteRange, config_argument, json_events, json_option, set_option
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import QualityError
 from beamline.core.events import Done, Sink
@@ -80,3 +79,23 @@ def evaluated(
     if not as_json:
         click.echo("\n".join(found.lines()))
     return found
+
+
+@click.command()
+@config_argument
+@click.option(
+    "--angle", type=FiniteRange(), help="Angle of the first view, degrees. Default: the first one of the scan."
+)
+@set_option
+@json_option
+def align(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Take a pair of views half a turn apart, and say axis, tilt and sharpness, with the correction of each.
+
+    The shutter opens, the sample goes out and back, the stage turns to both angles and back. Mend what is said, and
+    call it again. Nothing is written.
+
+    Exit code: 0 done, 2 wrong configuration, 3 a device failed, 4 stopped, 6 the views show no axis.
+    """
+    from beamline.scan.align import align as align_views
+
+    evaluated(file, overrides, as_json, align_views, angle)

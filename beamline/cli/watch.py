@@ -9,12 +9,12 @@ import time
 import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import click
 
+from beamline.cli.options import say
 from beamline.core.events import Event, RunStarted
 from beamline.core.files import RUNS
 from beamline.core.process import ChildProcess
@@ -56,7 +56,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
 
     reader = Reader(watched(path or newest(Path(RUNS))))
     try:
-        server = start(lambda access: page(reader, access, _log), open_port(bind, port), control=control)
+        server = start(lambda access: page(reader, access, say), open_port(bind, port), control=control)
         click.echo("Ctrl-C ends the page, not the scan.", err=True)
         if tethered:
             threading.Thread(target=_end_with_stdin, args=(server,), daemon=True).start()
@@ -118,7 +118,3 @@ def _end_with_stdin(server: PageServer) -> None:
     server.stop()
     time.sleep(ENDS_WITHIN)
     os._exit(0)
-
-
-def _log(line: str) -> None:
-    click.echo(f"{datetime.now():%H:%M:%S}  {line}", err=True)

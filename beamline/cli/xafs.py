@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.json_output import json_events
-from beamline.cli.options import POSITIVE, SEED, FiniteRange, parsed, refuse_shared, volume_path
+from beamline.cli.options import POSITIVE, SEED, FiniteRange, json_events, parsed, refuse_shared, volume_path
 from beamline.cli.scan_options import underscored
 from beamline.cli.terminal import Terminal, counting, events_shown
 from beamline.cli.xafs_curves import CurveJob, CurveOptions, run_job

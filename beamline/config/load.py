@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from beamline.config.checks import faults
+from beamline.config.devices import DcamOrca
 from beamline.config.errors import explain
 from beamline.config.models import Config as Config
 from beamline.config.models import (
@@ -29,9 +29,10 @@ from beamline.config.tree import Tree, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
 from beamline.core.shipped import config_folder as config_folder
-from beamline.core.version import version
+from beamline.core.shipped import version
 from beamline.plan import angles
-from beamline.plan.plan import FieldPlan, ScanPlan
+from beamline.plan.plan import FieldPlan, Mode, ScanPlan
+from drivers.base.protocols import CameraSettings, TriggerSource
 
 
 def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> Config:
@@ -218,3 +219,70 @@ def _group(data: Any, *path: str) -> dict[str, Any] | None:
     for name in path[:-1]:
         data = data.get(name) if isinstance(data, dict) else None
     return data if isinstance(data, dict) and isinstance(data.get(path[-1]), str) else None
+
+
+def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Key path and sentence of each fault; `shipped`: folder of the configurations that come with the package."""
+    yield from _files(config, shipped)
+    yield from _camera(config)
+    yield from _triggers(config)
+
+
+def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
+    angles, simulation = config.scan.angles, config.simulation
+    if isinstance(angles, FileAngles) and not Path(angles.path).is_file():
+        yield (
+            ("scan", "angles", "path"),
+            f"scan.angles.path: there is no file {angles.path}; expected one angle in degrees a line",
+        )
+    if simulation is None or not isinstance(simulation.scene, str):
+        return
+    if not (shipped / simulation.scene).is_file():
+        scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
+        yield (
+            ("simulation", "scene"),
+            f"simulation.scene: there is no file {simulation.scene}; expected one beside this file, or {scenes}",
+        )
+
+
+_ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigger_active": ("edge", "level")}
+
+
+def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
+    camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
+    if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
+        return
+    for key, fit in _ONE_FRAME_A_PULSE.items():
+        if (value := getattr(camera, key)) not in fit:
+            yield (
+                ("devices", "camera", key),
+                f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; expected "
+                f"{' | '.join(map(str, fit))}, or scan.mode: step",
+            )
+    width = stage.settings.wiring.pulse_width
+    if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
+        yield (
+            ("devices", "camera", "trigger_active"),
+            f"devices.camera.trigger_active level exposes while the pulse lasts; set devices.stage.pulse_width_s "
+            f"({width}) to scan.exposure_s ({scan.exposure_s:g}), or trigger_active: edge",
+        )
+
+
+def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
+    """The configured region, binning and readout with an exposure (s) and a trigger source."""
+    camera = config.devices.camera
+    return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
+
+
+def _camera(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
+    camera = config.devices.camera
+    settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
+    try:
+        timing = camera.timing_of(settings)
+    except ValueError as error:
+        yield ("devices", "camera"), f"devices.camera: {error}"
+        return
+    axis, last = config.recon.axis, timing.shape[1] - 1
+    if isinstance(axis, float) and not -0.5 <= axis <= last + 0.5:
+        yield ("recon", "axis"), f"recon.axis {axis:g} lies outside the frame's columns 0 ... {last}"

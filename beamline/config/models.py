@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, PositiveFloat, model_validator
 
 from beamline.config.devices import DeviceSection
-from beamline.config.monitor import MonitorSection
+from beamline.config.monitor import MonitorSection, ReferencesSection
 from beamline.config.monochromator import Kev, NoMonochromator
-from beamline.config.references import ReferencesSection
 from beamline.config.section import Section
 from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
@@ -33,13 +32,19 @@ Views = Annotated[int, Field(gt=0, le=1_000_000)]
 Degrees = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-class FixedAngles(Section):
-    """Equal steps from start_deg over span_deg; the end itself is excluded (180 views over 180 deg: 0 ... 179)."""
+class _Span(Section):
+    """The keys that most schemes share."""
 
-    scheme: Literal["fixed"]
+    scheme: str
     views: Views
     start_deg: Degrees = 0.0
     span_deg: Degrees = 180.0
+
+
+class FixedAngles(_Span):
+    """Equal steps from start_deg over span_deg; the end itself is excluded (180 views over 180 deg: 0 ... 179)."""
+
+    scheme: Literal["fixed"]
 
 
 class SectorAngles(Section):
@@ -51,33 +56,24 @@ class SectorAngles(Section):
     last_deg: Degrees
 
 
-class RandomAngles(Section):
+class RandomAngles(_Span):
     """Uniformly random over span_deg, sorted; step scans only."""
 
     scheme: Literal["random"]
-    views: Views
-    start_deg: Degrees = 0.0
-    span_deg: Degrees = 180.0
     seed: int = 0
 
 
-class InterlacedAngles(Section):
+class InterlacedAngles(_Span):
     """The fixed angles taken in several passes, each pass in the gaps that the earlier ones left."""
 
     scheme: Literal["interlaced"]
-    views: Views
     passes: Views
-    start_deg: Degrees = 0.0
-    span_deg: Degrees = 180.0
 
 
-class GoldenAngles(Section):
+class GoldenAngles(_Span):
     """Golden-ratio steps modulo span_deg: well spread after any number of views; step scans only."""
 
     scheme: Literal["golden"]
-    views: Views
-    start_deg: Degrees = 0.0
-    span_deg: Degrees = 180.0
 
 
 class FileAngles(Section):

@@ -1,20 +1,21 @@
-"""Section `monitor` of the configuration: effects of alarms, and the limits of every check in the registry.
+"""Sections `monitor` and `references` of the configuration: effects of alarms and faults, and limits.
 
-The keys `monitor.<check>.<limit>` are derived from the fields of the checks: a check that enters the registry can be
-configured without an edit here.
+The keys of limits are the fields of the checks in the registry, and of `ReferenceLimits`. A check that enters the
+registry can be configured without an edit here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 from pydantic import Field
 
 from beamline.config.section import Section, section_of
 from beamline.monitor.check import Check, Policy
 from beamline.monitor.checks import CHECKS
+from beamline.monitor.references import ReferenceLimits
 
 
 class MonitorBase(Section):
@@ -28,11 +29,14 @@ class MonitorBase(Section):
     """Share of the views that are taken again at most."""
 
 
+def _keys(limits: type[Any]) -> dict[str, Any]:
+    types = get_type_hints(limits, include_extras=True)
+    return {limit.name: (types[limit.name], limit.default) for limit in fields(limits)}
+
+
 def _limits_of(check: Check) -> Any:
     """The section with the limits of a check, and its default, as `section_of` takes a key."""
-    types = get_type_hints(type(check), include_extras=True)
-    keys: dict[str, Any] = {limit.name: (types[limit.name], limit.default) for limit in fields(check)}
-    section = section_of(f"{type(check).__name__}Limits", Section, keys, f"Flag: {check.meaning}.")
+    section = section_of(f"{type(check).__name__}Limits", Section, _keys(type(check)), f"Flag: {check.meaning}.")
     return section, section()
 
 
@@ -47,8 +51,7 @@ if TYPE_CHECKING:
     MonitorSection = MonitorBase
 else:
     _LIMITS = {check.name: _limits_of(check) for check in CHECKS if fields(check)}
-    _KEYS = {"policy": _policies(), **_LIMITS}
-    MonitorSection = section_of("MonitorSection", MonitorBase, _KEYS, "Section `monitor`.")
+    MonitorSection = section_of("MonitorSection", MonitorBase, {"policy": _policies(), **_LIMITS}, "Section `monitor`.")
 
 
 def configured_checks(monitor: MonitorBase) -> tuple[Check, ...]:
@@ -60,3 +63,21 @@ def policies(monitor: MonitorBase) -> Mapping[str, Policy]:
     """What alarms of each check do to a scan, by the check's name."""
     section: Section = monitor.policy  # type: ignore[attr-defined]  # made above, from the registry
     return {name: Policy(policy) for name, policy in section}
+
+
+class ReferencesBase(Section):
+    """The keys that are not limits."""
+
+    on_fault: Literal["stop", "log"] = "stop"
+    """Darks or flats with a fault stop the scan before its first projection, or the fault is logged."""
+
+
+if TYPE_CHECKING:
+    ReferencesSection = ReferencesBase
+else:
+    ReferencesSection = section_of("ReferencesSection", ReferencesBase, _keys(ReferenceLimits), "Section `references`.")
+
+
+def reference_limits(section: ReferencesBase) -> ReferenceLimits:
+    """The limits that the configuration gives."""
+    return ReferenceLimits(**{limit.name: getattr(section, limit.name) for limit in fields(ReferenceLimits)})

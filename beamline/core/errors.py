@@ -10,7 +10,7 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 
-from beamline.core.version import version
+from beamline.core.shipped import version
 from drivers.base.errors import DeviceError
 
 

@@ -1,7 +1,8 @@
-"""Configurations and scenes that come with the package."""
+"""What is installed: the version, and configurations and scenes that come with the package."""
 
 from __future__ import annotations
 
+from importlib import metadata
 from pathlib import Path
 
 
@@ -14,3 +15,11 @@ def config_folder() -> Path:
 def shipped_scenes() -> dict[str, Path]:
     """The scenes that come with the package, by name."""
     return {path.stem: path for path in sorted((config_folder() / "scenes").glob("*.yaml"))}
+
+
+def version() -> str:
+    """The installed distribution's version; "uninstalled" when run from a bare checkout."""
+    try:
+        return metadata.version("splatline")
+    except metadata.PackageNotFoundError:
+        return "uninstalled"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 from beamline.config.devices import DcamOrca, EpicsShutter, NoBeamMonitor, SimulatedOrca, StageOutputShutter
-from beamline.config.load import Config
+from beamline.config.load import Config, camera_settings
 from beamline.config.monochromator import EpicsMonochromator, NoMonochromator
 from beamline.config.places import EpicsFilter, MotorFilter, NoFilter, StageMover
 from beamline.core.errors import ConfigError
@@ -23,7 +23,6 @@ from drivers.base.clock import Clock, SystemClock
 from drivers.base.protocols import (
     BeamMonitor,
     Camera,
-    CameraSettings,
     CameraTiming,
     Devices,
     Filter,
@@ -155,12 +154,6 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     return limits, timing, Travel("stage", limits).to_counts
 
 
-def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> CameraSettings:
-    """The configured region, binning and readout with an exposure (s) and a trigger source."""
-    camera = config.devices.camera
-    return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
-
-
 def _instrument(
     config: Config, clock: Clock, ask: Ask, check_stop: Callable[[], None], opened: ExitStack, memory: FrameMemory
 ) -> Devices:
@@ -186,24 +179,20 @@ def _instrument(
 
 def _filter(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Filter | None:
     wanted = config.devices.filter
-    if isinstance(wanted, NoFilter):
-        return None
-    if not isinstance(wanted, MotorFilter | EpicsFilter):
-        return ManualFilter(ask)
-    found = wanted.connect(clock)
-    opened.callback(found.close)
-    return found
+    if isinstance(wanted, MotorFilter | EpicsFilter):
+        found = wanted.connect(clock)
+        opened.callback(found.close)
+        return found
+    return None if isinstance(wanted, NoFilter) else ManualFilter(ask)
 
 
 def _monochromator(config: Config, clock: Clock, ask: Ask, opened: ExitStack) -> Monochromator | None:
     wanted = config.devices.monochromator
-    if isinstance(wanted, NoMonochromator):
-        return None
-    if not isinstance(wanted, EpicsMonochromator):
-        return ManualMonochromator(ask)
-    found = wanted.connect(clock)
-    opened.callback(found.close)
-    return found
+    if isinstance(wanted, EpicsMonochromator):
+        found = wanted.connect(clock)
+        opened.callback(found.close)
+        return found
+    return None if isinstance(wanted, NoMonochromator) else ManualMonochromator(ask)
 
 
 def shutter_of(config: Config, stage: RotationStage, clock: Clock, ask: Ask) -> Shutter:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.projections.steps.air import Surface
 from recon.base.arrays import F32, F64, Mask
-from recon.base.binning import bin_views
+from recon.base.binning import bin_views, factor_within
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import noise_level
@@ -30,7 +30,7 @@ _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
 
 def background_memory(geometry: Geometry) -> int:
     """Most bytes that `without_background` takes beside such views, about."""
-    small = geometry.binned(_factor(geometry.detector_shape))
+    small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))
     n, pixels, grid = geometry.n_views, math.prod(small.detector_shape), Grid.matching(small)
     some = min(n, _VIEWS)
     fit = 8 * (_TERMS * pixels + _SUMS * n)
@@ -38,18 +38,12 @@ def background_memory(geometry: Geometry) -> int:
     return fit + volume + 4 * (4 * some + 3 * min(n, _AT_ONCE)) * pixels + 16 * math.prod(geometry.detector_shape)
 
 
-def _factor(shape: tuple[int, int]) -> int:
-    """By which views are binned, so that a volume of them has few voxels."""
-    rows, cols = shape
-    return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= _VOXELS), rows)
-
-
 class _Views:
     """Line integrals [view, row, col] with their geometry, which are taken binned and finite, so many at a time."""
 
     def __init__(self, data: F32, geometry: Geometry, unknown: Mask | None) -> None:
         self.data, (rows, cols) = data, geometry.detector_shape
-        self.factor = _factor((rows, cols))
+        self.factor = factor_within((rows, cols), _VOXELS)
         filled = np.zeros((1, rows, cols), np.float32) if unknown is None else unknown[None].astype(np.float32)
         self._measured = bin_views(filled, self.factor)[0] == 0
         self.geometry = geometry.binned(self.factor)

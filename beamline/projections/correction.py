@@ -212,8 +212,8 @@ class ScanCorrection:
 
     def _no_view(self) -> DataError:
         return DataError(
-            f"{self._source.path}: none of the views chosen can be used: their pixels are not finite, or not those "
-            "that were written."
+            f"{self._source.path}: no chosen view can be used. Their pixels are not finite, or differ from their "
+            "checksums."
         )
 
     def _look_for_shadow(self, views: NDArray[np.int64]) -> None:

@@ -29,7 +29,6 @@ COMMAND = (sys.executable, "-m", "beamline.cli.recon_worker")
 """The worker, which reconstructs scan after scan: libraries are loaded and kernels compiled once."""
 _POLL = 0.2  # real s between two checks of the worker
 _SILENCE = 1800.0  # real s without an event of a scan, after which it is taken to hang
-_OURS = ("done", "failed")  # events of a scan that make its row
 
 
 @dataclass(frozen=True)

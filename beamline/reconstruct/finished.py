@@ -206,6 +206,10 @@ class _Job:
         grid = Grid.matching(self.prepared.geometry)
         return self.region.grid_of(grid) if self.region is not None and self.options.method.traits.direct else grid
 
+    def say(self, text: str) -> None:
+        """Tell what a slab has come to."""
+        self.sink(StateEntered("slab", text, time=self.clock.now()))
+
     def listener(self, seconds: float | None = None) -> Callable[[Progress], None]:
         return progress_events(self.sink, self.clock, seconds)
 
@@ -285,13 +289,10 @@ def _with_error_bars(job: _Job, made: ReconOutcome, slabs: Sequence[Slab], decid
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now)
     given = made.volume, method, job.prepared, job.options
 
-    def say(text: str) -> None:
-        job.sink(StateEntered("slab", text, time=job.clock.now()))
-
     why = "as they were stopped"
     try:
         if slabs:
-            found = deviation_by_slabs(*given, slabs, decided.made, control, say)
+            found = deviation_by_slabs(*given, slabs, decided.made, control, job.say)
         else:
             found = deviation_of(*given, decided.made, control)
     except ValueError as error:  # hours may be in the volume
@@ -350,14 +351,11 @@ def _by_slabs(job: _Job, slabs: Sequence[Slab], decided: Decisions) -> ReconOutc
     options = replace(job.options, method=job.options.method_for(job.prepared.geometry))
     control = RunControl(job.stop_latch, job.listener(), now=job.clock.now, decide=decided)
 
-    def say(text: str) -> None:
-        job.sink(StateEntered("slab", text, time=job.clock.now()))
-
     with connected(options.cluster) if options.cluster is not None else nullcontext() as cluster:
         workers = None
         if cluster is not None:
             workers = SlabWorkers(cluster.workers, partial(job.run_on, reconstruct=cluster.reconstruct))
-        result = in_slabs(job.run_on, job.prepared, options, slabs, control, say, job.warn, workers)
+        result = in_slabs(job.run_on, job.prepared, options, slabs, control, job.say, job.warn, workers)
     return job.outcome(result, job.stop_latch.stopped, _chosen(result))
 
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from beamline.core.errors import DataError, ScanStopped
 from beamline.core.files import remove
+from beamline.core.shipped import version
 from beamline.core.sinks import Warn
-from beamline.core.version import version
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other
 from beamline.reconstruct.options import ReconOptions

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from beamline.core.errors import DataError
 from beamline.core.events import Sink, SnapshotWritten
 from beamline.core.files import write_whole
 from beamline.core.sinks import Warnings
 from beamline.reconstruct.options import ReconOptions
-from beamline.report.live_picture import LivePicture
+from beamline.report.figures import GreyWindow, bright_centre, grey_window, png, round_length
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
 from drivers.base.clock import Clock
+from recon.base.arrays import F32
+from recon.base.noise import noise_level
 from recon.base.volume import Volume
 from recon.splatting.stream import StreamingFit
 
@@ -68,3 +77,134 @@ class Snapshots:
         )
         picture = LivePicture(volume, *fit.newest_view(), title, self._unit)
         write_whole(self.picture_path, picture.png(), replace=True)
+
+
+_DPI, _GAP, _LINE = 100, 14, 15  # pixels: between panels, a line of text
+_SIDE = 256  # pixels: the longest side of an image is so long, to twice that; a label takes as much room
+_SIGMAS = 5.0  # range of the differences
+_DIFFERENCES = LinearSegmentedColormap.from_list("differences", ["tab:blue", "white", "tab:red"])
+
+
+@dataclass(frozen=True, eq=False)
+class LivePicture:
+    """What a picture shows.
+
+    Attributes:
+        volume: so far, 1/unit.
+        view, render: the newest view [row, col] and the same view of the volume, line integrals.
+        title: of the whole, one line.
+        unit: of length, "mm" or "px".
+    """
+
+    volume: Volume
+    view: F32
+    render: F32
+    title: str
+    unit: str
+
+    def png(self) -> bytes:
+        """The picture. Without axes and layout, which would take ten times as long: it is drawn beside a fit."""
+        rows = (self._slices(), self._views())
+        across = max(_SIDE, *(panel.pixels.shape[1] for row in rows for panel in row)) + _GAP
+        tall = [max(panel.pixels.shape[0] for panel in row) for row in rows]
+        width, height = 3 * across + _GAP, sum(tall) + 2 * (2 * _LINE + _GAP) + 2 * _LINE + _GAP
+        figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+        top = height - 2 * _LINE
+        figure.text(_GAP / width, (top + 0.4 * _LINE) / height, self.title, fontsize=9, weight="bold")
+        for row, pixels in zip(rows, tall, strict=True):
+            for k, panel in enumerate(row):
+                panel.draw(figure, _GAP + k * across, top - _GAP)
+            top -= _GAP + 2 * _LINE + pixels
+        return png(figure, compression=1)
+
+    def _slices(self) -> list[_Panel]:
+        grid, data = self.volume.grid, self.volume.data
+        k, j, i = (1 + n // 100 for n in data.shape)  # the middle of what is bright need not be known to a voxel
+        z, y, x = np.multiply((k, j, i), bright_centre(data[::k, ::j, ::i])).tolist()
+        at = [axis[i] for axis, i in zip(grid.coordinates(), (z, y, x), strict=True)]
+        images = (data[z], data[:, y], data[:, :, x])
+        window = grey_window(images)
+        grey = f"{window[0]:.3g} to {window[1]:.3g} 1/{self.unit}"
+        labels = (
+            f"x → y ↓ at z = {at[0]:.3g} {self.unit}",
+            f"x → z ↓ at y = {at[1]:.3g}",
+            f"y → z ↓ at x = {at[2]:.3g}",
+        )
+        notes = (grey, "the same greys and scale", "the same greys and scale")
+        pixels, zoom = _sized(images)
+        bar = grid.voxel_size / zoom, self.unit
+        return [
+            _Panel(image, "gray", window, label, note, None if k else bar)
+            for k, (image, label, note) in enumerate(zip(pixels, labels, notes, strict=True))
+        ]
+
+    def _views(self) -> list[_Panel]:
+        window = grey_window([self.view], 0.5, 99.5)
+        noise = noise_level(self.view[None]) or 0.01 * (window[1] - window[0])
+        left = (self.view - self.render) / np.float32(noise)
+        greys = f"line integral {window[0]:.3g} to {window[1]:.3g}"
+        spread = f"white 0, red {_SIGMAS:g}, blue -{_SIGMAS:g}; RMS {math.sqrt(float(np.mean(left**2))):.2f}"
+        (view, render, left), _ = _sized((self.view, self.render, left))
+        return [
+            _Panel(view, "gray", window, "newest view, u → z ↓", greys),
+            _Panel(render, "gray", window, "the volume seen from there", "the same greys"),
+            _Panel(left, _DIFFERENCES, (-_SIGMAS, _SIGMAS), "difference in noise of a pixel", spread),
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Panel:
+    """An image, row 0 at the top, below two lines of text.
+
+    Attributes:
+        pixels: of the screen [row, col].
+        colours, limits: colour map, and the values at its ends.
+        label, note: the two lines.
+        bar: width of a pixel and its unit, for a bar of a round length; None: no bar.
+    """
+
+    pixels: F32
+    colours: str | LinearSegmentedColormap
+    limits: GreyWindow
+    label: str
+    note: str
+    bar: tuple[float, str] | None = None
+
+    def draw(self, figure: Figure, left: int, top: int) -> None:
+        """Draw it so many pixels from the left and the bottom of the figure, which is where its text begins."""
+        width, height = figure.get_size_inches() * _DPI
+        for line, (text, colour) in enumerate(((self.label, "black"), (self.note, "0.35")), 1):
+            figure.text(left / width, (top + 4 - line * _LINE) / height, text, fontsize=8, color=colour)
+        bottom = top - 2 * _LINE - self.pixels.shape[0]
+        low, high = self.limits
+        figure.figimage(self.pixels, left, bottom, cmap=self.colours, vmin=low, vmax=high, origin="upper")
+        if self.bar is not None:
+            self._scale(figure, left + 6, bottom + 6, *self.bar)
+
+    def _scale(self, figure: Figure, x: int, y: int, pixel: float, unit: str) -> None:
+        """A bar of a round length, at most a third of the image."""
+        length = round_length(pixel * self.pixels.shape[1] / 3)
+        bar = Line2D([x, x + length / pixel], [y, y], color="tab:orange", lw=3, transform=None, solid_capstyle="butt")
+        figure.add_artist(bar)
+        width, height = figure.get_size_inches() * _DPI
+        text = f"{length:g} {unit}"
+        figure.text(x / width, (y + 6) / height, text, fontsize=8, color="tab:orange", weight="bold")
+
+
+def _sized(images: Sequence[F32]) -> tuple[list[F32], float]:
+    """The images with pixels repeated, or means of several, so that the longest side is _SIDE pixels or more, less than
+    twice as many. Then how many pixels one became."""
+    longest = max(max(image.shape) for image in images)
+    if longest < _SIDE:
+        factor = math.ceil(_SIDE / longest)
+        return [np.repeat(np.repeat(image, factor, 0), factor, 1) for image in images], factor
+    step = longest // _SIDE
+    return [_means(image, step) for image in images], 1 / step
+
+
+def _means(image: F32, step: int) -> F32:
+    """Means of step x step pixels, or of as many as there are; what is left over at the ends is left out."""
+    rows, cols = (max(1, n // step) for n in image.shape)
+    each = min(step, image.shape[0]), min(step, image.shape[1])
+    cut = image[: rows * each[0], : cols * each[1]]
+    return cut.reshape(rows, each[0], cols, each[1]).mean(axis=(1, 3))

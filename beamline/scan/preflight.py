@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamline.config.devices import NoBeamMonitor
-from beamline.config.load import Config, at_energies, plan_of, resolved_yaml
+from beamline.config.load import Config, at_energies, camera_settings, plan_of, resolved_yaml
 from beamline.config.monitor import configured_checks
 from beamline.core.errors import ConfigError
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.instrument import connect
-from beamline.instrument.connect import ConnectedDevices, camera_settings
+from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.watch import Monitor, usual_step

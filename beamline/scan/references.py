@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from beamline.config.references import ReferencesSection, reference_limits
+from beamline.config.monitor import ReferencesSection, reference_limits
 from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
 from beamline.monitor.digest import FrameDigest
@@ -51,7 +51,7 @@ class ReferenceLog:
             planned: blocks that are over by now; references without any frame are missing.
         """
         missing = {
-            block.kind.name: f"None of the {block.n} {block.kind.name.lower()}s planned before the views came."
+            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the views did not come."
             for block in planned
             if block.kind in REFERENCES and not any(group[0].kind is block.kind for group in self._groups)
         }

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.config.load import Config, plan_of
-from beamline.config.references import reference_limits
+from beamline.config.load import Config, camera_settings, plan_of
+from beamline.config.monitor import reference_limits
 from beamline.core.errors import InstrumentError
 from beamline.core.events import Sink
 from beamline.core.stop import StopRequest
 from beamline.core.text import degrees, rounded
-from beamline.instrument.connect import ConnectedDevices, camera_settings
+from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.digest import digest
 from beamline.monitor.references import FaultKind, ReferenceFrame, ReferenceLimits, judge
 from beamline.plan.plan import Block, Mode, ScanPlan, Timeline

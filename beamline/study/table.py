@@ -15,7 +15,7 @@ import numpy as np
 
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
-from beamline.core.version import version
+from beamline.core.shipped import version
 from beamline.projections.scan_statistics import Light
 from beamline.study.studies import Study, StudyRow
 from beamline.tradeoff.report import finite

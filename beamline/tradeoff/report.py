@@ -14,7 +14,7 @@ from typing import Any
 
 from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
-from beamline.core.version import version
+from beamline.core.shipped import version
 from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
 from beamline.report.slice_sheet import SliceSheet

@@ -1,4 +1,4 @@
-"""bin_views: binning of projections by a factor; `Geometry.binned` gives their geometry."""
+"""Binning of projections by a factor, and the factor; `Geometry.binned` gives their geometry."""
 
 from __future__ import annotations
 
@@ -23,3 +23,9 @@ def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float
     rows, cols = rows // factor, cols // factor
     whole = projections[:, : rows * factor, : cols * factor]
     return whole.reshape(n, rows, factor, cols, factor).mean(axis=(2, 4), dtype=np.float32)
+
+
+def factor_within(shape: tuple[int, int], voxels: int) -> int:
+    """The factor by which views [row, col] are binned, so that a volume of them has at most so many voxels."""
+    rows, cols = shape
+    return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= voxels), rows)

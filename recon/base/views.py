@@ -76,8 +76,7 @@ def _sector(
     if not inside.size:
         degrees = np.rad2deg(theta)
         raise ValueError(
-            f"{spec!r} holds none of the {theta.size} views, which lie at "
-            f"{degrees.min():.2f} to {degrees.max():.2f} degrees"
+            f"{spec!r} holds no view; the {theta.size} views lie at {degrees.min():.2f} to {degrees.max():.2f} degrees"
         )
     if count is None:
         return inside

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from recon.base.arrays import F32, F64, Mask
-from recon.base.binning import bin_views
+from recon.base.binning import bin_views, factor_within
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -125,17 +125,12 @@ def learn_background(
 
 def background_memory(geometry: Geometry) -> int:
     """Most bytes that `learn_background` takes beside the views, about."""
-    small = geometry.select(slice(min(geometry.n_views, _VIEWS))).binned(_factor(geometry.detector_shape))
+    factor = factor_within(geometry.detector_shape, _VOXELS)
+    small = geometry.select(slice(min(geometry.n_views, _VIEWS))).binned(factor)
     rays = small.n_views * math.prod(small.detector_shape)
     voxels = math.prod(Grid.for_fit(small, Grid.matching(small), wider=True).shape)
     pixels = math.prod(geometry.detector_shape)
     return 4 * ((9 * len(TERMS) + 16) * rays + 12 * voxels + 6 * pixels)
-
-
-def _factor(shape: tuple[int, int]) -> int:
-    """By which views are binned, so that a volume of them has few voxels."""
-    rows, cols = shape
-    return next((f for f in range(1, rows + 1) if (rows // f) * (cols // f) ** 2 <= _VOXELS), rows)
 
 
 def _surface(coefficients: F64, time: float, shape: tuple[int, int], factor: int = 1) -> F32:
@@ -166,7 +161,8 @@ class _Views:
     @classmethod
     def of(cls, projections: F32, geometry: Geometry, times: F64, measured: Mask | None) -> _Views:
         shape, n = geometry.detector_shape, geometry.n_views
-        factor, some = _factor(shape), np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(np.intp))
+        factor = factor_within(shape, _VOXELS)
+        some = np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(np.intp))
         data = np.concatenate([bin_views(projections[k : k + 1], factor) for k in some])
         views, weight = geometry.select(some).binned(factor), None
         if measured is not None and not measured.all():

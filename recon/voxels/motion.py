@@ -101,7 +101,7 @@ def descent(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) -
         left = part.data - part.projector.forward_lines(moved(x, u))
         slope.append(np.empty_like(u))
         slopes(x, u, slope[-1])
-        right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(_weighted(left, part)))
+        right += motion.back(part.time, slope[-1] * part.projector.adjoint_lines(weighed(left, part.weight)))
     return right, slope
 
 
@@ -117,7 +117,7 @@ def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) 
         out = np.zeros_like(control)
         for part, own in zip(seen, slope, strict=True):
             along = np.einsum("dyxz,dyxz->yxz", own, motion.at(part.time, control))
-            lines = _weighted(part.projector.forward_lines(along), part)
+            lines = weighed(part.projector.forward_lines(along), part.weight)
             out += motion.back(part.time, own * part.projector.adjoint_lines(lines))
         return out
 
@@ -131,8 +131,9 @@ def improved(motion: Motion, seen: Sequence[Seen], image: Callable[[int], F32]) 
     return Motion(motion.shape, motion.times, motion.control + step)
 
 
-def _weighted(lines: F32, part: Seen) -> F32:
-    return lines if part.weight is None else part.weight * lines
+def weighed(lines: F32, weight: F32 | None) -> F32:
+    """The lines by the weights of their rays, if they have some."""
+    return lines if weight is None else weight * lines
 
 
 def _rough(control: F64) -> F64:

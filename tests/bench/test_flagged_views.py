@@ -18,7 +18,7 @@ from click.testing import CliRunner
 import recon
 from beamline.cli.main import main
 from beamline.config.load import config_folder
-from beamline.projections import flag_regions, flags
+from beamline.projections import flags
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
 from beamline.projections.steps.flags import Flags
@@ -94,7 +94,7 @@ def test_what_regions_of_flags_are_worth(tmp_path: Path, seed: int) -> None:
         path = scan(tmp_path, fault, seed)
         found = {"ignore": psnr(path, truth, every)}
         for name, (largest, share, weight) in WAYS.items():
-            of_regions = patch.object(treatment, "LARGEST", largest), patch.object(flag_regions, "WARNED_SHARE", share)
+            of_regions = patch.object(treatment, "LARGEST", largest), patch.object(flags, "WARNED_SHARE", share)
             with of_regions[0], of_regions[1], patch.object(flags, "WARNED_WEIGHT", weight):
                 found[name] = psnr(path, truth, judged)
         print(f"seed {seed}, {fault}: " + ", ".join(f"{name} {value:.2f}" for name, value in found.items()), flush=True)

@@ -18,11 +18,10 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource
 from beamline.storage.readers.overlay import OverlaidSource
-from beamline.storage.readers.parts_source import PartsSource
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeriesSource
-from beamline.storage.readers.wrapped import CroppedSource
+from beamline.storage.readers.wrapped import CroppedSource, PartsSource
 from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 

@@ -1,8 +1,8 @@
-"""WrappedSource: a scan that reads another one; a subclass changes what differs, as CroppedSource the columns."""
+"""WrappedSource: a scan that reads others; a subclass changes what differs: columns, or frames of several files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from beamline.core.errors import ConfigError
-from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.readers.base import WHOLE, ScanSource
+from beamline.core.errors import ConfigError, DataError
+from beamline.storage.flag_legend import TODAY, FrameFlags
+from beamline.storage.readers.base import WHOLE, ScanSource, frame_indices
 from drivers.base.frame import Frame
 
 
@@ -75,12 +75,98 @@ class CroppedSource(WrappedSource):
         regions[..., 2:] -= np.where(regions[..., :1] < 0, 0, self._cols.start)  # below 0: no region
         return replace(flags, regions=regions)
 
-    @property
-    def shifts(self) -> NDArray[np.float64] | None:
-        return self._base.shifts
-
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         return self._base.read(frames, rows)[..., self._cols]
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
         return (replace(frame, counts=frame.counts[:, self._cols]) for frame in self._base.frames(first))
+
+
+class PartsSource(WrappedSource):
+    """A ScanSource of the frames of `earlier`, which have ended, and then of `last`, whose path and facts it has.
+
+    Row numbers, such as the row that a frame replaces, count from the first frame of all files.
+    """
+
+    def __init__(self, earlier: Sequence[ScanSource], last: ScanSource) -> None:
+        """Put them together; DataError where frames are of another shape or type. It closes all of them."""
+        self._sources = (*earlier, last)
+        for source in earlier:
+            if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
+                raise DataError(
+                    f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, {last.path} "
+                    f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
+                )
+        super().__init__(last)
+        self._earlier_flags = [_as_of_today(source) for source in earlier]
+        self._update()
+
+    def _update(self) -> None:
+        sources = self._sources
+        self._firsts = np.cumsum([0, *(source.image_key.size for source in sources)])
+        self.image_key = np.concatenate([source.image_key for source in sources])
+        self.angles = np.concatenate([source.angles for source in sources])
+        self.exposures = np.concatenate([source.exposures for source in sources])
+
+    @property
+    def flags(self) -> FrameFlags | None:
+        parts = [*self._earlier_flags, _as_of_today(self._sources[-1])]
+        bits = np.concatenate([part.bits for part in parts])
+        scores = [part.scores for part in parts if part.scores is not None]
+        regions = [part.regions for part in parts if part.regions is not None]
+        whole = len(scores) == len(regions) == len(parts)
+        return FrameFlags(bits, TODAY, *((np.concatenate(scores), np.concatenate(regions)) if whole else ()))
+
+    @property
+    def replaces(self) -> NDArray[np.int64] | None:
+        if all(source.replaces is None for source in self._sources):
+            return None
+        rows = []
+        for source, first in zip(self._sources, self._firsts[:-1], strict=True):
+            known = np.full(source.image_key.size, -1) if source.replaces is None else source.replaces
+            rows.append(np.where(known < 0, -1, known + first))
+        return np.concatenate(rows)
+
+    @property
+    def part_starts(self) -> NDArray[np.int64]:
+        return np.concatenate(
+            [s.part_starts + first for s, first in zip(self._sources, self._firsts[:-1], strict=True)]
+        )
+
+    @property
+    def checksummed(self) -> bool:
+        return all(source.checksummed for source in self._sources)
+
+    @property
+    def altered(self) -> frozenset[int]:
+        pairs = zip(self._sources, self._firsts[:-1], strict=True)
+        return frozenset(int(row + first) for source, first in pairs for row in source.altered)
+
+    @property
+    def damaged(self) -> frozenset[int]:
+        pairs = zip(self._sources, self._firsts[:-1], strict=True)
+        return frozenset(int(row + first) for source, first in pairs for row in source.damaged)
+
+    currents, shifts = ScanSource.currents, ScanSource.shifts  # not told of parts
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        indices = frame_indices(frames, self.image_key.size)
+        of = np.searchsorted(self._firsts, indices, "right") - 1
+        if indices.size and (of == of[0]).all():
+            return self._sources[of[0]].read(indices - self._firsts[of[0]], rows)
+        out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
+        for i in np.unique(of):
+            out[of == i] = self._sources[i].read(indices[of == i] - self._firsts[i], rows)
+        return out
+
+    def close(self) -> None:
+        for source in self._sources:
+            source.close()
+
+
+def _as_of_today(source: ScanSource) -> FrameFlags:
+    """Its flags by the legend of today; none where no monitor looked at it."""
+    flags, n = source.flags, source.image_key.size
+    if flags is not None and flags.legend == TODAY:
+        return flags
+    return FrameFlags(np.zeros(n, np.uint64), TODAY) if flags is None else flags.of_today()

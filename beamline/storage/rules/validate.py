@@ -28,7 +28,7 @@ from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_degrees
 
-__all__ = ["Finding", "reconstruction_blockers", "scan_findings", "source_findings", "validate"]
+__all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
@@ -81,11 +81,6 @@ def source_findings(source: ScanSource) -> list[Finding]:
 def scan_findings(source: ScanSource) -> list[Finding]:
     """What the rules of this module find in an open scan."""
     return [finding for rule in SOURCE_RULES for finding in rule(source)]
-
-
-def reconstruction_blockers(source: ScanSource) -> list[Finding]:
-    """Why this scan must not be reconstructed; [] if it may be."""
-    return [finding for finding in source_findings(source) if finding.severity == "error"]
 
 
 def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator[Finding]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
-from beamline.core.version import version
+from beamline.core.shipped import version
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
-from beamline.core.version import version
+from beamline.core.shipped import version
 from beamline.storage import hdf5
 from beamline.storage.structure import require_harmless
 from recon.base.volume import Grid, Volume

@@ -41,10 +41,9 @@ def _combine(alpha: float, a: F32, beta: float, b: F32, floor: float, out: F32) 
         out[i] = max(p * a[i] + q * b[i], low)
 
 
-def combine(alpha: float, a: F32, beta: float, b: F32, out: F32, nonnegative: bool = False) -> None:
-    """out = alpha a + beta b, negative values clipped with `nonnegative`; `out` may be `a` or `b`."""
-    floor = 0.0 if nonnegative else float(np.finfo(np.float32).min)
-    _combine(alpha, a.reshape(-1), beta, b.reshape(-1), floor, out.reshape(-1))
+def combine(alpha: float, a: F32, beta: float, b: F32, out: F32) -> None:
+    """out = alpha a + beta b; `out` may be `a` or `b`."""
+    _combine(alpha, a.reshape(-1), beta, b.reshape(-1), float(np.finfo(np.float32).min), out.reshape(-1))
 
 
 @njit(**OPTIONS)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from beamline.core.events import BeamRead, Event, FrameFlagged, FrameStored, RunStarted, ScanDone, StateEntered, Warned
-from beamline.epics.values import RunValues
+from beamline.epics.ioc import RunValues
 
 STARTED = RunStarted(Path("runs/a"), Path("runs/a/scan.h5"), "cathode", 20, 60.0, 1000, [])
 FRAME = FrameStored(5, 20, "projection", 2.5, 40.0, 6.0, 812.0)

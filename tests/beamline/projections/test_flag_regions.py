@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
-from beamline.projections.flag_regions import WARNED_SHARE, regions_of
+from beamline.projections.flags import WARNED_SHARE, regions_of
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections

@@ -9,7 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from beamline.report.live_picture import LivePicture
+from beamline.reconstruct.snapshots import LivePicture
 from recon.base.volume import Grid, Volume
 
 pytestmark = pytest.mark.usefixtures("real_pictures")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.config.load import config_folder, load
-from beamline.config.references import reference_limits
+from beamline.config.monitor import reference_limits
 from beamline.core.errors import ConfigError, ReferencesError
 from beamline.core.events import Event
 from beamline.monitor.digest import digest
@@ -33,7 +33,7 @@ from tests.beamline.ran import SMALL, Ran
     [
         (210, 200, Faults(), "The flats 3-4: there is no beam in them"),
         (20000, 15000, Faults(), "The darks 0-2: there is light in them"),
-        (20000, 200, Faults(lost={3, 4}), "None of the 2 flats planned before the views came"),
+        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the views did not come"),
     ],
 )
 def test_no_projection_is_taken_after_references_that_cannot_be_used(

@@ -280,7 +280,7 @@ class Scanned:
     def warnings(self) -> list[str]:
         """Without those on darks and flats, which show no beam here."""
         said = [event.data["message"] for event in self.events if event.event == "warning"]
-        return [message for message in said if not message.startswith(("The darks", "The flats", "None of the"))]
+        return [message for message in said if not re.match(r"The (\d+ )?(darks|flats)", message)]
 
     def of(self, name: str) -> list[Event]:
         return [event for event in self.events if event.event == name]

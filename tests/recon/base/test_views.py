@@ -137,5 +137,5 @@ def test_views_without_an_angle_are_named(spec: str) -> None:
 def test_sectors_without_extent_or_views_are_refused() -> None:
     with pytest.raises(ValueError, match="end after it begins"):
         parse_views("sector:50-30", HALF)
-    with pytest.raises(ValueError, match=r"none of the 180 views, which lie at 0\.00 to 179\.00"):
+    with pytest.raises(ValueError, match=r"holds no view; the 180 views lie at 0\.00 to 179\.00"):
         parse_views("sector:200-300", HALF)

@@ -9,8 +9,7 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.calibration.freedom import GeometryChange, knowable
-from recon.calibration.judge import better
-from recon.calibration.learn import LearntGeometry, learn_geometry
+from recon.calibration.learn import LearntGeometry, better, learn_geometry
 from tests.recon.calibration.bodies import balls
 
 VIEWS, SHAPE = 60, (24, 48)
