@@ -45,7 +45,7 @@ def test_the_maximum_is_that_of_a_general_optimiser() -> None:
     best = minimize(descent, np.full(a.shape[1], 10.0), jac=True, method="L-BFGS-B", bounds=[(0, None)] * a.shape[1],
                     options={"maxiter": 5000, "ftol": 1e-14, "gtol": 1e-9, "maxfun": 50000})  # fmt: skip
     reached = []
-    found = mlem(emission, grid, 3000, on_iteration=lambda n, likelihood: reached.append(likelihood))
+    found = mlem(emission, grid, 3000, on_iteration=lambda n, likelihood, residual: reached.append(likelihood))
     assert -best.fun - reached[-1] == pytest.approx(0, abs=0.02)  # of some 10⁴; the statistical unit is 0.5
     np.testing.assert_allclose(found.data.ravel(), best.x, atol=0.03 * best.x.max())
 
@@ -53,7 +53,7 @@ def test_the_maximum_is_that_of_a_general_optimiser() -> None:
 def test_each_iteration_raises_the_likelihood() -> None:
     emission, grid, _ = toy(1)
     reached: list[float] = []
-    mlem(emission, grid, 60, on_iteration=lambda n, likelihood: reached.append(likelihood))
+    mlem(emission, grid, 60, on_iteration=lambda n, likelihood, residual: reached.append(likelihood))
     assert (np.diff(reached) > -1e-3).all() and reached[20] > reached[0] + 10
 
 
@@ -143,7 +143,7 @@ def test_lines_of_few_counts_are_not_lowered_by_their_weights() -> None:
 def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
     emission, grid, _ = toy()
     calls: list[int] = []
-    mlem(emission, grid, 50, on_iteration=lambda n, _: calls.append(n) or n == 3)
+    mlem(emission, grid, 50, on_iteration=lambda n, *_: calls.append(n) or n == 3)
     assert calls == [1, 2, 3]
     with pytest.raises(ValueError, match="0 or more"):
         Emission(-emission.counts, emission.geometry)
