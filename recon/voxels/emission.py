@@ -89,9 +89,9 @@ def mlem(
     the projections of a subset.
 
     Args:
-        on_iteration: called with the number of each iteration, from 1, and of the volume before it L (up to a
-            constant) and ||counts - mean|| / ||counts||; with subsets each view at its turn. The iterations end if it
-            returns something true.
+        on_iteration: called with the number of each iteration, from 1, L (up to a constant), and
+            ||counts - mean|| / ||counts||. Both are of the volume before it; with subsets each view at its turn. The
+            iterations end if it returns something true.
 
     Returns:
         counts per mm of line, 0 or more; 0 where no line sees a voxel.

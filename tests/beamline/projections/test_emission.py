@@ -11,6 +11,9 @@ from click.testing import CliRunner, Result
 
 import recon
 from beamline.cli.main import main
+from beamline.core.errors import DataError
+from beamline.projections.prepare import Spill, prepare_projections
+from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan
 from simulators.scenes.emission import events, load_emission
 
@@ -79,7 +82,7 @@ def test_other_methods_take_its_weighted_lines(pet: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [(("--bin", "2"), "go with --bin"), (("--rings", "sort"), "go with the correction 'rings'"),
-     (("--cols", "2:30"), "go with --cols"), (("--follow",), "do not grow"), (("--memory", "4M"), "in memory")],
+     (("--cols", "2:30"), "go with --cols"), (("--follow",), "do not grow")],
 )  # fmt: skip
 def test_what_counts_do_not_take_is_refused(pet: Path, tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
     refused = _beamline("recon", str(pet), "-m", "r2", *arguments, "-o", str(tmp_path / "out.h5"))
@@ -103,3 +106,9 @@ def test_sets_of_another_shape_and_a_wrong_scene_are_refused(pet: Path, tmp_path
         assert refused.exit_code == 2 and said in refused.output, refused.output
     refused = _beamline("simulate", str(pet.with_suffix(".yaml")), "--explain")
     assert refused.exit_code == 2 and "takes no --explain" in refused.output
+
+
+def test_counts_are_not_spilled(pet: Path) -> None:
+    spill = Spill(np.zeros((24, 3, 32), np.float32), 4, lambda n, of: None)
+    with open_scan(pet) as source, pytest.raises(DataError, match="have to be in memory"):
+        prepare_projections(source, Selection(), print, spill)
