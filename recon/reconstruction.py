@@ -198,10 +198,9 @@ def _of_counts(counts: Counts | Emission, geometry: Geometry, use: DataUse) -> t
         raise ValueError(f"counts have shape {shape}, the geometry says {expected} [view, row, col]")
     if use.weights is not None and np.shape(use.weights) != shape:
         raise ValueError(f"weights have shape {np.shape(use.weights)}, the counts {shape}")
-    counted = isinstance(counts, Emission)
-    data, weights = weighted_lines(counts) if counted else line_integrals(counts)
+    data, weights = weighted_lines(counts) if isinstance(counts, Emission) else line_integrals(counts)
     weights = weights if use.weights is None else weights * use.weights
-    return data, replace(use, weights=weights, emission=counts if counted else None)
+    return data, replace(use, weights=weights, emission=counts if isinstance(counts, Emission) else None)
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

@@ -24,9 +24,9 @@ from beamline.core.text import size
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
+    from beamline.simulate.emission import EmissionScene
     from beamline.simulate.scene_file import Scan, SceneFile
     from beamline.simulate.write import SimulatedScan
-    from simulators.scenes.emission import EmissionScene
 
 _OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
 _VIEWS = click.IntRange(1)

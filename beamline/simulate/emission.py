@@ -13,7 +13,8 @@ from beamline.core.files import whole_file
 from beamline.core.machine import free_memory
 from beamline.core.text import size
 from beamline.storage import hdf5
-from simulators.scenes.emission import EmissionScene, Events, events
+from simulators.scenes.emission import EmissionScene as EmissionScene
+from simulators.scenes.emission import Events, events
 
 _BYTES_A_LINE = 120  # as measured
 
