@@ -42,7 +42,7 @@ class PreparedProjections:
         done: what each step did, by name, in the order in which it did.
         shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
             None: as `shares` says.
-        emission: what was counted of a sample that emits, in these views; None: it does not emit.
+        emission: the counts behind these views; None: the sample does not emit.
     """
 
     projections: Projections

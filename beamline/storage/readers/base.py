@@ -108,7 +108,7 @@ class ScanSource(ABC):
 
     @property
     def emission(self) -> EmissionOf | None:
-        """What was counted of a sample that emits, whose line integrals the pixels are; None: it does not emit."""
+        """The counts of a sample that emits, whose line integrals the pixels are; None: it does not emit."""
         return None
 
     @property
