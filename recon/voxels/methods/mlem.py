@@ -14,6 +14,8 @@ from recon.base.volume import Grid
 from recon.voxels.emission import Emission, mlem
 from recon.voxels.voxel_problem import iterative_memory
 
+_FLOOR = 1e-6  # of the mean line integral
+
 
 @dataclass(frozen=True)
 class Mlem:
@@ -80,7 +82,10 @@ def _emission(problem: ReconProblem) -> Emission:
     if given is None:
         lines, known = masked(problem.projections, weights)
         known = np.ones_like(lines) if known is None else known
-        return Emission(np.maximum(lines, 0) * known, problem.geometry, known)
+        counts = np.maximum(lines, 0) * known
+        # Rays of real views may miss the grid, and are not 0: a background explains them.
+        floor = np.full_like(counts, max(_FLOOR * float(counts.mean()), float(np.finfo(np.float32).tiny)))
+        return Emission(counts, problem.geometry, known, floor)
     if weights is None or weights.all():
         return replace(given, geometry=problem.geometry)
     survival = np.ones_like(given.counts) if given.survival is None else given.survival
@@ -88,4 +93,4 @@ def _emission(problem: ReconProblem) -> Emission:
 
 
 def _memory(geometry: Geometry, grid: Grid, weighted: bool, subsets: int) -> int:
-    return iterative_memory(geometry, grid, 4.5 + subsets, 4.2 + 4 / subsets, 1.1 * weighted)
+    return iterative_memory(geometry, grid, 4.5 + subsets, 5.2 + 4 / subsets, 1.1 * weighted)
