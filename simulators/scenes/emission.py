@@ -196,5 +196,6 @@ def events(
     for view, image in zip(scatter, trues, strict=True):
         add_enlarged(view, broad_blur(image, scanner.scatter_mm / detector.pitch, gaussian), scanner.scatter)
     counts = rng.poisson(trues + randoms + scatter)
-    kept = (each.astype(np.float32) for each in (counts, efficiency, depth, scatter, randoms))
-    return Events(*kept, scale)
+    f32 = np.float32
+    kept = efficiency.astype(f32), depth.astype(f32), scatter.astype(f32), randoms.astype(f32)
+    return Events(counts.astype(f32), *kept, scale)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import WHOLE, EmissionCounts, EmissionOf, Opening, ScanFormat
+from beamline.storage.readers.base import WHOLE, EmissionCounts, EmissionOf, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
 from drivers.base.frame import FrameKind
 
@@ -58,7 +58,7 @@ class EmissionSource(StacksSource):
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Line integrals of the activity [frame, row, col], counts per mm of line x mm; NaN where nothing survives."""
-        found = self._counted(np.arange(self.image_key.size)[frames], rows)
+        found = self._counted(frame_indices(frames, self.image_key.size), rows)
         lines = np.full_like(found.counts, np.nan)
         return np.divide(found.counts - found.background, found.survival, out=lines, where=found.survival > 0)
 
