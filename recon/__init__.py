@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from recon.voxels.methods.asd_pocs import AsdPocs
     from recon.voxels.methods.cgls import Cgls
     from recon.voxels.methods.fista_tv import FistaTv
+    from recon.voxels.methods.mlem import Mlem, Osem
     from recon.voxels.methods.os_sirt_tv import OsSirtTv
     from recon.voxels.methods.sart import Sart
     from recon.voxels.methods.sirt import Sirt
@@ -71,7 +72,9 @@ __all__ = [
     "IntraTomo",
     "Kernel",
     "Materials",
+    "Mlem",
     "OsSirtTv",
+    "Osem",
     "Progress",
     "Projections",
     "Projector",

@@ -39,6 +39,8 @@ REGISTRY: dict[str, MethodEntry] = {
     "sirt": MethodEntry("recon.voxels.methods.sirt", "Sirt"),
     "sart": MethodEntry("recon.voxels.methods.sart", "Sart"),
     "cgls": MethodEntry("recon.voxels.methods.cgls", "Cgls"),
+    "mlem": MethodEntry("recon.voxels.methods.mlem", "Mlem", compared=False),
+    "osem": MethodEntry("recon.voxels.methods.mlem", "Osem", compared=False),
     "asd-pocs": MethodEntry("recon.voxels.methods.asd_pocs", "AsdPocs"),
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),

@@ -22,6 +22,7 @@ from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
 from recon.splatting.gaussians import Gaussians
+from recon.voxels.emission import Emission, weighted_lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    projections: ArrayLike | Tensor | Counts,
+    projections: ArrayLike | Tensor | Counts | Emission,
     geometry: Geometry,
     method: str | Method = DEFAULT,
     *,
@@ -104,7 +105,8 @@ def reconstruct(
         projections: [view, row, col], -log of the transmission; any real type (a CPU tensor too). Values that are not
             finite are filled from their neighbours and weigh nothing. Or what was counted, where photons are few. The
             method is then given line integrals and weights that carry the likelihood of the counts, see
-            `recon.prep.counts.line_integrals`; `use.weights` multiply them.
+            `recon.prep.counts.line_integrals`; `use.weights` multiply them. Of an `Emission` likewise, see
+            `recon.weighted_lines`; mlem and osem take the counts themselves.
         method: a name (see `recon.methods.names`) for a method with its default settings, or a method with settings
             of its own, such as `recon.R2(steps=2000)` or `recon.FistaTv(tv_weight=2e-3)`.
         grid: of the volume; None gives one voxel a detector pixel. A fit always covers all that the views see, so a
@@ -130,12 +132,12 @@ def reconstruct(
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)
     _refuse_one_side(geometry)
-    if isinstance(projections, Counts):
+    if isinstance(projections, Counts | Emission):
         projections, use = _of_counts(projections, geometry, use)
         data = _line_integrals(projections, geometry)
     else:
         data = _line_integrals(projections, geometry)
-        if look_like_counts(data):
+        if use.emission is None and look_like_counts(data):
             warnings.warn(
                 f"projections have a median of {np.nanmedian(data[:1]):.4g}: they look like counts. Line integrals are "
                 "-log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
@@ -189,15 +191,16 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
         raise ValueError(f"method {method.name!r} does not take {owners}: leave that out, or choose another method")
 
 
-def _of_counts(counts: Counts, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
+def _of_counts(counts: Counts | Emission, geometry: Geometry, use: DataUse) -> tuple[NDArray[np.float32], DataUse]:
     """Line integrals, and their weights times the given ones."""
     shape, expected = np.shape(counts.counts), (geometry.n_views, *geometry.detector_shape)
     if shape != expected:
         raise ValueError(f"counts have shape {shape}, the geometry says {expected} [view, row, col]")
     if use.weights is not None and np.shape(use.weights) != shape:
         raise ValueError(f"weights have shape {np.shape(use.weights)}, the counts {shape}")
-    data, weights = line_integrals(counts)
-    return data, replace(use, weights=weights if use.weights is None else weights * use.weights)
+    data, weights = weighted_lines(counts) if isinstance(counts, Emission) else line_integrals(counts)
+    weights = weights if use.weights is None else weights * use.weights
+    return data, replace(use, weights=weights, emission=counts if isinstance(counts, Emission) else None)
 
 
 def _line_integrals(projections: ArrayLike, geometry: Geometry) -> NDArray[np.float32]:

@@ -15,6 +15,7 @@ from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Done
 from beamline.core.signals import StopOnSignal
+from beamline.core.sinks import Warnings
 from drivers.base.clock import SystemClock
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -54,11 +55,12 @@ def materials(
     from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
     from beamline.scan.energies import is_series, scans_in
 
-    files = tuple(scan for path in files for scan in (scans_in(path) if is_series(path) else [path]))
-    refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
     table = read_spectra(spectra)
     with events_shown(as_json) as sink:
         clock = SystemClock()
+        warn = Warnings(sink, clock)
+        files = tuple(scan for path in files for scan in (scans_in(path, warn) if is_series(path) else [path]))
+        refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
         made = reconstruct_materials(
             [chosen(path, 0, values) for path in files], table, output, sink, clock,
             lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False), register,

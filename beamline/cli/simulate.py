@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import json_events, json_option
-from beamline.cli.terminal import Terminal
+from beamline.cli.options import json_events, json_option, refuse_shared
+from beamline.cli.terminal import Terminal, counting
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import CostExplained, Done, Event, Sink
 from beamline.core.files import refuse_existing, remove, write_whole
@@ -23,6 +23,7 @@ from beamline.core.text import size
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
+    from beamline.simulate.emission import EmissionScene
     from beamline.simulate.scene_file import Scan, SceneFile
     from beamline.simulate.write import SimulatedScan
 
@@ -71,14 +72,15 @@ def simulate(
 ) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
-    Only the effects that the scene names are computed. The file has the format of the instrument, which
+    A scene with `emission` gives the counts of a sample that emits (PET), which `beamline recon` reads, too. Of others
+    only the effects that the scene names are computed. The file has the format of the instrument, which
     `beamline recon` reads. The first Ctrl-C stops after the current frame, with a readable file and its labels; the
     second stops at once.
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
     """
     from beamline.simulate.figure import sheet
-    from beamline.simulate.scene_file import exposure_errors, open_scene, scan_of
+    from beamline.simulate.scene_file import exposure_errors, open_emission, open_scene, scan_of
     from beamline.simulate.write import check_output
 
     clock = SystemClock()
@@ -87,6 +89,14 @@ def simulate(
             raise ConfigError("Nothing to do. Give --explain, --out FILE, --truth FILE or --picture FILE.")
         if truth_bin and not truth:
             raise ConfigError("--truth-bin needs --truth FILE. Nothing was simulated.")
+        if (emission := open_emission(scene, overrides)) is not None:
+            if explains or truth_bin or picture:
+                raise ConfigError(f"{scene} emits: it takes no --explain, --truth-bin or --picture. Leave them out.")
+            refuse_shared({"--output": out, "--truth": truth})
+            emission = replace(emission, lines=replace(emission.lines, views=views or emission.lines.views))
+            output = _Output(sink, clock, plain=not as_json)
+            output.event(Done(_emission(emission, seed, out, truth, output, sink)))
+            return
         picture = out.with_suffix(".png") if out and not picture else picture
         _refuse_outputs(out, truth, picture)
         opened = open_scene(scene, overrides)
@@ -178,6 +188,31 @@ def _truth(scan: Scan, path: Path, binning: int | None, output: _Output) -> dict
     voxels = " x ".join(map(str, truth.grid.shape))
     output("truth", f"{path}  {voxels} voxels of {truth.grid.voxel_size:.4g} mm, for `beamline recon --bin {n}`")
     return {"truth": path}
+
+
+def _emission(
+    scene: EmissionScene, seed: int, out: Path | None, truth: Path | None, output: _Output, sink: Sink
+) -> dict[str, object]:
+    from beamline.simulate.emission import emit, write_emission
+    from beamline.simulate.truth import truth_of_emission, write_truth
+
+    wanted = {"output": out, "truth": truth}
+    for path in (path for path in wanted.values() if path):
+        refuse_existing(path)
+    with Terminal(sys.stderr) as terminal:
+        made = emit(scene, seed, counting("views", fan_out(terminal, sink), SystemClock()))
+    if truth:
+        write_truth(truth, truth_of_emission(scene, made.scale))
+        output("truth", f"{truth}  activity, {made.scale:.4g} counts per mm of line in the body")
+    try:
+        if out:
+            write_emission(out, scene, made)
+            output("scan", f"{out}  {len(made.counts)} views, {made.counts.sum():.4g} counts")
+    except Exception:
+        if truth:
+            remove(truth)
+        raise
+    return {name: path for name, path in wanted.items() if path}
 
 
 def _scan(scene: SceneFile, scan: Scan, out: Path, output: _Output, sink: Sink) -> SimulatedScan:

@@ -12,6 +12,7 @@ import click
 
 from beamline.core.errors import DataError
 from beamline.core.events import Sink
+from beamline.core.sinks import Warnings
 from beamline.core.stop import StopRequest
 from drivers.base.clock import SystemClock
 
@@ -78,7 +79,8 @@ def run_job(
             from beamline.scan.energies import is_series, scans_in
 
             folder = Path(source)
-            scans = scans_in(folder) if is_series(folder) else ()
+            warn = Warnings(sink, SystemClock())
+            scans = scans_in(folder, warn) if is_series(folder) else ()
             if folder.is_dir() and not scans:
                 raise DataError(
                     f"{folder} is no folder of a series of scans (scan.energies); expected one, a file or a scene. "

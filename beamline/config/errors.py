@@ -29,7 +29,10 @@ def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
             missing = found["type"] == "union_tag_not_found"
         sentence = _sentence("missing" if missing else found["type"], path, found["msg"], tree.data, schema)
         faults.setdefault(path, f"{tree.origin(path)}: {sentence}")
-    return list(faults.values())
+    # A list with a wrong item may also seem too short.
+    lists = {path for path in faults if isinstance(_value(tree.data, path), list)}
+    items = {path[:-1] for path in faults if path}
+    return [said for path, said in faults.items() if path not in lists & items]
 
 
 def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:

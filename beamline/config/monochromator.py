@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from contextlib import closing
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from beamline.config.places import PvUrl, Seconds
 from beamline.config.section import Section
@@ -22,6 +22,13 @@ class NoMonochromator(Section):
 class _Monochromator(Section):
     range_kev: tuple[Kev, Kev] | None = None
     """Lowest and highest energy that a scan may ask for; null: any."""
+
+    @model_validator(mode="after")
+    def _range_rises(self) -> Self:
+        if self.range_kev is not None and self.range_kev[0] > self.range_kev[1]:
+            low, high = self.range_kev
+            raise ValueError(f"range_kev is {low:g} ... {high:g}; expected the lower energy first")
+        return self
 
 
 class SceneMonochromator(_Monochromator):

@@ -14,6 +14,7 @@ from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.calibrate import Calibrated
 from beamline.projections.correction import ScanCorrection
+from beamline.projections.emission import prepare_emission
 from beamline.projections.flags import UsableViews, checked_views
 from beamline.projections.poses import poses_of, require_known
 from beamline.projections.prepared import PreparedProjections
@@ -75,6 +76,12 @@ def prepare_projections(
         DataError: the scan cannot be reconstructed; the message says why and what to do.
         ConfigError: the selection does not fit the scan.
     """
+    if (emission := source.emission) is not None:
+        if spill is not None:
+            raise DataError(
+                f"{source.path}: counts of an emission have to be in memory. Give more --memory, or --rows."
+            )
+        return prepare_emission(source, emission, selection, warn)
     phases = phases or Phases()
     phases.enter("flags and references")
     usable = checked_views(source, selection, warn)

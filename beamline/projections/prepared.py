@@ -16,6 +16,7 @@ from recon.base.masks import RayWeights
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
+from recon.voxels.emission import Emission
 from recon.voxels.projector import seen_rays
 
 
@@ -32,7 +33,7 @@ class PreparedProjections:
         held_out_ids: rows of the file of these views; None: unknown.
         n_projections: how many views the scan has.
         length_unit: "mm" or "px".
-        quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
+        quantity: what the pixels were: "counts", which were corrected, "line_integrals", or "emission".
         view_weights: float32 [view], less than 1 for views with a warning of the monitor; None: one for all.
         left_out: views with an alarm of the monitor, or that a jump spoils: the selection does not choose from them.
         flags: of all frames of the scan; None if the file has no flags.
@@ -41,6 +42,7 @@ class PreparedProjections:
         done: what each step did, by name, in the order in which it did.
         shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
             None: as `shares` says.
+        emission: the counts behind these views; None: the sample does not emit.
     """
 
     projections: Projections
@@ -59,6 +61,7 @@ class PreparedProjections:
     done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
     held_out_ids: NDArray[np.int64] | None = None
+    emission: Emission | None = None
 
     @property
     def on_disk(self) -> bool:

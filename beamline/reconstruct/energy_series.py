@@ -22,7 +22,7 @@ from beamline.core.signals import StopOnSignal
 from beamline.core.text import size
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection
+from beamline.projections.selection import Selection, cone_of
 from beamline.reconstruct.slabs import SHARE
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import write_volume
@@ -159,6 +159,11 @@ def reconstruct_materials(
                 raise ConfigError(
                     f"{scan.path} does not state its energy (keV, instrument/beam/incident_energy of NXtomo), which "
                     "chooses the line of the spectra. Nothing was written."
+                )
+            if register and cone_of(scan, selection) is not None:
+                raise ConfigError(
+                    f"--register: {scan.path} is of a cone, whose rays a shift of the sample turns. Leave it out. "
+                    "Nothing was written."
                 )
             attenuation.append(spectra.at(scan.energy_kev))
             chosen = replace(selection, axis_col=axis_col if selection.axis_col is None else selection.axis_col)

@@ -261,7 +261,7 @@ class _Job:
         with self.refused(f" by {method.name}"):
             return reconstruct(
                 data, geometry, method, grid=grid, seed=self.options.seed, device=self.options.device,
-                use=DataUse(weights, held_out), control=control,
+                use=DataUse(weights, held_out, prepared.emission), control=control,
             )  # fmt: skip
 
     def outcome(self, result: Reconstruction, early: bool, chosen: str = "", **settings: Any) -> ReconOutcome:

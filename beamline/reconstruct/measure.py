@@ -111,15 +111,18 @@ def measure(
 ) -> dict[str, float]:
     """Figures of merit by the names of beamline.report.metrics.METRICS.
 
-    With a truth: PSNR, SSIM 3D, NRMSE. With a mask of the dense and empty regions: SNR and CNR. With views: the
-    residual in up to 16 of the views used, and in the views held out where there are any. Of a detector with more than
-    2^17 pixels only bands of rows with so many pixels are used. `progress` hears how many of these views were compared.
+    With a truth: PSNR, SSIM 3D, NRMSE, and of an emission `metrics.contrast`. With a mask of the dense and empty
+    regions: SNR and CNR. With views: the residual in up to 16 of the views used, and in the views held out where there
+    are any. Of a detector with more than 2^17 pixels only bands of rows with so many pixels are used. `progress` hears
+    how many of these views were compared.
     """
     values: dict[str, float] = {}
     if truth is not None:
         values["psnr"] = metrics.psnr(truth.data, volume.data)
         values["ssim3d"] = metrics.ssim3d(truth.data, volume.data)
         values["nrmse"] = metrics.nrmse(truth.data, volume.data)
+        if prepared is not None and prepared.emission is not None:
+            values |= metrics.contrast(truth.data, volume.data)
     if mask is not None:
         values["snr"], values["cnr"] = metrics.snr_cnr(metrics.sampled(volume.data), mask)
     if prepared is None:

@@ -48,6 +48,7 @@ _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
 _REGIONS = 2**24  # voxels, at most, of the regions by which volumes are judged, see `metrics.sampled`
 _NO_STEPS = StepMemory()
+_EMISSION = 6 * 4  # bytes a pixel: counts, survival, background and weights, and what they are made of
 _ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
 
 
@@ -177,7 +178,9 @@ def needs_of(source: ScanSource, options: ReconOptions) -> Needs:
     axis = source.axis_col if selection.axis_col is None else selection.axis_col
     if axis is not None:
         axis = (axis - (selection.binning - 1) / 2) / selection.binning
-    needs = Needs.of(options.method, views, shape, source.dtype.itemsize if selection.binning == 1 else 4, axis)
+    pixel = source.dtype.itemsize if selection.binning == 1 else 4
+    pixel = pixel if source.emission is None else _EMISSION
+    needs = Needs.of(options.method, views, shape, pixel, axis)
     part = ScanPart(source, selection, needs.geometry)
     stated = {step.name: step.memory(part) for step in selection.in_order}
     return replace(

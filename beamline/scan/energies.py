@@ -14,6 +14,7 @@ from beamline.config.load import Config, at_energies, load, resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event, RunDone, Sink, StateEntered, Warned
 from beamline.core.files import write_whole
+from beamline.core.sinks import Warn
 from beamline.core.stop import StopRequest
 from beamline.instrument.connect import connect
 from beamline.instrument.simulated import clock_of
@@ -30,6 +31,8 @@ from beamline.scan.resume import (
 )
 from beamline.scan.run import RunResult, run_scan
 from beamline.scan.run_folder import CONFIG, SCAN, create_run_folder
+from beamline.scan.runs import describe
+from beamline.scan.states import State
 from drivers.base.clock import SystemClock
 from drivers.manual import Ask
 
@@ -56,13 +59,23 @@ def is_series(folder: Path) -> bool:
     return load(folder / CONFIG, environment={}).scan.energies is not None
 
 
-def scans_in(folder: Path) -> list[Path]:
+def scans_in(folder: Path, warn: Warn) -> list[Path]:
     """The scan file of each energy of a series that has one, in the order of the configuration.
+
+    Args:
+        warn: is told of energies whose scan lacks frames, or is not there.
 
     Raises:
         DataError: none has one.
     """
-    found = [scan_file(run) for run in _runs(folder, load(folder / CONFIG, environment={})) if run is not None]
+    runs = _runs(folder, load(folder / CONFIG, environment={}))
+    found = [scan_file(run) for run in runs if run is not None]
+    whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
+    if found and len(whole) < len(runs):
+        warn(
+            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan, and {len(found)} are used. "
+            f"`beamline scan --resume {folder}` takes the rest."
+        )
     if not found:
         raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
     return found
@@ -96,8 +109,10 @@ def run_energies(
     with ExitStack() as held:
         jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
         whole = {one.scan.energy for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)}
-        if len(whole) < len(each):
-            refuse_violations(dry_run(config, series or place, whole=whole).timeline)
+        if series is not None and len(whole) == len(each):
+            return SeriesRun(series, tuple((one.scan.energy or 0.0, job) for one, job in zip(each, jobs, strict=True)
+                                           if isinstance(job, Path)), ())  # fmt: skip
+        refuse_violations(dry_run(config, series or place, whole=whole).timeline)
         last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
         clock = None if config.simulation is None else clock_of(config.simulation.clock, not_before=last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))

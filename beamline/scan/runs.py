@@ -17,7 +17,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import EVENTS, parts_of
 from beamline.core.text import printable, size
 from beamline.scan.control import running, state_of
-from beamline.scan.run_folder import CONTROL, SCAN, STAMP
+from beamline.scan.run_folder import CONFIG, CONTROL, SCAN, STAMP
 from beamline.scan.states import State
 
 DIED = "died"  # State of a run whose process has ended without a final event
@@ -62,8 +62,9 @@ class Run:
 
 
 def runs_in(folder: Path) -> list[Path]:
-    """The folders of runs in a folder, newest first."""
-    found = [run for run in folder.glob("*/") if _is_run(run)]
+    """The folders of runs in a folder, newest first; also those of the energies of a series in it."""
+    within = [path for path in folder.glob("*/") if not _is_run(path) and (path / CONFIG).is_file()]
+    found = [run for place in (folder, *within) for run in place.glob("*/") if _is_run(run)]
     return sorted(found, key=lambda run: (_began(run), _numbered(run)), reverse=True)
 
 
@@ -111,9 +112,10 @@ def cells(run: Run) -> tuple[str, ...]:
     if run.planned is not None and run.state != State.DONE:
         frames += f" of {run.planned}"
     parts = f" in {run.parts} parts" if run.parts > 1 else ""
+    of_series = f"{run.folder.parent.name}/" if (run.folder.parent / CONFIG).is_file() else ""
     row = (
         time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(run.time)), run.sample, frames + parts, run.state,
-        size(run.bytes), counted(run.flags) if run.flags else "-", run.folder.name,
+        size(run.bytes), counted(run.flags) if run.flags else "-", f"{of_series}{run.folder.name}",
     )  # fmt: skip
     return tuple(printable(cell).replace("\n", " ").replace("\t", " ") for cell in row)
 

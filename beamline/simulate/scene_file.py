@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
@@ -15,9 +15,11 @@ from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, text_in
 from beamline.core.shipped import shipped_scenes
 from beamline.core.text import size
+from beamline.storage.mesh_reader import READERS, read_mesh
 from beamline.storage.volume_file import read_volume
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
+from simulators.scenes.emission import EmissionScene, load_emission
 from simulators.scenes.explain import FrameCost, explain
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import Scene, load_scene
@@ -43,6 +45,26 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
         ConfigError: there is no such scene, or it is wrong.
         DataError: a volume of the scene cannot be read.
     """
+    path, tree, text = _scene_text(name, overrides)
+    try:
+        return SceneFile(load_scene(tree, volumes_beside(path.parent)), path, text)
+    except SceneError as error:
+        raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
+
+
+def open_emission(name: str, overrides: Sequence[str] = ()) -> EmissionScene | None:
+    """As `open_scene` for a scene of an emission; None: it is another one."""
+    path, tree, _ = _scene_text(name, overrides)
+    if "emission" not in tree:
+        return None
+    try:
+        return load_emission(tree)
+    except SceneError as error:
+        raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
+
+
+def _scene_text(name: str, overrides: Sequence[str]) -> tuple[Path, Mapping[str, Any], str]:
+    """The file of a scene, its values and its text."""
     shipped = shipped_scenes()
     path = Path(name)
     if not path.is_file():
@@ -55,13 +77,8 @@ def open_scene(name: str, overrides: Sequence[str] = ()) -> SceneFile:
         text = text_in(path, SETTINGS)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read ({error}). Nothing was simulated.") from error
-    try:
-        tree = override(read(text, str(path)), overrides, environment={})
-        if overrides:
-            text = yaml.safe_dump(tree.data, sort_keys=False)
-        return SceneFile(load_scene(tree.data, volumes_beside(path.parent)), path, text)
-    except SceneError as error:
-        raise ConfigError(f"{path}: {error}. Nothing was simulated.") from None
+    tree = override(read(text, str(path)), overrides, environment={})
+    return path, tree.data, yaml.safe_dump(tree.data, sort_keys=False) if overrides else text
 
 
 def scan_of(scene: SceneFile, seed: int, views: int | None, start: float) -> Scan:
@@ -107,6 +124,8 @@ def volumes_beside(folder: Path) -> ReadVolume:
     from simulators.samples.voxels.volume import Stored
 
     def read_beside(file: str, dataset: str | None) -> Stored:
+        if (folder / file).suffix.lower() in READERS:
+            return Stored(read_mesh(folder / file))
         return Stored(*read_volume(folder / file, dataset))  # a full path stays itself
 
     return read_beside

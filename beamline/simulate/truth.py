@@ -15,6 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from simulators.frame.detector import Detector
 from simulators.samples.sample import Sample
+from simulators.scenes.emission import EmissionScene
 
 LARGEST = 256  # Voxels across by default: 256³ take 84 MB with the labels
 BYTES_A_VOXEL = 16  # Peak memory as measured: 12 for solids (float64 and float32), 16 for volumes
@@ -61,6 +62,12 @@ def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
     z, y, x = grid.centre
     shifted = replace(grid, centre=(z + _above(detector, binning), y, x))
     return Truth(grid, sample.attenuation(shifted), sample.labels(shifted), sample.names)
+
+
+def truth_of_emission(scene: EmissionScene, scale: float) -> Truth:
+    """The activity in counts per mm of line, `scale` in the body, in voxels of a line's width."""
+    grid, sample = _grid(scene.lines.detector, 1), scene.emission.activity
+    return Truth(grid, sample.attenuation(grid) * np.float32(scale), sample.labels(grid), sample.names)
 
 
 def _grid(detector: Detector, binning: int) -> Grid:

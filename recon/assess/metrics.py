@@ -14,6 +14,7 @@ _SAMPLE = 100_000  # voxels from which the two cluster centres are computed
 _SLAB = 32  # slices at a time
 _MOST = 2**24  # voxels at most that regions and their noise are computed from
 _PART = 2**22  # values whose errors are summed at a time
+_RIM = 2  # voxels at the edge of a region of activity, where its surroundings blur into it
 
 Array = NDArray[np.floating]
 
@@ -234,6 +235,35 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
         return float(20 * np.log10(signal / spread)) if spread else float("inf")
 
     return decibel(dense.mean), decibel(abs(dense.mean - empty.mean))
+
+
+def contrast(truth: Array, volume: Array) -> dict[str, float]:
+    """What NEMA NU 4-2008 asks of an image of activity, in the regions of the truth, less `_RIM` voxels at each edge.
+
+    `recovery`: (hot / body - 1) / (true hot / body - 1), mean of hot voxels. `spillover`: cold / body, of cold regions
+    inside the body. `variation`: standard deviation over mean of the body, whose level most voxels of the truth have.
+    What the truth has no region for is left out.
+    """
+    level = float(np.median(truth[truth > 0])) if (truth > 0).any() else 0.0
+    if not level > 0:
+        return {}
+    cross = ndimage.generate_binary_structure(3, 1)
+
+    def inner(part: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.asarray(ndimage.binary_erosion(part, cross, _RIM, border_value=1))
+
+    solid = np.stack([ndimage.binary_fill_holes(image > 0) for image in truth])
+    body = inner(np.abs(truth - level) < 1e-3 * level)
+    hot, cold = inner(truth > 1.5 * level), inner(solid & (truth < 1e-3 * level))
+    mean = float(volume[body].mean()) if body.any() else 0.0
+    if not mean > 0:
+        return {}
+    found = {"variation": float(volume[body].std()) / mean}
+    if hot.any():
+        found["recovery"] = (float(volume[hot].mean()) / mean - 1) / (float(truth[hot].mean()) / level - 1)
+    if cold.any():
+        found["spillover"] = float(volume[cold].mean()) / mean
+    return found
 
 
 @dataclass(frozen=True)

@@ -59,10 +59,13 @@ class DataUse:
         weights: of each ray [view, row, col], 0 or more; None: one for all. FBP fills rays of weight 0 from their
             neighbours and takes all others alike.
         held_out: numbers of the views that are not fitted; their residual is in the history.
+        emission: a `recon.Emission`, which this module must not import: the counts that projections and weights are
+            made of. None: these are all there is.
     """
 
     weights: F32 | None = None
     held_out: Sequence[int] = ()
+    emission: Any = None
 
 
 @dataclass(frozen=True, eq=False)

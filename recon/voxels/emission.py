@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,7 +78,7 @@ def mlem(
     grid: Grid,
     iterations: int = 20,
     subsets: int = 1,
-    on_iteration: Callable[[int, float], object] | None = None,
+    on_iteration: Callable[[int, float, float], object] | None = None,
 ) -> Volume:
     """Maximum likelihood by expectation maximisation (Shepp & Vardi 1982; Lange & Carson 1984).
 
@@ -88,8 +89,9 @@ def mlem(
     the projections of a subset.
 
     Args:
-        on_iteration: called with the number of each iteration, from 1, and L of the volume before it (up to a
-            constant); with subsets each view at its turn. The iterations end if it returns something true.
+        on_iteration: called with the number of each iteration, from 1, L (up to a constant), and
+            ||counts - mean|| / ||counts||. Both are of the volume before it; with subsets each view at its turn. The
+            iterations end if it returns something true.
 
     Returns:
         counts per mm of line, 0 or more; 0 where no line sees a voxel.
@@ -129,8 +131,9 @@ def mlem(
             "numbers of float32. Expected the share of pairs that a line counts, such as 0.3"
         )
     x *= np.float32(level)
+    scale = float(np.linalg.norm(emission.counts))
     for iteration in range(1, iterations + 1):
-        likelihood = 0.0
+        likelihood = squares = 0.0
         for projector, counts, survival, background, sensitivity in parts:
             mean = survival * projector.forward(x) + background
             if blind := np.count_nonzero(counts[mean <= 0]):
@@ -140,10 +143,11 @@ def mlem(
                 )
             ratio = np.divide(counts, mean, out=np.zeros_like(mean), where=mean > 0)
             likelihood += float(np.sum(xlogy(counts, mean) - mean, dtype=np.float64))
+            squares += float(np.sum((counts - mean) ** 2, dtype=np.float64))
             x *= np.divide(
                 projector.adjoint(survival * ratio), sensitivity, out=np.ones_like(x), where=sensitivity > least
             )
-        if on_iteration is not None and on_iteration(iteration, likelihood):
+        if on_iteration is not None and on_iteration(iteration, likelihood, math.sqrt(squares) / scale):
             break
     return Volume(x, grid)
 

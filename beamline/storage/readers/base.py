@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +19,18 @@ Quantity = Literal["counts", "line_integrals", "unknown"]
 Attributes = Mapping[str, str | float | int]
 
 WHOLE = slice(None)
+
+
+class EmissionCounts(NamedTuple):
+    """Float32 [view, row, col] each: what was counted, and survival and background as of `recon.Emission`."""
+
+    counts: NDArray[np.float32]
+    survival: NDArray[np.float32]
+    background: NDArray[np.float32]
+
+
+EmissionOf = Callable[[NDArray[np.int64], slice], EmissionCounts]
+"""What was counted in some frames and rows."""
 
 
 class ScanSource(ABC):
@@ -97,6 +109,11 @@ class ScanSource(ABC):
 
         NaN in other frames; None where it says nothing.
         """
+        return None
+
+    @property
+    def emission(self) -> EmissionOf | None:
+        """The counts of a sample that emits, whose line integrals the pixels are; None: it does not emit."""
         return None
 
     @property

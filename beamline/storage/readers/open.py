@@ -32,6 +32,7 @@ REGISTRY = (  # modules in this folder, asked in this order
     "tiff_stack",
     "txrm",
     "nxtomo",
+    "emission",
     "dxchange",
 )
 

@@ -96,6 +96,15 @@ def _volume(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume
     return voxels_of(settings, read)
 
 
+def _mesh(where: str, mapping: Mapping[str, Any], beam: Beam, read: ReadVolume | None) -> Sample:
+    from simulators.samples.voxels.mesh import MeshSettings, mesh_of
+
+    settings = build(MeshSettings, where, mapping)
+    if read is None:
+        raise ValueError(f"{settings.file} cannot be read: no reader of meshes was given")
+    return mesh_of(settings, read)
+
+
 def _pieces(cls: str) -> _Builder:
     """The builder of a phantom of pieces, which are materials if the beam has energies and the scene no attenuation."""
 
@@ -162,4 +171,5 @@ _KINDS: Mapping[str, _Builder] = {
     "foam": _pieces("Foam"),
     "resolution": _pieces("Resolution"),
     "volume": _volume,
+    "mesh": _mesh,
 }

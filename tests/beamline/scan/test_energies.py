@@ -104,8 +104,13 @@ def test_each_energy_has_a_scan_and_all_of_them_give_the_materials(config: Path,
     step = np.pi / VIEWS / len(ENERGIES)
     assert np.diff(np.sort(angles)) == pytest.approx(np.full(VIEWS * len(ENERGIES) - 1, step), abs=2e-5)
     assert not any((noise[0] == other).all() for other in noise[1:])  # each energy has noise of its own
-    made = beamline("materials", series, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
-    assert made.exit_code == 0, made.output
+    listed = beamline("runs", tmp_path / "runs").stdout
+    assert all(f"{series.name}/{path.parent.name}" in listed for path in scans), listed
+    words = ("--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
+    cone = beamline("materials", series, *words, "--register", "--cone", "100:300")
+    assert cone.exit_code == 2 and "--register: " in cone.stderr and "is of a cone" in cone.stderr, cone.output
+    made = beamline("materials", series, *words)
+    assert made.exit_code == 0 and "energies have a complete scan" not in made.stderr, made.output
     y, x = (np.mgrid[:64, :64] - 31.5) * PITCH
     for name in GRAINS:
         with opened_volume(tmp_path / f"out_{name}.h5") as record:
@@ -134,6 +139,10 @@ def test_a_series_that_was_stopped_goes_on(
     (series,) = tmp_path.iterdir()
     assert f"beamline scan --resume {series}" in ended.stderr.replace("\n", " ")
     before = digests(series)
+    if before:
+        words = ("--spectra", spectra(tmp_path), "-o", tmp_path / "no.txt")
+        early = beamline("materials", series, *words).stderr.replace("\n", " ")
+        assert f"{int(at > 22)} of 4 energies have a complete scan" in " ".join(early.split()), early
     whole = [name for name in before if f"{ENERGIES[0]}keV" in name and at > 22]
     done = beamline("scan", "--resume", series, "--json")
     assert done.exit_code == 0, done.output
@@ -144,7 +153,9 @@ def test_a_series_that_was_stopped_goes_on(
             kinds = source.image_key
             assert (kinds == FrameKind.PROJECTION).sum() == VIEWS
     assert all(digests(series)[name] == before[name] for name in whole)
-    assert beamline("scan", "--resume", series, "--json").exit_code == 0  # nothing is missing
+    with monkeypatch.context() as without:
+        without.setattr("beamline.scan.energies.connect", None)  # nothing is missing: no device is connected
+        assert beamline("scan", "--resume", series, "--json").exit_code == 0
     other = beamline("scan", config, "--set", "scan.energies=[8.3, 8.4]", "--resume", series)
     assert other.exit_code == 2 and "`- 8.32`, not `- 8.3`" in other.stderr.replace("\n", " ")
 
@@ -193,6 +204,8 @@ def test_a_dry_run_counts_all_energies(config: Path, tmp_path: Path) -> None:
         (("simulation.scene.beam.energy_kev=null", "simulation.scene.beam.tube={kv: 60}"), "gives one energy"),
         (("simulation.scene.phantom.materials.fresh.formula=Xx",), "Xx"),
         (("scan.energies=[8.3, 9000]",), "9000"),
+        (("scan.energies=[.nan]",), "scan.energies.0 is .nan"),
+        (("devices.monochromator={kind: simulated, range_kev: [25, 4]}",), "expected the lower energy first"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(config: Path, tmp_path: Path, words: tuple[str, ...], said: str) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import recon
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.emission import Emission, attenuation_factors, mlem, weighted_lines
@@ -45,7 +48,7 @@ def test_the_maximum_is_that_of_a_general_optimiser() -> None:
     best = minimize(descent, np.full(a.shape[1], 10.0), jac=True, method="L-BFGS-B", bounds=[(0, None)] * a.shape[1],
                     options={"maxiter": 5000, "ftol": 1e-14, "gtol": 1e-9, "maxfun": 50000})  # fmt: skip
     reached = []
-    found = mlem(emission, grid, 3000, on_iteration=lambda n, likelihood: reached.append(likelihood))
+    found = mlem(emission, grid, 3000, on_iteration=lambda n, likelihood, residual: reached.append(likelihood))
     assert -best.fun - reached[-1] == pytest.approx(0, abs=0.02)  # of some 10⁴; the statistical unit is 0.5
     np.testing.assert_allclose(found.data.ravel(), best.x, atol=0.03 * best.x.max())
 
@@ -53,7 +56,7 @@ def test_the_maximum_is_that_of_a_general_optimiser() -> None:
 def test_each_iteration_raises_the_likelihood() -> None:
     emission, grid, _ = toy(1)
     reached: list[float] = []
-    mlem(emission, grid, 60, on_iteration=lambda n, likelihood: reached.append(likelihood))
+    mlem(emission, grid, 60, on_iteration=lambda n, likelihood, residual: reached.append(likelihood))
     assert (np.diff(reached) > -1e-3).all() and reached[20] > reached[0] + 10
 
 
@@ -143,7 +146,7 @@ def test_lines_of_few_counts_are_not_lowered_by_their_weights() -> None:
 def test_a_stop_ends_it_and_bad_counts_are_refused() -> None:
     emission, grid, _ = toy()
     calls: list[int] = []
-    mlem(emission, grid, 50, on_iteration=lambda n, _: calls.append(n) or n == 3)
+    mlem(emission, grid, 50, on_iteration=lambda n, *_: calls.append(n) or n == 3)
     assert calls == [1, 2, 3]
     with pytest.raises(ValueError, match="0 or more"):
         Emission(-emission.counts, emission.geometry)
@@ -169,3 +172,29 @@ def test_lines_of_a_survival_that_float32_cannot_hold_are_refused(survival: floa
     counts = np.full((4, 1, 8), 5, np.float32)
     with pytest.raises(ValueError, match="float32 cannot hold"):
         weighted_lines(Emission(counts, geometry, np.full_like(counts, survival)))
+
+
+def test_the_methods_are_the_function_by_the_one_call() -> None:
+    """To the bit; and lines that weigh nothing are left out, as if nothing had survived there."""
+    emission, grid, _ = toy()
+    whole = recon.reconstruct(emission, emission.geometry, recon.Mlem(iterations=6), grid=grid)
+    np.testing.assert_array_equal(whole.volume.data, mlem(emission, grid, 6).data)
+    assert [each.step for each in whole.history] == [1, 2, 3, 4, 5, 6]
+    assert (np.diff([each.loss for each in whole.history]) < 0).all()
+    some = recon.reconstruct(emission, emission.geometry, recon.Osem(iterations=3, subsets=4), grid=grid)
+    np.testing.assert_array_equal(some.volume.data, mlem(emission, grid, 3, 4).data)
+    weights = np.ones_like(emission.counts)
+    weights[3:5, :, 2:4] = 0
+    use = recon.DataUse(weights=weights)
+    spoiled = replace(emission, counts=np.where(weights > 0, emission.counts, F32(500)))
+    found = recon.reconstruct(spoiled, emission.geometry, recon.Mlem(iterations=6), grid=grid, use=use)
+    without = replace(emission, counts=emission.counts * weights, survival=emission.survival * weights)
+    np.testing.assert_allclose(found.volume.data, mlem(without, grid, 6).data, rtol=1e-4, atol=1e-3)
+
+
+def test_other_methods_get_weighted_lines_by_the_same_call() -> None:
+    emission, grid, _ = toy()
+    lines, weights = weighted_lines(emission)
+    by_hand = recon.reconstruct(lines, emission.geometry, "cgls", grid=grid, use=recon.DataUse(weights, (), emission))
+    by_call = recon.reconstruct(emission, emission.geometry, "cgls", grid=grid)
+    np.testing.assert_array_equal(by_call.volume.data, by_hand.volume.data)
