@@ -1,4 +1,7 @@
-"""Manual devices, from shutter to monochromator: asks an operator to act and keeps the state that was confirmed."""
+"""Manual devices, from shutter to monochromator: asks an operator to act and keeps the state that was confirmed.
+
+The state is unknown while the operator is asked, and stays unknown if the request is not confirmed.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,13 @@ class ManualShutter:
 
     def open(self) -> None:
         if self._open is not True:
+            self._open = None
             self._ask("Open the beam shutter.")
             self._open = True
 
     def close(self) -> None:
         if self._open is not False:
+            self._open = None
             self._ask("Close the beam shutter.")
             self._open = False
 
@@ -43,15 +48,17 @@ class ManualSampleMover:
     def __init__(self, ask: Ask, name: str = "sample mover") -> None:
         self.name = name
         self._ask = ask
-        self._in = True
+        self._in: bool | None = True
 
     def out(self) -> None:
-        if self._in:
+        if self._in is not False:
+            self._in = None
             self._ask("Move the sample out of the beam.")
             self._in = False
 
     def back(self) -> None:
-        if not self._in:
+        if self._in is not True:
+            self._in = None
             self._ask("Move the sample back into the beam, to the same place.")
             self._in = True
 
@@ -66,6 +73,7 @@ class ManualFilter:
 
     def put(self, place: str) -> None:
         if place != self._place:
+            self._place = None
             self._ask(f"Put the filter into the beam: {place}.")
             self._place = place
 
@@ -83,7 +91,7 @@ class ManualMonochromator:
 
     def move_to(self, energy: float) -> None:
         if energy != self._energy:
-            self._energy = None  # whoever does not confirm may have turned it
+            self._energy = None
             self._ask(f"Set the monochromator to {energy:.7g} keV.")
             self._energy = energy
 

@@ -1,11 +1,13 @@
-"""Manual devices ask the operator once for each change, and believe nothing that was not confirmed."""
+"""Manual devices ask the operator once for each change, and again after a request that was not confirmed."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import pytest
 
 from drivers.base.protocols import SampleMover, Shutter
-from drivers.manual import ManualSampleMover, ManualShutter
+from drivers.manual import Ask, ManualFilter, ManualMonochromator, ManualSampleMover, ManualShutter
 
 
 def test_the_shutter_asks_for_each_change_and_not_again() -> None:
@@ -45,3 +47,47 @@ def test_what_the_operator_did_not_confirm_did_not_happen() -> None:
     with pytest.raises(KeyboardInterrupt):
         shutter.open()
     assert not shutter.is_open()
+
+
+def _shutter(ask: Ask) -> tuple[Callable[[], object], Callable[[], object]]:
+    device = ManualShutter(ask)
+    return device.close, device.open
+
+
+def _mover(ask: Ask) -> tuple[Callable[[], object], Callable[[], object]]:
+    device = ManualSampleMover(ask)
+    return device.back, device.out
+
+
+def _filter(ask: Ask) -> tuple[Callable[[], object], Callable[[], object]]:
+    device = ManualFilter(ask)
+    return lambda: device.put("none"), lambda: device.put("Al 1 mm")
+
+
+def _monochromator(ask: Ask) -> tuple[Callable[[], object], Callable[[], object]]:
+    device = ManualMonochromator(ask)
+    return lambda: device.move_to(8.0), lambda: device.move_to(8.4)
+
+
+@pytest.mark.parametrize("device", [_shutter, _mover, _filter, _monochromator])
+def test_after_a_request_that_was_not_confirmed_the_state_of_before_is_asked_for_again(
+    device: Callable[[Ask], tuple[Callable[[], object], Callable[[], object]]],
+) -> None:
+    asked: list[str] = []
+
+    def ask(request: str) -> None:
+        asked.append(request)
+        if refuses:
+            raise KeyboardInterrupt
+
+    back, there = device(ask)
+    refuses = False
+    back()
+    asked.clear()
+    refuses = True
+    with pytest.raises(KeyboardInterrupt):
+        there()
+    refuses = False
+    back()
+    back()
+    assert len(asked) == 2
