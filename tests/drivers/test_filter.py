@@ -113,7 +113,7 @@ def test_one_that_does_not_obey_is_told_and_is_not_there(rig: Rig) -> None:
     rig.break_it()
     with pytest.raises(DeviceError):
         rig.filter.put("Cu")
-    assert rig.filter.place() == "none"
+    assert rig.filter.place() in ("none", None)  # by hand it is not known
 
 
 def test_a_status_that_does_not_follow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
