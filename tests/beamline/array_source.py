@@ -34,6 +34,8 @@ class ArraySource:
     altered: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()
     finished = True
+    times = None
+    emission = None
     plan: dict[str, Any] = {}  # noqa: RUF012
 
     def __init__(

@@ -197,7 +197,7 @@ def test_a_shell_completes_commands_without_their_modules_and_their_options(
 def test_a_manual_page_has_what_the_help_has(words: list[str]) -> None:
     printed = CliRunner().invoke(module.main, ["man", *words])
     assert (printed.exit_code, printed.stderr) == (0, "")
-    page = printed.stdout.replace("\\-", "-")
+    page = printed.stdout.replace("\\-", "-").replace("\\:", "")
     command = module.main.get_command(click.Context(module.main), words[0]) if words else module.main
     assert command is not None
     context = click.Context(command)

@@ -67,7 +67,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "plain splatting of fbp": ({}, ["-m", "fbp", "--plain-splatting"], 2, "--plain-splatting is of r2"),
     "a loss of fbp": ({}, ["--loss", "l2"], 2, "--loss is of r2"),
     "a checkpoint of fbp": ({}, ["--checkpoint", "fit.h5"], 2, "--checkpoint is of r2"),
-    "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of sirt, sart, cgls, asd-pocs"),
+    "iterations of fbp": ({}, ["--iterations", "5"], 2, "--iterations is of sirt, sart, cgls, mlem, osem, asd-pocs"),
     "iterations of a fit": ({}, ["-m", "r2", "--iterations", "5"], 2, "does not go with --method r2"),
     "steps of iterations": ({}, ["-m", "sirt", "--steps", "5"], 2, "--steps is of r2"),
     "smoothing of sirt": ({}, ["-m", "sirt", "--tv-weight", "0.1"], 2, "fista-tv, os-sirt-tv"),
