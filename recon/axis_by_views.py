@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.binning import bin_views
@@ -27,11 +28,18 @@ _TV_WEIGHT = 3e-3  # any weight that keeps noise out of the volume shows the sam
 _WIDER = 2.0  # A box this wide takes the matter around the field. In the field alone it would hide the axis.
 _STEPS = 8  # of the parabola's middle towards its vertex, at most
 _BETTER = 0.98  # of the residual at the start: what another axis has to leave
+_WHOLE = 0.999  # of a binned pixel that the beam reaches
+_SHADOWED = 3  # times the sweeps: matter that half of the views see takes longer, and draws the axis away till then
 _CLEAR = 0.1  # of the typical residual that the best axis has to take away
 
 
 def axis_by_views(
-    projections: F32, geometry: Geometry, progress: Callable[[int], None] = lambda n: None, *, near: bool = False
+    projections: F32,
+    geometry: Geometry,
+    progress: Callable[[int], None] = lambda n: None,
+    *,
+    near: bool = False,
+    lit: NDArray[np.bool_] | None = None,
 ) -> AxisEstimate:
     """The column by which a volume of two thirds of the views leaves least of the others.
 
@@ -45,6 +53,7 @@ def axis_by_views(
         progress: takes the number of candidates tried so far.
         near: the start stays, after ten candidates, where it is clearly the best of the coarse search and no axis
             beside it leaves 2 % less. Far from the axis no candidate differs much from those beside it.
+        lit: [row, col], pixels that the beam reaches; None: all. Others count as not measured.
 
     Returns:
         Not confident where the best candidate leaves nearly as much as the others.
@@ -55,8 +64,9 @@ def axis_by_views(
     """
     if geometry.n_views < _LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few to hold some out; {_LEAST_VIEWS} are needed")
-    if not leaves_the_field(projections, geometry):
-        return _search(projections, geometry, progress, 1.0, near)
+    views = _Views(projections if lit is None else np.where(lit, projections, 0).astype(np.float32), geometry, lit)
+    if not leaves_the_field(views.data, geometry):
+        return _search(views, progress, 1.0, near)
     tried = 0
 
     def counted(n: int) -> None:
@@ -65,21 +75,29 @@ def axis_by_views(
         progress(n)
 
     with suppress(AxisError):
-        found = _search(projections, geometry, counted, 1.0, near)
+        found = _search(views, counted, 1.0, near)
         if found.confident:
             return found
     before = tried
-    return _search(projections, geometry, lambda n: progress(before + n), _WIDER, near)
+    return _search(views, lambda n: progress(before + n), _WIDER, near)
 
 
-def _search(
-    projections: F32, geometry: Geometry, progress: Callable[[int], None], width: float, near: bool
-) -> AxisEstimate:
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Line integrals [view, row, col], their geometry, and which pixels [row, col] the beam reaches; None: all."""
+
+    data: F32
+    geometry: Geometry
+    lit: NDArray[np.bool_] | None
+
+
+def _search(views: _Views, progress: Callable[[int], None], width: float, near: bool) -> AxisEstimate:
     """`axis_by_views` in a box of `width` times the field's."""
-    cols = geometry.detector_shape[1]
-    coarse = _Judge(projections, geometry, _COARSE, progress, width)
-    fine = _Judge(projections, geometry, _FINE, progress, width, others=coarse)
-    start, half = geometry.axis_col, 0.5 * fine.bin
+    cols = views.geometry.detector_shape[1]
+    longer = 1 if views.lit is None else _SHADOWED
+    coarse = _Judge(views, replace(_COARSE, sweeps=longer * _COARSE.sweeps), progress, width)
+    fine = _Judge(views, replace(_FINE, sweeps=longer * _FINE.sweeps), progress, width, others=coarse)
+    start, half = views.geometry.axis_col, 0.5 * fine.bin
     step = _WIDEST / 3 * cols
     best = min((start + n * step for n in range(-3, 4)), key=coarse)
     typical = float(np.median(list(coarse.found.values())))
@@ -131,8 +149,7 @@ _FINE = _Accuracy(COLS, rows=8, sweeps=6, one_grid=True)
 class _Judge:
     """The share of unseen views that a volume leaves, for an axis in columns of the data; each is asked once."""
 
-    projections: F32
-    geometry: Geometry
+    views: _Views
     accuracy: _Accuracy
     progress: Callable[[int], None]
     width: float
@@ -141,13 +158,15 @@ class _Judge:
     _grid: Grid | None = None
 
     def __post_init__(self) -> None:
-        whole, rows = self.geometry, self.geometry.detector_shape[0]
+        whole, rows = self.views.geometry, self.views.geometry.detector_shape[0]
         self.bin = max(1, min(rows, whole.detector_shape[1] // self.accuracy.cols))
-        data, views = self.projections, whole
+        data, views, lit = self.views.data, whole, self.views.lit
         if (height := self.accuracy.rows * self.bin) < rows:
             first = round(min(max(whole.axis_row - height / 2, 0), rows - height))
             data, views = data[:, first : first + height], whole.rows(first, first + height)
+            lit = None if lit is None else lit[first : first + height]
         self.binned, self._views = bin_views(np.ascontiguousarray(data), self.bin), views.binned(self.bin)
+        self._lit = None if lit is None else bin_views(lit[None].astype(np.float32), self.bin) > _WHOLE
         order = np.argsort(np.mod(views.angles, 2 * np.pi), kind="stable")
         self._unseen = order[1::_ONE_IN]
         self._seen = np.setdiff1d(order, self._unseen)
@@ -159,15 +178,18 @@ class _Judge:
         return self.found[axis_col]
 
     def _residual(self, axis_col: float) -> float:
-        moved = (axis_col - self.geometry.axis_col) / self.bin
+        moved = (axis_col - self.views.geometry.axis_col) / self.bin
         views = replace(self._views, axis_col=self._views.axis_col + moved)
         if self._grid is None or not self.accuracy.one_grid:
             self._grid = Grid.matching(views).widened(self.width, views)
         grid, method = self._grid, FistaTv(self.accuracy.sweeps, _TV_WEIGHT)
-        part = ReconProblem(self.binned[self._seen], views.select(self._seen), grid, DataUse(), 0, "cpu")
+        seen, unseen = self.binned[self._seen], self.binned[self._unseen]
+        lit = 1 if self._lit is None else self._lit
+        use = DataUse() if self._lit is None else DataUse(np.broadcast_to(self._lit, seen.shape).astype(np.float32))
+        part = ReconProblem(seen, views.select(self._seen), grid, use, 0, "cpu")
         volume = method.run(part, RunControl()).volume
-        unseen = self.binned[self._unseen]
-        left = unseen - Projector(views.select(self._unseen), grid).forward(volume.data)
+        unseen = unseen * lit
+        left = unseen - Projector(views.select(self._unseen), grid).forward(volume.data) * lit
         most = _norm(unseen)
         if most == 0:
             raise AxisError("the views held out show no matter, so that they tell nothing of the axis; give the axis")

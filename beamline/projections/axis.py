@@ -20,7 +20,10 @@ from beamline.projections.steps.poses import stated_poses
 from beamline.projections.tilt import spread, spread_views
 from beamline.storage.readers.base import ScanSource
 from recon.axis_by_views import COLS, VIEWS, axis_by_views
+from recon.base.geometry import Geometry
+from recon.base.masks import areas
 from recon.prep.align import AxisError, AxisEstimate, find_axis
+from recon.prep.correct import Projections
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64
@@ -129,7 +132,7 @@ def locate_axis(
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
 
-    An estimate without a clear optimum gives way to what the file states, if it states it.
+    An estimate without a clear optimum gives way to what the file states, if it states it, else to views held out.
 
     Raises:
         DataError: no axis in the search range explains the views.
@@ -142,6 +145,8 @@ def locate_axis(
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:
         raise _not_found(source, error) from error
+    if not estimate.confident and source.axis_col is None:
+        estimate = _by_unseen_views(band, source.angles[band.view_ids]) or estimate
     found = unbinned(estimate.value, correction.binning)
     if estimate.confident:
         return found, estimate
@@ -153,6 +158,24 @@ def locate_axis(
         "used. Check the slices, or give --axis COLUMN."
     )
     return source.axis_col, estimate
+
+
+def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
+    """The axis of a sample wider than the field, or of a detector in part without beam; None: not found so either.
+
+    A part without beam leaves it unsure: half a column, and more where the sample leaves the field, too.
+    """
+    if band.data.shape[1] < band.data.shape[2] // COLS:
+        return None  # columns would stay fine, and volumes take minutes
+    dark, some = areas(band.masked), spread(np.arange(angles.size), VIEWS)
+    data = np.ascontiguousarray(band.data[some])
+    with suppress(ValueError):
+        found = axis_by_views(
+            data, Geometry.parallel(angles[some], data.shape[1:]), lit=~dark if dark.any() else None
+        )  # fmt: skip
+        if found.confident or dark.any():
+            return replace(found, confident=not dark.any())
+    return None
 
 
 def stated_axis(source: ScanSource) -> float:

@@ -56,6 +56,23 @@ def test_the_axis_of_a_sample_wider_than_the_field() -> None:
     assert found.value == pytest.approx(41.8, abs=0.2) and found.confident
 
 
+@pytest.mark.parametrize("dark", [64, 72])
+def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
+    """To half a column: the dark part counts as not measured; its pixels hold a wall."""
+    n = 96
+    y, x = np.mgrid[:n, :n] - (n - 1) / 2
+    disc = np.where(np.hypot(x, y) < 34, 0.02, 0) + np.where(np.hypot(x - 10, y - 6) < 6, 0.02, 0)
+    disc[(np.abs(0.9 * x + 0.3 * y + 8) < 1) & (np.abs(y) < 18)] = 0
+    geometry = Geometry.parallel(np.pi * np.arange(60) / 60, (12, n), axis_col=48.6)
+    volume = np.repeat(disc[None], 12, 0).astype(np.float32)
+    views = Projector(geometry, Grid(volume.shape, 1.0)).forward(volume)
+    views += np.random.default_rng(0).normal(0, 0.01, views.shape).astype(np.float32)
+    views[..., dark:] = 5.0
+    lit = np.broadcast_to(np.arange(n) < dark, (12, n))
+    found = axis_by_views(views, replace(geometry, axis_col=47.5), lit=lit)
+    assert found.value == pytest.approx(48.6, abs=0.5)
+
+
 def test_a_right_start_stays_after_ten_candidates_and_a_wrong_one_does_not() -> None:
     """Also where it is so far from the axis that the candidates beside it leave nearly as much."""
     views, told = _views(29.2, SOD, SDD), list[int]()

@@ -213,11 +213,8 @@ def _estimate(value: float, confident: bool) -> AxisEstimate:
 
 def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: _estimate(18.0, False))
-    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()]).astype(
-        np.uint16
-    )
-    source = ArraySource(data, [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles]))
-    warnings: list[str] = []
+    monkeypatch.setattr(axis_module, "axis_by_views", lambda data, geometry, lit: _estimate(17.0, False))
+    source, warnings = _two_cylinders(), list[str]()
     prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
     assert prepared.axis_col == 18.0
     assert any("18.00, is not a clear optimum" in text and "--axis" in text for text in warnings)
@@ -226,6 +223,21 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
     assert prepared.axis_col == 20.5
     assert any("the file's 20.50 is used" in text for text in warnings)
+
+
+def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(axis_module, "find_axis", lambda data, angles: _estimate(18.0, False))
+    warnings: list[str] = []
+    prepared = prepare_projections(_two_cylinders(), Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
+    assert prepared.axis_col == pytest.approx(SCAN.axis_col, abs=0.2)
+    assert not any("axis" in text for text in warnings)
+
+
+def _two_cylinders() -> ArraySource:
+    data = np.concatenate([np.full((1, 4, 40), DARK), np.full((1, 4, 40), DARK + BEAM), SCAN.counts()])
+    return ArraySource(
+        data.astype(np.uint16), [2, 1] + [0] * 45, np.concatenate([[np.nan] * 2, SCAN.angles])
+    )  # fmt: skip
 
 
 def test_an_axis_at_the_edge_of_the_search_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
