@@ -236,7 +236,9 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
             require_harmless(file)
             n = volumes_in_time(file)
             if (at is None) != (n == 0) or (at is not None and not 0 <= at < n):
-                held = f"{n} volumes in time: name one by --at 0 to {n - 1} (`beamline export`)" if n else "one volume"
+                held = "one volume, not a series in time: leave out --at"
+                if n:
+                    held = f"{n} volumes in time: name one by --at 0 to {n - 1} (`beamline export`)"
                 raise DataError(f"{path} holds {held}.")
             record = _read_entry(file["entry"], at)
         except hdf5.ALTERED as error:
