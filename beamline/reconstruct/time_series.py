@@ -36,7 +36,7 @@ _VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each volume of the series; f
 
 
 @dataclass(frozen=True)
-class InTime:
+class WantedSeries:
     """What is asked of a series.
 
     Attributes:
@@ -59,7 +59,7 @@ class SeriesNeeds:
     output: int
 
     @classmethod
-    def of(cls, options: ReconOptions, wanted: InTime, geometry: Geometry) -> SeriesNeeds:
+    def of(cls, options: ReconOptions, wanted: WantedSeries, geometry: Geometry) -> SeriesNeeds:
         voxels = 4 * math.prod(shape := Grid.matching(geometry).shape)
         rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
         memory = (_VOLUMES * wanted.volumes + _FIELDS) * voxels + _COPIES * rays
@@ -84,7 +84,7 @@ class SeriesNeeds:
         ]
 
 
-def series_needs(options: ReconOptions, wanted: InTime) -> SeriesNeeds:
+def series_needs(options: ReconOptions, wanted: WantedSeries) -> SeriesNeeds:
     """What it takes, before any frame is read. ConfigError where the memory does not suffice, or options do not fit."""
     with options.source.open() as source:
         needs = SeriesNeeds.of(options, wanted, stated_geometry(source, options.selection))
@@ -126,7 +126,7 @@ class SeriesDone:
 
 def reconstruct_series(
     options: ReconOptions,
-    wanted: InTime,
+    wanted: WantedSeries,
     sink: Sink,
     clock: Clock,
     counting: Callable[[str], Callable[[int, int], None]],
@@ -181,8 +181,8 @@ def reconstruct_series(
     except ValueError as error:
         raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
     chosen = ""
-    if made.left_of_unseen is not None:
-        still, moved = made.left_of_unseen
+    if made.unseen_residuals is not None:
+        still, moved = made.unseen_residuals
         chosen = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
         sink(StateEntered("chosen", f"{'Motion' if made.motion else 'No motion'}, by {chosen}.", time=clock.now()))
     phases.enter("writing")

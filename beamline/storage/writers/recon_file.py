@@ -48,10 +48,10 @@ class VolumesInTime:
 
     def each(self) -> list[Any]:
         """The volumes, which are read where they are sliced along z."""
-        return [_OneOf(self.data, at) for at in range(len(self.seconds))]
+        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
 
 
-class _OneOf:
+class _VolumeAt:
     """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
 
     def __init__(self, data: Any, at: int) -> None:
