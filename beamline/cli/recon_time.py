@@ -59,11 +59,8 @@ def refuse_others(context: click.Context, of_views: Collection[str], output: Pat
 
 def recon_series(options: ReconOptions, volumes: int, moves: bool | None, dry: bool, as_json: bool) -> None:
     """Write the volumes, or say what they take."""
-    from beamline.reconstruct.time_series import (
-        WantedSeries,
-        reconstruct_series,
-        series_needs,
-    )  # here: help needs none of it
+    # Imported here: help needs none of it.
+    from beamline.reconstruct.time_series import WantedSeries, reconstruct_series, series_needs
 
     clock, wanted, found = SystemClock(), WantedSeries(volumes, moves), None
     with events_shown(as_json) as sink:
