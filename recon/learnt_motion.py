@@ -25,13 +25,13 @@ _KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
 _HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
 _JUDGED, _JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
 MOTION_SWEEPS = sum(turns for _, turns in _LEVELS) * _SWEEPS  # of `learnt_motion`
-JUDGE_SWEEPS = MOTION_SWEEPS + 2 * _JUDGED_SWEEPS  # of `moves`
+JUDGE_SWEEPS = MOTION_SWEEPS + 2 * _JUDGED_SWEEPS  # of `unseen_residuals`
 
 
-def moves(
+def unseen_residuals(
     views: EnergyViews, times: F64, weights: F64, go_on: Callable[[int, float], bool], stop: Callable[[], bool]
 ) -> tuple[float, float] | None:
-    """What volumes leave of views held out, where nothing moves and where they also move; None: stopped.
+    """Residuals of views held out, of volumes that do not move and of volumes that do; None: stopped.
 
     Of coarse voxels, each from seven of eight views. Arguments as of `learnt_motion`.
     """

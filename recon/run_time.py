@@ -99,15 +99,14 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
     """
     if isinstance(method, FitMethod):
         return _of_fit(method, extent, now)
-    if isinstance(method, IterativeMethod):
-        seconds = _of_iterations(method, extent, now, method.iterations)
-        return RunTime(seconds, seconds)
-    if isinstance(method, FieldMethod):
-        seconds = _of_field(method, extent, now)
-        return RunTime(seconds, seconds)
     candidates = candidates_of(method)
     if candidates[0] is method:
-        seconds = _of_direct(method, extent, now)
+        if isinstance(method, IterativeMethod):
+            seconds = _of_iterations(method, extent, now, method.iterations)
+        elif isinstance(method, FieldMethod):
+            seconds = _of_field(method, extent, now)
+        else:
+            seconds = _of_direct(method, extent, now)
         return RunTime(seconds, seconds)
     first = Extent(extent.geometry, [min(32, max(extent.heights))])
     known = not extent.geometry.is_cone  # the weight that the first trial finds is that of the others

@@ -17,7 +17,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import JUDGE_SWEEPS, MOTION_SWEEPS, learnt_motion, moves
+from recon.learnt_motion import JUDGE_SWEEPS, MOTION_SWEEPS, learnt_motion, unseen_residuals
 from recon.spectral import ALIKE_LONGER, weights_by_views
 from recon.spectral import TRIAL_SWEEPS as _WEIGHT_SWEEPS
 from recon.voxels.held_out_weight import ONE_IN
@@ -73,7 +73,7 @@ class TimedVolumes:
         grid: of each volume.
         residual: norm of what the volumes leave of the views, over the norm of the views.
         motion: from where each place takes its value; None: nothing moves.
-        left_of_unseen: what coarse volumes without and with motion leave of views held out, as `residual`; None where
+        unseen_residuals: what coarse volumes without and with motion leave of views held out, as `residual`; None where
             the motion was not chosen by them.
     """
 
@@ -82,7 +82,7 @@ class TimedVolumes:
     grid: Grid
     residual: float
     motion: Motion | None = None
-    left_of_unseen: tuple[float, float] | None = None
+    unseen_residuals: tuple[float, float] | None = None
 
     def at(self, time: float) -> F32:
         """The volume [z, y, x] at a time; before the first and after the last knot that of the knot."""
@@ -153,7 +153,7 @@ def fit_series(
     coarse, coarse_past = _of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
     coarse_weights = weights * math.sqrt(past.size / coarse_past.size)
     if motion is None:
-        left = moves(coarse, coarse_past, coarse_weights, go_on, stop)
+        left = unseen_residuals(coarse, coarse_past, coarse_weights, go_on, stop)
         motion = left is not None and left[1] < _MOVES * left[0]
     if motion:
         learnt = learnt_motion(coarse, coarse_past, coarse_weights, go_on, stop)

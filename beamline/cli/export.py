@@ -91,6 +91,8 @@ def export(
                 raise click.UsageError(f"{name} does not go with --bits, --window, --at or --dataset.")
             export_part(volume, output, as_json)
             return
+    if dataset is not None and at is not None:
+        raise click.UsageError("--at does not go with --dataset: a series in time has one array.")
     pixels = Pixels(int(bits), window)
     if pixels.bits == 32 and window is not None:
         raise click.UsageError("--window is of grey values: give --bits 8 or --bits 16 with it.")

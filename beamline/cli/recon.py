@@ -34,7 +34,7 @@ from beamline.cli.options import (
     volume_path,
 )
 from beamline.cli.recipe import config_option, recipe_text, repeating
-from beamline.cli.recon_time import reconstruct_in_time, refuse_others, time_options
+from beamline.cli.recon_time import recon_series, refuse_others, time_options
 from beamline.cli.selection_options import chosen, selection_options, steps_said
 from beamline.cli.terminal import counting, events_shown, results
 from beamline.core.errors import DataError, QualityError, ScanStopped
@@ -267,11 +267,11 @@ def recon(
         refuse_shared({"FILE": file, "--output": output})
         source, selection = chosen(file, seed, values)
         target = output or Path(f"{file.stem}_time.h5")
-        in_time = ReconOptions(
+        for_series = ReconOptions(
             source, OutputPaths(target, None), selection, seed=seed, unfinished=unfinished, memory=memory,
             command=repeating(context, file, target),
         )  # fmt: skip
-        reconstruct_in_time(in_time, volumes, moves, dry, as_json)
+        recon_series(for_series, volumes, moves, dry, as_json)
         return
     if moves is not None:
         raise click.UsageError("--moves and --no-moves are of volumes in time: give --time N with them.")

@@ -57,11 +57,12 @@ def refuse_others(context: click.Context, of_views: Collection[str], output: Pat
         raise click.UsageError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
 
 
-def reconstruct_in_time(options: ReconOptions, volumes: int, moves: bool | None, dry: bool, as_json: bool) -> None:
+def recon_series(options: ReconOptions, volumes: int, moves: bool | None, dry: bool, as_json: bool) -> None:
     """Write the volumes, or say what they take."""
-    from beamline.reconstruct.time_series import InTime, reconstruct_series, series_needs  # here: help needs none of it
+    # Imported here: help needs none of it.
+    from beamline.reconstruct.time_series import WantedSeries, reconstruct_series, series_needs
 
-    clock, wanted, found = SystemClock(), InTime(volumes, moves), None
+    clock, wanted, found = SystemClock(), WantedSeries(volumes, moves), None
     with events_shown(as_json) as sink:
         if dry:
             needs = series_needs(options, wanted)

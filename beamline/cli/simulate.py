@@ -72,9 +72,9 @@ def simulate(
 ) -> None:
     """Simulate SCENE: a YAML file, or the name of a scene that comes with the package.
 
-    A scene with `emission` gives the counts of a sample that emits (PET), which `beamline recon` reads, too. Of others
-    only the effects that the scene names are computed. The file has the format of the instrument, which
-    `beamline recon` reads. The first Ctrl-C stops after the current frame, with a readable file and its labels; the
+    Only the effects that the scene names are computed. The file has the format of the instrument, which
+    `beamline recon` reads. A scene with `emission` gives the counts of a sample that emits (PET), which it reads, too.
+    The first Ctrl-C stops after the current frame, with a readable file and its labels; the
     second stops at once.
 
     Exit code: 0 done, 2 wrong scene, 4 stopped, 5 disk error, 130 interrupted.
@@ -208,7 +208,7 @@ def _emission(
         if out:
             write_emission(out, scene, made)
             output("scan", f"{out}  {len(made.counts)} views, {made.counts.sum():.4g} counts")
-    except Exception:
+    except BaseException:  # Ctrl-C, too
         if truth:
             remove(truth)
         raise

@@ -16,7 +16,7 @@ from scipy.ndimage import map_coordinates
 from beamline.core.errors import DataError
 from beamline.page.slices import F32, HELD, VolumeSlices, slices_of
 from beamline.page.tiles import TileRegion, bin_mean
-from beamline.storage.volumes.files import opened_volume, seconds_of
+from beamline.storage.volumes.files import opened_volume, times_of
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 
 BINS = 256
@@ -73,7 +73,7 @@ class ShownVolume:
 
     def __init__(self, path: Path, held: int = HELD, fbp: bool = False, dataset: str | None = None) -> None:
         with ExitStack() as opened:
-            seconds = () if dataset is not None else seconds_of(path)
+            seconds = () if dataset is not None else times_of(path)
             record = opened.enter_context(opened_reconstruction(path, 0) if seconds else opened_volume(path, dataset))
             self.path, self._grid, self.has_fbp = path, record.volume.grid, record.fbp is not None
             values: Any = record.volume.data

@@ -31,12 +31,12 @@ from recon.base.volume import Grid, Volume
 from recon.series import TRIAL_SWEEPS, TimedViews, fit_series
 
 _SWEEPS = 60
-_COPIES = 7  # of all line integrals: views, lines, of a part held out, as moments, binned, and weights
-_VOLUMES, _FIELDS = 8, 12  # volumes for each of the series, and of one: displacements, what is displaced
+_COPIES = 7  # of all line integrals: views, lines, a part held out, moments, binned views, weights
+_VOLUMES, _FIELDS = 8, 12  # volumes in memory: for each volume of the series; for displacements and what they displace
 
 
 @dataclass(frozen=True)
-class InTime:
+class WantedSeries:
     """What is asked of a series.
 
     Attributes:
@@ -59,7 +59,7 @@ class SeriesNeeds:
     output: int
 
     @classmethod
-    def of(cls, options: ReconOptions, wanted: InTime, geometry: Geometry) -> SeriesNeeds:
+    def of(cls, options: ReconOptions, wanted: WantedSeries, geometry: Geometry) -> SeriesNeeds:
         voxels = 4 * math.prod(shape := Grid.matching(geometry).shape)
         rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
         memory = (_VOLUMES * wanted.volumes + _FIELDS) * voxels + _COPIES * rays
@@ -84,7 +84,7 @@ class SeriesNeeds:
         ]
 
 
-def series_needs(options: ReconOptions, wanted: InTime) -> SeriesNeeds:
+def series_needs(options: ReconOptions, wanted: WantedSeries) -> SeriesNeeds:
     """What it takes, before any frame is read. ConfigError where the memory does not suffice, or options do not fit."""
     with options.source.open() as source:
         needs = SeriesNeeds.of(options, wanted, stated_geometry(source, options.selection))
@@ -126,7 +126,7 @@ class SeriesDone:
 
 def reconstruct_series(
     options: ReconOptions,
-    wanted: InTime,
+    wanted: WantedSeries,
     sink: Sink,
     clock: Clock,
     counting: Callable[[str], Callable[[int, int], None]],
@@ -134,7 +134,8 @@ def reconstruct_series(
 ) -> SeriesDone:
     """Fit volumes in time to one scan, and write them.
 
-    From the first sweep of the fit on Ctrl-C ends it with the volumes so far; before that it interrupts.
+    Before the first sweep of the fit Ctrl-C interrupts, and nothing is written. From then on it writes the volumes so
+    far.
 
     Raises:
         ConfigError: too little memory, or too few views. DataError: the scan cannot be reconstructed, or the output
@@ -150,8 +151,7 @@ def reconstruct_series(
             check=lambda geometry: SeriesNeeds.of(options, wanted, geometry).refuse(), phases=phases,
         )  # fmt: skip
         times = _times(source, prepared.projections.view_ids, warn)
-    output = 4 * wanted.volumes * math.prod(Grid.matching(prepared.geometry).shape)
-    options.target.require_room(output)
+    options.target.require_room(SeriesNeeds.of(options, wanted, prepared.geometry).output)
     phases.enter("reconstruction")
     early, tried, progress = False, 0, counting("sweeps")
     trials = counting("trial sweeps")
@@ -164,7 +164,7 @@ def reconstruct_series(
         else:
             tried += 1
             trials(tried, TRIAL_SWEEPS)
-            progress = counting("sweeps")
+            progress = counting("sweeps")  # whose clock starts when the last trial ends
         early = stopping()
         return not early
 
@@ -181,12 +181,11 @@ def reconstruct_series(
     except ValueError as error:
         raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
     chosen = ""
-    if made.left_of_unseen is not None:
-        still, moved = made.left_of_unseen
+    if made.unseen_residuals is not None:
+        still, moved = made.unseen_residuals
         chosen = f"views held out: residual {still:.4g} where nothing moves, {moved:.4g} with motion"
         sink(StateEntered("chosen", f"{'Motion' if made.motion else 'No motion'}, by {chosen}.", time=clock.now()))
     phases.enter("writing")
-    stop.ready = False
     series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]))
     shape, settings = series.data.shape, {"volumes": wanted.volumes, "moves": made.motion is not None, "chosen": chosen}
     outcome = ReconOutcome(
@@ -214,10 +213,10 @@ def reconstruct_series(
 
 
 def _times(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
-    """s when each of these views was exposed; evenly in the order of the file where it does not say."""
+    """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
     known = source.times
     if known is not None and np.isfinite(known[view_ids]).all():
         return np.asarray(known[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
-    warn(f"The file does not say when each view was taken: they count as even, {period} s apart, in its order.")
+    warn(f"The file states no time of each view. Views count as evenly spaced, {period} s apart, in the file's order.")
     return np.asarray(view_ids * float(period), np.float64)

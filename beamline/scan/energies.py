@@ -108,11 +108,10 @@ def run_energies(
     each = at_energies(config)
     with ExitStack() as held:
         jobs = [None] * len(each) if series is None else [_job(run, held) for run in _runs(series, config)]
-        whole = {one.scan.energy for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)}
-        if series is not None and len(whole) == len(each):
-            return SeriesRun(series, tuple((one.scan.energy or 0.0, job) for one, job in zip(each, jobs, strict=True)
-                                           if isinstance(job, Path)), ())  # fmt: skip
-        refuse_violations(dry_run(config, series or place, whole=whole).timeline)
+        complete = [(one.scan.energy or 0.0, job) for one, job in zip(each, jobs, strict=True) if isinstance(job, Path)]
+        if series is not None and len(complete) == len(each):
+            return SeriesRun(series, tuple(complete), ())
+        refuse_violations(dry_run(config, series or place, whole=[energy for energy, _ in complete]).timeline)
         last = max((job.last_frame_time for job in jobs if isinstance(job, ResumableRun)), default=0.0)
         clock = None if config.simulation is None else clock_of(config.simulation.clock, not_before=last)
         instrument = held.enter_context(connect(config, clock=clock, ask=ask, check_stop=stop.refuse_abort))

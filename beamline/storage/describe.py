@@ -12,7 +12,7 @@ import numpy as np
 from beamline.storage.readers.base import ScanSource, rows_replaced
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.validate import altered_said, source_findings
-from beamline.storage.volumes.files import seconds_of, volume_format
+from beamline.storage.volumes.files import times_of, volume_format
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
 from drivers.base.frame import FrameKind
 
@@ -21,7 +21,7 @@ def describe(scan: SourceOptions | Path | str) -> Mapping[str, Any]:
     """Describe a scan or a volume. DataError if it cannot be opened."""
     path = Path(scan.path if isinstance(scan, SourceOptions) else scan)
     if (kind := volume_format(path)) is not None:
-        seconds = seconds_of(path)
+        seconds = times_of(path)
         with opened_reconstruction(path, 0) if seconds else kind.open(path) as record:
             return describe_volume(path, kind.name, record)
     with open_scan(scan) as source:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +52,17 @@ def _obj(data: bytes) -> Reals:
 
 
 def _ply(data: bytes) -> Reals:
-    head, _, body = data.partition(b"end_header\n")
+    head, *rest = re.split(rb"end_header\r?\n", data, maxsplit=1)
+    if not rest:
+        raise ValueError("its header does not end")
+    body = rest[0]
     words = [line.split() for line in head.decode().splitlines()]
     n = {line[1]: int(line[2]) for line in words if line[:1] == ["element"]}
     own = [(line[2], _TYPES[line[1]]) for line in words if line[:1] == ["property"] and line[1] != "list"]
-    count, index = next((_TYPES[line[2]], _TYPES[line[3]]) for line in words if line[:2] == ["property", "list"])
+    lists = [line for line in words if line[:2] == ["property", "list"]]
+    if not lists:
+        raise ValueError("it has no faces")
+    count, index = (_TYPES[name] for name in lists[0][2:4])
     if ["format", "ascii", "1.0"] in words:
         lines = body.decode().splitlines()
         at = [name for name, _ in own]
@@ -72,8 +79,10 @@ def _ply(data: bytes) -> Reals:
 
 
 def _corners(vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> Reals:
-    if faces.ndim != 2 or faces.shape[1] != 3 or faces.min() < 0:
+    if faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(f"faces have shape {faces.shape}; expected three corners each")
+    if faces.min(initial=0) < 0:
+        raise ValueError("a face names a corner before the first one")
     return vertices[faces].astype(np.float64)
 
 

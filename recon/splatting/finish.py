@@ -47,7 +47,7 @@ _CLEARLY = 0.9  # a parallel beam: residuals .94 to .98 of the first's lose 3 dB
 # Residual of views held out after 50 steps, over that of total variation from FBP. It is 0.99 to 1.00 after 24 sweeps
 # where 100 steps lose nothing, 0.65 to 0.97 where they do. After 8 sweeps of the former it is at most 1.15.
 _AS_WELL = 0.98, 1.2
-_AS_NEAR = 0.99  # further sweeps that bring less are left out: 16 for 24 gain 0.18 dB on grains, lose 0.08 on a battery
+_NEAR_BEST = 0.99  # fewest sweeps whose residual times it is the least or less: 16 for 24 gain 0.18 dB, or lose 0.08
 _WILD, _FEW = 0.5, 0.01  # of the largest line integral; of the rays: more disagree only where the fit has failed
 
 
@@ -108,7 +108,7 @@ class _TryFinish:
             low, high = (share * preferred.residual for share in _AS_WELL)
             left = residuals_of_rounds(problem, x, preferred.weight, SWEEPS, (low, high))
             as_well = bool(left) and low <= left[-1] <= high
-            rounds = 1 + next(n for n, one in enumerate(left) if one * _AS_NEAR <= min(left)) if as_well else 0
+            rounds = 1 + next(n for n, one in enumerate(left) if one * _NEAR_BEST <= min(left)) if as_well else 0
             weight = math.ldexp(preferred.weight, _power(problem))
             self.found = FinishTrial(rounds * SWEEPS, weight, preferred.residual)
         return x

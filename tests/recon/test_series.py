@@ -141,8 +141,8 @@ def test_views_held_out_tell_a_sample_that_moves_from_one_that_changes_in_place(
     seen = np.stack([projector.subset([v]).forward(x)[0] for v, x in enumerate(settled)])
     for views, moving in ((fading, False), (replace(fading, projections=seen.astype(np.float32)), True)):
         found = fit_series(views, 3, tv_weight=0.15, sweeps=2)
-        assert found.left_of_unseen is not None
-        without, with_motion = found.left_of_unseen
+        assert found.unseen_residuals is not None
+        without, with_motion = found.unseen_residuals
         assert (found.motion is not None) == (with_motion < without) == moving
 
 

@@ -18,7 +18,7 @@ from drivers.base.frame import FrameKind
 F32 = NDArray[np.float32]
 GROUP = "emission"
 SETS = ("attenuation", "normalisation", "randoms", "scatter")
-"""Beside the counts, each [view, row, col]: line integrals of the attenuation, efficiency, mean counts of both."""
+"""Beside the counts [view, row, col]: line integrals of the attenuation, efficiency, mean randoms, mean scatter."""
 
 
 class EmissionSource(StacksSource):
@@ -57,7 +57,7 @@ class EmissionSource(StacksSource):
         return EmissionCounts(counts, survival, sets["randoms"] + sets["scatter"])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        """Line integrals of the activity [frame, row, col], counts per mm of line x mm; NaN where nothing survives."""
+        """Line integrals of the activity [frame, row, col], in counts; NaN where nothing survives."""
         found = self._counted(frame_indices(frames, self.image_key.size), rows)
         lines = np.full_like(found.counts, np.nan)
         return np.divide(found.counts - found.background, found.survival, out=lines, where=found.survival > 0)

@@ -23,7 +23,7 @@ from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.volume import volume_findings
-from beamline.storage.volumes.files import opened_volume, seconds_of, volume_format
+from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_degrees
@@ -55,7 +55,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     try:
         if kind is not None:
             of_all: dict[Finding, None] = {}
-            for at in range(len(seconds_of(path))) or (None,):
+            for at in range(len(times_of(path))) or (None,):
                 with opened_volume(path, at=at) as record, hdf5.readable(path):
                     of_all |= dict.fromkeys(volume_findings(record))
             return [*of_all]

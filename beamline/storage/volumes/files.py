@@ -88,7 +88,7 @@ def volume_format(path: Path) -> VolumeFormat | None:
     return found
 
 
-def seconds_of(path: Path) -> tuple[float, ...]:
+def times_of(path: Path) -> tuple[float, ...]:
     """When each of several volumes in time was, s from the first view on; empty where a file holds no such series."""
     if not NXtomoproc().holds(path):
         return ()

@@ -48,10 +48,10 @@ class VolumesInTime:
 
     def each(self) -> list[Any]:
         """The volumes, which are read where they are sliced along z."""
-        return [_OneOf(self.data, at) for at in range(len(self.seconds))]
+        return [_VolumeAt(self.data, at) for at in range(len(self.seconds))]
 
 
-class _OneOf:
+class _VolumeAt:
     """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is sliced along z."""
 
     def __init__(self, data: Any, at: int) -> None:
@@ -236,7 +236,9 @@ def opened_reconstruction(path: Path, at: int | None = None) -> Iterator[ReconRe
             require_harmless(file)
             n = volumes_in_time(file)
             if (at is None) != (n == 0) or (at is not None and not 0 <= at < n):
-                held = f"{n} volumes in time: name one by --at 0 to {n - 1} (`beamline export`)" if n else "one volume"
+                held = "one volume, not a series in time: leave out --at"
+                if n:
+                    held = f"{n} volumes in time: name one by --at 0 to {n - 1} (`beamline export`)"
                 raise DataError(f"{path} holds {held}.")
             record = _read_entry(file["entry"], at)
         except hdf5.ALTERED as error:

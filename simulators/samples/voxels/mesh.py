@@ -21,18 +21,20 @@ from simulators.samples.voxels.voxels import Voxels
 Reals = NDArray[np.float64]
 
 _MM = {"m": 1e3, "mm": 1.0, "um": 1e-3}
-_LINES = 4  # along z through a voxel, per side
+_LINES = 4  # along z through a voxel, in each of x and y
 _MOST = 2**29  # voxels
 
 
 @dataclass(frozen=True)
 class MeshSettings:
-    """Attributes:
-    file: .stl, .ply or .obj, beside the scene file or by its full path.
-    attenuation: 1/mm, inside.
-    voxel_mm: of the volume that it becomes; half a pixel or less.
-    unit: of the lengths in the file.
-    name: of its label.
+    """The keys of a mesh in a scene.
+
+    Attributes:
+        file: .stl, .ply or .obj, beside the scene file or by its full path.
+        attenuation: 1/mm, inside.
+        voxel_mm: edge of the voxels that the mesh becomes; half a pixel or less.
+        unit: of the lengths in the file.
+        name: of its label.
     """
 
     file: str
@@ -62,11 +64,13 @@ def require_closed(triangles: Reals) -> None:
     there = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there = there[there[:, 0] != there[:, 1]]
     n = np.int64(corners.max(initial=0) + 1)
-    one, back = (np.sort(there[:, a] * n + there[:, 1 - a]) for a in (0, 1))
-    if not len(triangles) or one.size != back.size or (one != back).any():
-        lacking = np.setdiff1d(one, back).size
+    ways = np.concatenate([there[:, a] * n + there[:, 1 - a] for a in (0, 1)])
+    edges, which = np.unique(ways, return_inverse=True)
+    one, back = (np.bincount(half, minlength=edges.size) for half in np.split(which, 2))
+    lacking = int(np.maximum(one - back, 0).sum())  # an edge of two triangles needs two ways back
+    if lacking or not len(triangles):
         raise ValueError(
-            f"the mesh of {len(triangles)} triangles is open: {lacking} of {one.size} edges have no neighbour in the "
+            f"the mesh of {len(triangles)} triangles is open: {lacking} of {len(there)} edges have no neighbour in the "
             "other direction. Close it, with all triangles anticlockwise seen from outside"
         )
 

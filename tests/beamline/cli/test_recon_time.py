@@ -67,6 +67,8 @@ def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: 
         assert np.array_equal(np.load(tmp_path / "last.npy"), file["entry/data/data"][1])
     with opened_volume(tmp_path / "last.h5") as record:  # an ordinary volume
         assert (record.series, record.parameters["time_s"]) == (None, pytest.approx(SPAN))
+    both = beamline("export", str(series), "--at", "1", "--dataset", "entry/data/data", "-o", str(tmp_path / "b.npy"))
+    assert (both.exit_code, (tmp_path / "b.npy").exists()) == (2, False)
     beyond = beamline("export", str(series), "--at", "2", "-o", str(tmp_path / "none.npy"))
     assert (beyond.exit_code, (tmp_path / "none.npy").exists()) == (5, False)
     assert beamline("export", str(tmp_path / "last.h5"), "--at", "0", "-o", str(tmp_path / "n.npy")).exit_code == 5

@@ -31,6 +31,28 @@ def test_text(tmp_path: Path, name: str) -> None:
     np.testing.assert_array_equal(read_mesh(tmp_path / name), [[[0, 0, 0], [1, 0, 0], [0, 2, 0]]])
 
 
+def test_text_with_the_line_ends_of_windows(tmp_path: Path) -> None:
+    for name, text in TEXT.items():
+        (tmp_path / name).write_bytes(text.replace("\n", "\r\n").encode())
+        np.testing.assert_array_equal(read_mesh(tmp_path / name), [[[0, 0, 0], [1, 0, 0], [0, 2, 0]]])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("points.ply", TEXT["a.ply"].split("element face")[0] + "end_header\n0 0 0\n1 0 0\n0 2 0\n", "it has no faces"),
+        ("head.ply", TEXT["a.ply"].split("end_header")[0], "its header does not end"),
+        ("a.obj", TEXT["a.obj"].replace("1//1", "0//1"), "a corner before the first one"),
+        ("a.obj", TEXT["a.obj"].replace("3//1", "3//1 1//1"), "expected three corners each"),
+        ("a.obj", TEXT["a.obj"].replace("3//1", "4//1"), "out of bounds"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, name: str, text: str, said: str) -> None:
+    (tmp_path / name).write_text(text, "utf-8")
+    with pytest.raises(DataError, match=said):
+        read_mesh(tmp_path / name)
+
+
 def _indexed(triangles: np.ndarray) -> Mesh:
     vertices, faces = np.unique(triangles.reshape(-1, 3).astype(np.float32), axis=0, return_inverse=True)
     return Mesh(vertices, faces.reshape(-1, 3).astype(np.int32))

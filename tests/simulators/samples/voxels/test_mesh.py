@@ -61,8 +61,9 @@ def test_a_hollow_and_a_mesh_turned_inside_out() -> None:
 def test_an_open_mesh_is_refused_and_a_closed_one_is_a_sample() -> None:
     ball = sphere(200, 1000.0)
     require_closed(ball)
-    for wrong in (ball[1:], np.concatenate([ball[:1, ::-1], ball[1:]]), ball[:0]):
-        with pytest.raises(ValueError, match="is open"):
+    turned = np.concatenate([ball[:1, ::-1], ball[1:]])
+    for wrong, lacking in ((ball[1:], 3), (turned, 6), (np.concatenate([ball, ball[:1]]), 3), (ball[:0], 0)):
+        with pytest.raises(ValueError, match=f"is open: {lacking} of"):
             require_closed(wrong)
     entry = {"kind": "mesh", "file": "b.stl", "unit": "um", "attenuation": 2.0, "voxel_mm": 0.1}
     beam = Beam(1e5)
