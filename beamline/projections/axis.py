@@ -129,10 +129,13 @@ def locate_axis(
     frames: NDArray[np.int64],
     warn: Warn,
     progress: Callable[[int, int], None] = lambda n, total: None,
+    *,
+    all_there: bool = True,
 ) -> tuple[float, AxisEstimate]:
     """The rotation axis in columns of the full detector, from a band of rows of views spread over `frames`.
 
-    An estimate without a clear optimum gives way to what the file states, if it states it, else to views held out.
+    An estimate without a clear optimum gives way to what the file states. If it states nothing and the views are
+    `all_there`, the estimate gives way to views held out; those of a part of the turn would mislead.
 
     Raises:
         DataError: no axis in the search range explains the views.
@@ -145,7 +148,7 @@ def locate_axis(
         estimate = find_axis(band.data, source.angles[band.view_ids])
     except ValueError as error:
         raise _not_found(source, error) from error
-    if not estimate.confident and source.axis_col is None:
+    if all_there and not estimate.confident and source.axis_col is None:
         estimate = _by_unseen_views(band, source.angles[band.view_ids]) or estimate
     found = unbinned(estimate.value, correction.binning)
     if estimate.confident:

@@ -47,7 +47,8 @@ class AxisSearch:
         self._next, self.settled = views.size + views.size // 2, ended
         last_chance = ended and self.col is None
         try:
-            found, estimate = locate_axis(self._source, correction, views, self._warn if last_chance else _quiet)
+            told = self._warn if last_chance else _quiet
+            found, estimate = locate_axis(self._source, correction, views, told, all_there=last_chance)
         except DataError:
             if last_chance:
                 raise

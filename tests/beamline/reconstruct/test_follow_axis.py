@@ -61,10 +61,9 @@ def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.M
 def test_an_axis_without_a_clear_optimum_waits_for_the_end_and_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "beamline.projections.axis.find_axis",
-        lambda data, angles: AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), False, "pair"),
-    )
+    unclear = AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), False, "pair")
+    monkeypatch.setattr("beamline.projections.axis.find_axis", lambda data, angles: unclear)
+    monkeypatch.setattr("beamline.projections.axis.axis_by_views", lambda data, geometry, lit: unclear)
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
     follow(options(tmp_path, selection=Selection()), events.append, clock, RHYTHM)
