@@ -39,7 +39,9 @@ def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
 
 
 def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def locate(source: object, corrector: object, frames: np.ndarray, warn: object) -> tuple[float, AxisEstimate]:
+    def locate(
+        source: object, corrector: object, frames: np.ndarray, warn: object, all_there: bool
+    ) -> tuple[float, AxisEstimate]:
         value = 18.0 if frames.size < 20 else 20.7
         return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
 
