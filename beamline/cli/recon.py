@@ -257,7 +257,7 @@ def recon(
     from beamline.reconstruct.finished import reconstruct_file
     from beamline.reconstruct.follow import follow as follow_scan
     from beamline.reconstruct.options import ReconOptions
-    from beamline.reconstruct.result import OutputPaths, report_beside
+    from beamline.reconstruct.output_paths import OutputPaths, report_beside
     from recon.voxels.enough_views import Goal
 
     settings = {name: values.pop(name) for name in SETTINGS}

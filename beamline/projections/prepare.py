@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,42 +99,18 @@ def prepare_projections(
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
     _warn_of_other_axis(source, selection, axis_col, warn)
-    moved: dict[str, ViewPlaces] = {}
-    rays: dict[str, StepDone] = {}
     phases.enter("jumps", "guesses")
-    for place_step in (step for step in selection.in_order if isinstance(step, PlaceStep)):
-        places = place_step.place(source, selection, usable, axis_col, phases.progress)
-        moved[place_step.name] = places
-        if places.said:
-            warn(places.said)
-        usable = usable.only(places.frames)
-
-    learnt: Calibrated | None = None
-
-    def placed(part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
-        geometry = geometry_of(source, part, axis_col, source.angles[view_ids])
-        for places in moved.values():
-            geometry = places.corrected(geometry, view_ids)
-        for ray_step in (step for step in selection.in_order if isinstance(step, RayStep)):
-            geometry, rays[ray_step.name] = ray_step.rays(source, part, geometry)
-        return geometry
-
-    def seen(view_ids: NDArray[np.int64]) -> Geometry:
-        geometry = placed(selection, view_ids)
-        return geometry if learnt is None else learnt.corrected(geometry, view_ids)
-
-    chosen = choose_views(source, usable.frames, selection, seen(usable.frames).period)
+    places = _Places(source, selection, axis_col)
+    usable = places.find(usable, warn, phases)
+    chosen = choose_views(source, usable.frames, selection, places.of(usable.frames).period)
     wanted, rest = usable.frames[chosen], np.delete(usable.frames, chosen)
     if poses is not None:
         require_known(poses, source, selection, wanted)
         rest = rest[poses.known(rest)]
     others_ids = spread(rest, _HELD_OUT_VIEWS)
-    calibrate = selection.step(Calibrate)
-    if calibrate.geometry:
-        phases.enter("calibration", "steps")
-        learnt = calibrate.learn(source, selection, np.union1d(wanted, others_ids), placed, phases.progress)
+    places.calibrate(np.union1d(wanted, others_ids), phases)
     if check is not None:
-        check(seen(wanted))
+        check(places.of(wanted))
     phases.enter("correction")
     if spill is None:
         projections = correction.at_once(wanted, progress=phases.progress)
@@ -143,22 +119,74 @@ def prepare_projections(
     phases.enter("background, rings, views held out, hardening", "corrections")
     others = correction.at_once(others_ids) if rest.size else None
     ids = projections.view_ids
-    column = axis_col if learnt is None else axis_col + learnt.axis
-    found = assemble(source, selection, projections, seen(ids), (column, axis), usable, warn, spill is not None)
+    on_disk, column = spill is not None, places.axis_col
+    found = assemble(source, selection, projections, places.of(ids), (column, axis), usable, warn, on_disk)
     if others is not None:
-        found = replace(found, held_out=(others.data, seen(others.view_ids)), held_out_ids=others.view_ids)
-    done = {**correction.done, **({"tilt": selection.step(TiltAndLens).done(sought)} if sought else {})}
-    done |= {name: places.done for name, places in moved.items()} | rays
-    if learnt is not None:
-        done[calibrate.name] = learnt.done
+        found = replace(found, held_out=(others.data, places.of(others.view_ids)), held_out_ids=others.view_ids)
+    tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
+    done = {**correction.done, **tilt, **places.done}
     found = replace(found, done=done)
     steps = [step for step in selection.in_order if isinstance(step, ScanStep)]
     for n, step in enumerate(steps, 1):
         done[step.name] = step.apply(found, source.angles[ids], phases.progress)
         phases.progress(n, len(steps))
-    if spill is not None:
+    if on_disk:
         _fill_unknown(found)
     return found
+
+
+@dataclass(eq=False)
+class _Places:
+    """Where the views see the sample from: the stated angles, and what steps find out and change."""
+
+    source: ScanSource
+    selection: Selection
+    stated_axis: float
+    moved: dict[str, ViewPlaces] = field(default_factory=dict)
+    rays: dict[str, StepDone] = field(default_factory=dict)
+    learnt: Calibrated | None = None
+
+    @property
+    def axis_col(self) -> float:
+        """The column of the rotation axis."""
+        return self.stated_axis if self.learnt is None else self.stated_axis + self.learnt.axis
+
+    @property
+    def done(self) -> dict[str, StepDone]:
+        """What the steps did, by their names."""
+        calibrated = {} if self.learnt is None else {self.selection.step(Calibrate).name: self.learnt.done}
+        return {**{name: places.done for name, places in self.moved.items()}, **self.rays, **calibrated}
+
+    def find(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
+        """Let each step find the places of the views; those of `usable` that still can be used."""
+        for step in (step for step in self.selection.in_order if isinstance(step, PlaceStep)):
+            found = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
+            self.moved[step.name] = found
+            if found.said:
+                warn(found.said)
+            usable = usable.only(found.frames)
+        return usable
+
+    def calibrate(self, view_ids: NDArray[np.int64], phases: Phases) -> None:
+        """Learn the geometry from these views, where that is asked for."""
+        step = self.selection.step(Calibrate)
+        if step.geometry:
+            phases.enter("calibration", "steps")
+            self.learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
+
+    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of views, before calibration."""
+        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
+        for found in self.moved.values():
+            geometry = found.corrected(geometry, view_ids)
+        for step in (step for step in self.selection.in_order if isinstance(step, RayStep)):
+            geometry, self.rays[step.name] = step.rays(self.source, part, geometry)
+        return geometry
+
+    def of(self, view_ids: NDArray[np.int64]) -> Geometry:
+        """The geometry of views."""
+        geometry = self.uncalibrated(self.selection, view_ids)
+        return geometry if self.learnt is None else self.learnt.corrected(geometry, view_ids)
 
 
 def _warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import residual_share
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
 from recon.base.method import BoundedMethod

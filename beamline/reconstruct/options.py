@@ -8,8 +8,8 @@ from pathlib import Path
 from beamline.core.errors import ConfigError
 from beamline.projections.selection import Selection
 from beamline.reconstruct.checkpoints import CheckpointOptions
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.region import Region, selection_around
-from beamline.reconstruct.result import OutputPaths
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.partial_volume import can_become

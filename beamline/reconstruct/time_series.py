@@ -19,8 +19,8 @@ from beamline.projections.poses import stated_geometry
 from beamline.projections.prepare import prepare_projections
 from beamline.reconstruct.finished import require_finished
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.parameters import parameters_of
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
-from beamline.reconstruct.result import parameters_of
 from beamline.reconstruct.slabs import memory_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import ReconRecord, VolumesInTime, write_reconstruction

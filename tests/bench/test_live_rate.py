@@ -25,7 +25,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.follow import follow
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.scan.live_process import follow_command
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import SourceOptions

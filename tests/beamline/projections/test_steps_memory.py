@@ -25,7 +25,7 @@ from beamline.projections.steps.rings import Rings
 from beamline.projections.steps.step import PrepStep, ScanPart, ScanStep, StepMemory, ViewStep
 from beamline.projections.tilt import with_tilt
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.slabs import Needs, needs_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan

@@ -18,7 +18,7 @@ from beamline.projections.steps.step import StepDone, options_of
 from beamline.projections.steps.width import Width
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.simulate.scene_file import Scan, open_scene
 from beamline.simulate.write import write_scan
 from beamline.storage.readers.open import SourceOptions, open_scan

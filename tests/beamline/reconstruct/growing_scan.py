@@ -15,7 +15,7 @@ from beamline.monitor.digest import digest
 from beamline.projections.selection import Selection
 from beamline.reconstruct.follow import FollowTiming
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.frame import Frame

@@ -19,7 +19,7 @@ from beamline.reconstruct import budget as module
 from beamline.reconstruct.budget import Budgeted, binned, within
 from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock

@@ -22,7 +22,7 @@ from beamline.reconstruct import result as deliver
 from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.finished import reconstruct_file
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.checkpoint import read_checkpoint
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo

@@ -22,7 +22,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import growing as module
 from beamline.reconstruct import snapshots
 from beamline.reconstruct.follow import follow
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame

@@ -21,7 +21,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct import estimate, result
 from beamline.reconstruct import slabs as module
 from beamline.reconstruct.options import ReconOptions
-from beamline.reconstruct.result import OutputPaths
+from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.slab_run import _as_they_come
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers import partial_volume

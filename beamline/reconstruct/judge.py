@@ -1,0 +1,226 @@
+"""Judges a volume before delivery: figures of merit, FBP beside it, and warnings of what it may hide or invent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.events import Sink, StateEntered, Warned
+from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.measure import measure, regions, residual_share
+from beamline.reconstruct.output_paths import OutputPaths
+from beamline.reconstruct.recon_report import ReconOutcome, ReportContext
+from beamline.reconstruct.remarks import (
+    hiding_warning,
+    lost_mass_warning,
+    needles_warning,
+    odd_views_warning,
+    stray_mass_warning,
+)
+from beamline.storage.scratch import scratch_array
+from drivers.base.clock import Clock
+from recon.assess.lost_mass import compare
+from recon.base.volume import Grid, Volume
+from recon.methods import BASELINE, by_name
+from recon.voxels.direct import direct, has_direct_method
+from recon.voxels.stray_mass import stray_mass, stray_mass_share
+from recon.voxels.unexplained import Unexplained, unexplained
+
+# Times of projecting all views that these take, about: a look for odd views, and a direct method with its figures.
+_ODD_VIEWS, _DIRECT = 1.5, 2.5
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedVolume:
+    """A volume with what was found about it.
+
+    Attributes:
+        volumes: the volume and, where it is compared with one, FBP of the same views before it; by method.
+        metrics: figures of merit of each, by method.
+        remarks: warnings, those of the context first.
+        left: what the volume leaves in the views; None where that is not known.
+        stray: mass where views show nothing [y, x]; None without any.
+        hiding: the warning that the volume may hide structure; empty without one.
+        keeps_fbp: FBP is to be kept in the output, because the volume is in doubt.
+    """
+
+    volumes: Mapping[str, Volume]
+    metrics: Mapping[str, dict[str, float]]
+    remarks: Sequence[str]
+    left: Unexplained | None
+    stray: NDArray[np.float32] | None
+    hiding: str
+    keeps_fbp: bool
+
+
+def judge(
+    made: ReconOutcome,
+    prepared: PreparedProjections,
+    truth: Volume | None,
+    target: OutputPaths,
+    context: ReportContext,
+    sink: Sink,
+    clock: Clock,
+    in_parts: bool = False,
+) -> JudgedVolume:
+    """Measure a volume, compare it with its views and with FBP, and tell `sink` of each warning.
+
+    Looks that would take longer than `context` leaves, or that somebody waits for, are left out with a remark.
+
+    Args:
+        in_parts: the output is made of slabs already, so that FBP cannot be kept in it.
+    """
+    at_work = _Judging(made, prepared, truth, target, context, sink, clock)
+    at_work.remarks.extend(context.warnings)
+    left = at_work.look_at_residual()
+    stray = at_work.look_for_stray_mass()
+    at_work.warn(needles_warning(made, prepared.geometry))
+    at_work.look_for_odd_views()
+    compared = at_work.compare_with_fbp()
+    hiding = "" if left is None else hiding_warning(made, left)
+    doubtful = at_work.look_for_lost_mass() or bool(hiding)
+    keeps_fbp = doubtful and compared and not in_parts and target.takes_a_second(made.volume.grid)
+    if keeps_fbp:
+        at_work.warn(
+            f"FBP of the same views is kept beside the volume: `beamline view {target.output.name}` shows both."
+        )
+    elif doubtful and compared:
+        at_work.warn(
+            "FBP of the same views is not kept beside the volume: that takes an .h5 made at once, and room on its "
+            "disk. Make it with --method fbp to compare."
+        )
+    at_work.tell_what_was_left_out()
+    return JudgedVolume(at_work.volumes, at_work.metrics, at_work.remarks, left, stray, hiding, keeps_fbp)
+
+
+@dataclass(eq=False)
+class _Judging:
+    """The looks at one volume, in their order, with what they found so far."""
+
+    made: ReconOutcome
+    prepared: PreparedProjections
+    truth: Volume | None
+    target: OutputPaths
+    context: ReportContext
+    sink: Sink
+    clock: Clock
+    volumes: dict[str, Volume] = field(init=False)
+    metrics: dict[str, dict[str, float]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    mask: NDArray[np.int8] | None = None
+    all_rays: float = 0.0  # seconds to project all views, about
+
+    def __post_init__(self) -> None:
+        self.volumes = {self.made.method: self.made.volume}
+
+    @property
+    def waited_for(self) -> bool:
+        """Somebody stopped the reconstruction, and waits."""
+        return "ended_early" in self.made.settings
+
+    @property
+    def direct(self) -> bool:
+        return by_name(self.made.method).traits.direct
+
+    def has_time_for(self, projections: float) -> bool:
+        """Whether there is time for so many times the projection of all views."""
+        return not self.waited_for and self.context.leaves(projections * self.all_rays)
+
+    def warn(self, said: str) -> None:
+        """Tell of a warning that is not empty, and keep it."""
+        if said:
+            self.sink(Warned(said, time=self.clock.now()))
+            self.remarks.append(said)
+
+    def measured(self, volume: Volume, seconds: float) -> dict[str, float]:
+        """Figures of merit; without residuals where the volume is a region, whose views show more than it has."""
+        grid, geometry = self.made.volume.grid, self.prepared.geometry
+        is_part = self.context.region is not None and grid.shape != Grid.matching(geometry).shape
+        found = measure(volume, None if is_part else self.prepared, self.truth, self.mask, self.context.phases.progress)
+        return {**found, "seconds": seconds}
+
+    def look_at_residual(self) -> Unexplained | None:
+        """Measure the volume, and what it leaves in the views."""
+        made, prepared, seed = self.made, self.prepared, self.context.seed
+        views, rng = prepared.projections.data, np.random.default_rng(seed)
+        left = unexplained(made.volume, views, prepared.geometry, rng, prepared.ray_factors())
+        self.mask = regions(self.truth or made.volume, seed)  # after the work that takes most memory
+        before = self.clock.now()
+        own = self.metrics[made.method] = self.measured(made.volume, made.seconds)
+        share = residual_share(prepared.geometry, made.volume.grid, prepared.held_out)
+        self.all_rays = (self.clock.now() - before) / share
+        if left is not None:
+            own["unexplained"] = left.share
+            self.warn(hiding_warning(made, left))
+        return left
+
+    def look_for_stray_mass(self) -> NDArray[np.float32] | None:
+        """The map of mass where views show nothing; None without any."""
+        made, prepared = self.made, self.prepared
+        if not self.has_time_for(stray_mass_share(prepared.geometry, made.volume.grid)):
+            self.left_out.append("the look for mass where views show nothing")
+            return None
+        stray = stray_mass(made.volume, prepared.projections.data, prepared.geometry, prepared.ray_factors())
+        if stray is None:
+            return None
+        self.metrics[made.method]["stray"] = stray.share
+        self.warn(stray_mass_warning(made, stray))
+        return stray.map if stray.share > 0 else None
+
+    def look_for_odd_views(self) -> None:
+        if self.direct or self.has_time_for(_ODD_VIEWS):
+            self.warn(odd_views_warning(self.made, self.prepared, self.context.selection, self.context.phases.progress))
+        else:
+            self.left_out.append("the look for views that do not fit the volume")
+
+    def compare_with_fbp(self) -> bool:
+        """Put FBP of the same views first among the volumes; False where it is not wanted or takes too long."""
+        made, prepared, phases = self.made, self.prepared, self.context.phases
+        if self.direct or self.target.report is None or not has_direct_method(prepared.geometry):
+            return False
+        if not self.has_time_for(_DIRECT):
+            self.left_out.append("FBP for comparison")
+            return False
+        phases.enter("FBP for comparison", "slices")
+        before = self.clock.now()
+        grid, on_disk = made.volume.grid, isinstance(made.volume.data, np.memmap)
+        out = scratch_array(self.target.output.parent, grid.shape) if on_disk else None
+        data = direct(prepared.projections.data, prepared.geometry, grid, made.filter, phases.progress, out)
+        fbp = Volume(data, grid)
+        self.volumes = {BASELINE: fbp, **self.volumes}
+        self.metrics = {BASELINE: self.measured(fbp, self.clock.now() - before), **self.metrics}
+        return True
+
+    def look_for_lost_mass(self) -> bool:
+        """Compare the level of air and weak matter with those of FBP; whether matter was lost."""
+        lost = False
+        if BASELINE not in self.volumes:
+            return lost
+        fbp = self.volumes[BASELINE]
+        for name, volume in self.volumes.items():
+            beside_fbp = compare(volume.data, fbp.data, _slices_seen(self.prepared, volume.grid))
+            if beside_fbp is None:
+                break  # it shows no air
+            self.metrics[name]["air"] = beside_fbp.air
+            self.warn(said := lost_mass_warning(self.made, beside_fbp))
+            lost = lost or bool(said)
+        return lost
+
+    def tell_what_was_left_out(self) -> None:
+        if self.left_out:
+            why = "the reconstruction was stopped" if self.waited_for else "the seconds asked for were nearly over"
+            remark = f"Left out, as {why}: {', '.join(self.left_out)}."
+            self.sink(StateEntered("left_out", remark, time=self.clock.now()))
+            self.remarks.append(remark)
+
+
+def _slices_seen(prepared: PreparedProjections, grid: Grid) -> NDArray[np.bool_] | None:
+    """[z] whether the slice's row of the detector got beam; None: all did, or rows show no slices."""
+    measured, geometry = prepared.measured, prepared.geometry
+    if measured is None or not geometry.rows_show_slices or grid.shape[0] != len(measured):
+        return None
+    return np.asarray(measured.any(axis=1))
