@@ -205,6 +205,36 @@ def compose(
     left: Unexplained | None = None,
 ) -> Report:
     """The report on a reconstruction; `left` is the structure in its residual, if known."""
+    settings = {
+        k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
+    }
+    return Report(
+        title=f"{context.facts.sample or context.facts.name}: {label_of(made.method)}",
+        summary=_summary(made, prepared, truth, metrics, context),
+        scan=context.facts.table,
+        settings=settings,
+        metrics={label_of(method): values for method, values in metrics.items()},
+        frames=context.facts.frames,
+        flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
+        pictures=[
+            *_pictures(made, prepared, truth, volumes, left),
+            *_stray_mass(context.stray, made.volume.grid, prepared.length_unit),
+            *_frame_pictures(context.facts),
+        ],
+        command=context.command,
+        recipe=context.recipe,
+        footnotes=_footnotes(made, truth, metrics, left),
+        live_picture=context.live_picture,
+    )
+
+
+def _summary(
+    made: ReconOutcome,
+    prepared: PreparedProjections,
+    truth: Volume | None,
+    metrics: Mapping[str, Mapping[str, float]],
+    context: ReportContext,
+) -> str:
     name, geometry = label_of(made.method), prepared.geometry
     best = "psnr" if truth is not None else "residual"
     own = metrics[made.method]
@@ -221,9 +251,13 @@ def compose(
         summary += f". Chosen: {made.chosen}"
     if made.next_decibel_text:
         summary += f". The next dB: {made.next_decibel_text}"
-    settings = {
-        k: _text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
-    }
+    return summary + "."
+
+
+def _footnotes(
+    made: ReconOutcome, truth: Volume | None, metrics: Mapping[str, Mapping[str, float]], left: Unexplained | None
+) -> list[str]:
+    """What the figures of merit mean, as far as there are any."""
     footnotes = [
         "Data residual: |A x − p| / |p| over up to 16 views, A the voxel projector (Joseph 1982).",
         f"SNR, CNR: between the two classes of k-means on the values of {'the truth' if truth else 'this volume'}. A "
@@ -239,13 +273,13 @@ def compose(
             "Time of R²-Gaussian: from the first look at the growing file to the volume; it includes the scan."
         )
     if "resumed_from" in made.settings:
-        footnotes.append(f"Time of {name}: since the fit was resumed, without the time before.")
+        footnotes.append(f"Time of {label_of(made.method)}: since the fit was resumed, without the time before.")
     if left is not None:
         footnotes.append(
             f"Matter that leaves structure: voxels at which the back-projected residual of {len(left.significance)} "
             f"slices exceeds four standard deviations of its noise; above {LIMIT:g} a fit hides something."
         )
-    if "stray" in own:
+    if "stray" in metrics[made.method]:
         footnotes.append(
             "Mass where views show nothing: share of the volume's mass in voxels whose rays meet no matter in two "
             "views at least. Sparse views leave blobs and streaks there."
@@ -254,24 +288,7 @@ def compose(
         footnotes.append(
             "PSNR: the peak is the truth's largest value. SSIM 3D: mean over the slices of three directions."
         )
-    return Report(
-        title=f"{context.facts.sample or context.facts.name}: {name}",
-        summary=summary + ".",
-        scan=context.facts.table,
-        settings=settings,
-        metrics={label_of(method): values for method, values in metrics.items()},
-        frames=context.facts.frames,
-        flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
-        pictures=[
-            *_pictures(made, prepared, truth, volumes, left),
-            *_stray_mass(context.stray, made.volume.grid, prepared.length_unit),
-            *_frame_pictures(context.facts),
-        ],
-        command=context.command,
-        recipe=context.recipe,
-        footnotes=footnotes,
-        live_picture=context.live_picture,
-    )
+    return footnotes
 
 
 def _stray_mass(stray: NDArray[np.float32] | None, grid: Grid, unit: str) -> list[Picture]:

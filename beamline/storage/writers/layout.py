@@ -172,6 +172,30 @@ def create(
     """Make every group, dataset and attribute that the file will have while it grows, with no frame in it yet."""
     rows, cols = frame_shape
     definition = NXTOMO if dtype.kind in "iu" else FLOAT_DEFINITION
+    _groups(file)
+    file["/entry/definition"] = definition
+    if start is not None:
+        file["/entry/start_time"] = iso_time(start)
+        _rewritable_text(file, END_TIME, "", len(iso_time(start)))
+    _facts(file, info)
+    file["/entry/record/quantity"] = quantity
+    _columns(file, info, frame_shape, dtype, preview_bin)
+    _nxdata(file, rows, cols, info.pixel_size_mm)
+    file[ENTRY].attrs["definition"], file[ENTRY].attrs["version"] = definition, ESRF_VERSION
+    file[IMAGE_KEY_CONTROL] = file[KIND]
+    field = _field_of_view(_planned_angles(info), frame_shape, info.axis_col)
+    if field or info.axis_col is not None:  # what is taken will say it; nothing can be created then
+        _rewritable_text(file, FIELD_OF_VIEW, field or FULL, len(FULL))
+
+    file[COMMITTED] = np.int64(0)
+    file[FINISHED] = np.int8(0)
+    _rewritable_text(file, STATUS, "running", 16)
+    _growing(file, MISSING, (), np.dtype("<i8"))
+    file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
+
+
+def _groups(file: h5py.File) -> None:
+    """The groups that every scan has."""
     for path, kind in (
         (ENTRY, "NXentry"),
         ("/entry/instrument", "NXinstrument"),
@@ -192,11 +216,10 @@ def create(
     file.attrs["default"] = "entry"
     file[ENTRY].attrs["default"] = "data"
 
-    file["/entry/definition"] = definition
+
+def _facts(file: h5py.File, info: ScanInfo) -> None:
+    """What is known before the first frame: of the sample, the beam, the plan and the devices."""
     file["/entry/title"] = info.title or info.sample
-    if start is not None:
-        file["/entry/start_time"] = iso_time(start)
-        _rewritable_text(file, END_TIME, "", len(iso_time(start)))
     file["/entry/sample/name"] = info.sample
     file["/entry/instrument/source/probe"] = "x-ray"
     # NXsource counts distances along the beam, from the sample.
@@ -215,12 +238,7 @@ def create(
         if value is not None:
             file[path] = np.float64(value)
             file[path].attrs["units"] = unit
-    for name, text in (
-        ("plan", info.plan),
-        ("config", info.config),
-        ("quantity", quantity),
-        ("program", f"splatline {version()}"),
-    ):
+    for name, text in (("plan", info.plan), ("config", info.config), ("program", f"splatline {version()}")):
         file[f"/entry/record/{name}"] = text
     if info.filter is not None:
         file.create_group("/entry/instrument/filter").attrs["NX_class"] = "NXattenuator"
@@ -235,6 +253,11 @@ def create(
         for key, said in description.items():
             group[key.replace("/", "_")] = said
 
+
+def _columns(
+    file: h5py.File, info: ScanInfo, frame_shape: tuple[int, int], dtype: np.dtype[Any], preview_bin: int
+) -> None:
+    """All that grows with the frames, or with the readings of the beam."""
     _growing(file, DATA, frame_shape, dtype)
     _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
     file[PREVIEW].attrs["bin"] = np.int64(preview_bin)
@@ -253,18 +276,6 @@ def create(
             _growing(file, f"{BEAM}/{name}", (), np.dtype("<f8"))
             file[f"{BEAM}/{name}"].attrs["units"] = unit
         file[f"{BEAM}/time"].attrs["description"] = "since 1970-01-01T00:00:00Z"
-    _nxdata(file, rows, cols, info.pixel_size_mm)
-    file[ENTRY].attrs["definition"], file[ENTRY].attrs["version"] = definition, ESRF_VERSION
-    file[IMAGE_KEY_CONTROL] = file[KIND]
-    field = _field_of_view(_planned_angles(info), frame_shape, info.axis_col)
-    if field or info.axis_col is not None:  # what is taken will say it; nothing can be created then
-        _rewritable_text(file, FIELD_OF_VIEW, field or FULL, len(FULL))
-
-    file[COMMITTED] = np.int64(0)
-    file[FINISHED] = np.int8(0)
-    _rewritable_text(file, STATUS, "running", 16)
-    _growing(file, MISSING, (), np.dtype("<i8"))
-    file[MISSING].attrs["description"] = "triggers of the scan, counted from 0, that gave no frame"
 
 
 def state_field_of_view(file: h5py.File) -> None:
