@@ -205,3 +205,15 @@ def test_what_cannot_be_is_refused() -> None:
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
     with pytest.raises(ValueError, match=r"method 'fbp' has no setting 'finish' \(r2, r2-published has\)"):
         build(Fbp, {"finish": 2})
+
+
+@pytest.mark.parametrize(("lacks", "sweeps"), [(False, 8), (True, 16)])
+def test_a_cone_whose_fit_lacks_structure_gets_twice_the_sweeps(lacks: bool, sweeps: int) -> None:
+    """Pixels are finer than voxels, so that edges within voxels stay with the Gaussians."""
+    views = Geometry.cone(np.linspace(0, 2 * math.pi, 30, endpoint=False), (48, 96), 0.5, 60.0, 84.0)
+    grid, fine = Grid((12, 24, 24), 1.0), Grid((24, 48, 48), 0.5)
+    at = np.random.default_rng(1).uniform(-5, 5, (60, 3)) * (0.6, 1, 1)
+    g = Gaussians.from_physical(at, np.full((60, 3), 0.3), np.full(60, 2.0), density_unit=2.0)
+    data = project(g, views).numpy() + (Projector(views, fine).forward(_box(fine)) if lacks else 0)
+    data += np.random.default_rng(0).normal(0, 0.05, data.shape).astype(np.float32)
+    assert finish(_of(g, grid), g, ReconProblem(data, views, grid, DataUse(), 0, "cpu")).sweeps == sweeps
