@@ -43,8 +43,8 @@ SUBSETS, TV_STEPS = 9, 3
 
 _DIFFERENT = 0.6  # of the noise
 _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 of the noise, and differs by 2.2 dB
-# Residual of a cone's fit over the noise. On thorax and shell it is 1.35 to 1.68: there 16 sweeps gain up to 1.5 dB, and
-# lose 0.5 at worst. On the teapot it is 1.19 to 1.24: there they lose 0.3 to 2 dB.
+# Residual of a cone's fit over the noise. On thorax and shell it is 1.35 to 1.68: there 16 sweeps gain up to 1.5 dB
+# or lose 0.5 at worst. On the teapot it is 1.19 to 1.24: there they lose 0.3 to 2 dB.
 _UNFINISHED = 1.3
 _CLEARLY = 0.9  # a parallel beam: residuals .94 to .98 of the first's lose 3 dB (spheres), .5 less than 0.1 dB (slabs)
 # Residual of views held out after 50 steps, over that of total variation from FBP. It is 0.99 to 1.00 after 24 sweeps
