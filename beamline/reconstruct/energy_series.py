@@ -77,7 +77,7 @@ def read_spectra(path: Path) -> Spectra:
         lines = [
             line for line in csv.reader(text_in(path, encoding="utf-8-sig").splitlines(True)) if "".join(line).strip()
         ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, csv.Error) as error:
         raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
     head, *rest = lines or [[]]
     names = tuple(name.strip() for name in head[1:])

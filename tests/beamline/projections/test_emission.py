@@ -187,3 +187,46 @@ def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Pa
     assert found is not None, outcome.message
     expected = recon.mlem(prepared.emission.summed(groups, views), recon.Grid.matching(views), 2, 3).data
     np.testing.assert_array_equal(found, expected)
+
+
+def test_a_set_that_changed_on_the_disk_is_refused_by_name(pet: Path, tmp_path: Path) -> None:
+    """Every set of the file has a checksum of each view; `validate --deep` compares it, too."""
+    said = _beamline("validate", str(pet), "--deep")
+    assert said.exit_code == 0 and "no checksums" not in said.output
+    for name in ("counts", "attenuation", "normalisation", "randoms", "scatter"):
+        damaged = tmp_path / f"{name}.h5"
+        damaged.write_bytes(pet.read_bytes())
+        with h5py.File(damaged) as file:
+            chunk = file[f"emission/{name}"].id.get_chunk_info(5)
+        with damaged.open("r+b") as raw:
+            raw.seek(chunk.byte_offset + chunk.size // 2)
+            byte = raw.read(1)[0]
+            raw.seek(-1, 1)
+            raw.write(bytes([byte ^ 1]))
+        refused = _beamline("recon", str(damaged), "-m", "fbp", "-o", str(tmp_path / "out.h5"))
+        assert refused.exit_code == 5 and "cannot be read" in refused.output, (name, refused.output)
+        assert _beamline("validate", str(damaged), "--deep").exit_code == 5
+        assert f"{name}.h5" in refused.output and not (tmp_path / "out.h5").exists()
+
+
+@pytest.mark.parametrize("method", ["fista-tv", "r2"])
+def test_error_bars_of_an_emission_are_those_of_its_counts(pet: Path, tmp_path: Path, method: str) -> None:
+    """Of the two volumes the noisier one has wider bars: a quarter of the counts, twice the relative deviation."""
+    relative = []
+    with h5py.File(pet) as file, h5py.File(tmp_path / "fewer.h5", "w") as fewer:
+        file.copy("emission", fewer)
+        kept = np.random.default_rng(1).binomial(file["emission/counts"][()].astype(int), 0.25)
+        for name, values in (("counts", kept), ("randoms", file["emission/randoms"][()] / 4),
+                             ("scatter", file["emission/scatter"][()] / 4)):  # fmt: skip
+            del fewer[f"emission/{name}"]
+            fewer[f"emission/{name}"] = values.astype(np.float32)
+    for path in (pet, tmp_path / "fewer.h5"):
+        out = tmp_path / f"{path.stem}_{method}.h5"
+        done = _beamline("recon", str(path), "-m", method, "--uncertainty", "-o", str(out))
+        assert done.exit_code == 0, done.output
+        with h5py.File(out) as made:
+            bars, volume = made["entry/data/data_errors"][()], made["entry/data/data"][()]
+        body = volume > 0.5 * np.median(volume[volume > 0.1 * volume.max()])
+        assert (bars[body] > 0).all()
+        relative.append(float(np.median(bars[body]) / np.median(volume[body])))
+    assert 1.3 < relative[1] / relative[0] < 3
