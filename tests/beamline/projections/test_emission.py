@@ -17,13 +17,16 @@ from beamline.core.errors import DataError
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.selection import Selection
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.study.run import Rig
 from beamline.study.studies import StudyRow
 from beamline.tradeoff.data import Data
-from beamline.tradeoff.run import split
+from beamline.tradeoff.opened import ComparedScan
+from beamline.tradeoff.run import TradeoffOptions, run_tradeoff, split
 from beamline.tradeoff.trials import Trial
 from beamline.tradeoff.worker import run
+from drivers.base.clock import SystemClock
+from recon.methods import names_compared
 from simulators.scenes.emission import events, load_emission
 
 SCENE = "emission: {radius: 24}\nscanner: {trues: 2.0e+5}\nlines: {views: 24, shape: [3, 32], pitch: 2.0}\n"
@@ -230,3 +233,12 @@ def test_error_bars_of_an_emission_are_those_of_its_counts(pet: Path, tmp_path: 
         assert (bars[body] > 0).all()
         relative.append(float(np.median(bars[body]) / np.median(volume[body])))
     assert 1.3 < relative[1] / relative[0] < 3
+
+
+def test_a_trade_off_without_names_tries_the_methods_of_counts(pet: Path, tmp_path: Path) -> None:
+    """And only there; those that take many times as long stay out."""
+    plain, emitting = names_compared(), names_compared(emission=True)
+    assert set(emitting) - set(plain) == {"mlem", "osem"} and set(plain) < set(emitting)
+    options = TradeoffOptions(ComparedScan(SourceOptions(pet), Selection(), tmp_path / "t"), (), max_seconds=1e-9)
+    table = run_tradeoff(options, lambda _: None, SystemClock())
+    assert {outcome.trial.method for outcome in table.outcomes} == set(emitting)
