@@ -38,7 +38,8 @@ def unseen_residuals(
     held_out = views.parted(ONE_IN) == ONE_IN // 2
     binning = max(1, round(views.geometry.detector_shape[1] / _JUDGED))
     seen, unseen = (views.select(np.flatnonzero(chosen), slice(None)) for chosen in (~held_out, held_out))
-    motion = learnt_motion(seen, times, weights, go_on, stop)
+    follow = 2 * _JUDGED_SWEEPS
+    motion = learnt_motion(seen, times, weights, lambda sweep, residual: go_on(sweep - follow, residual), stop)
     if motion is None:
         return None
     seen, unseen = _binned(seen, binning), _binned(unseen, binning)
@@ -47,7 +48,8 @@ def unseen_residuals(
     for now in (None, motion.on((ny, nx, nz), times)):
         fit = EnergyFit(seen, grid, np.random.default_rng(0), now, stop)
         for residual in fit.sweeps(weights, _JUDGED_SWEEPS):
-            if not go_on(0, residual):
+            follow -= 1
+            if not go_on(-follow, residual):
                 return None
         if stop():
             return None
@@ -64,12 +66,12 @@ def learnt_motion(
         views: each `energy` is a moment, each material a knot of the densities.
         times: [moment], 0 ... 1.
         weights: of total variation of the densities' components.
-        go_on: called with (0, residual) after each sweep; False ends it.
+        go_on: called with (-n, residual) after each sweep, where n follow. False ends it.
         stop: asked many times within a sweep; True ends it.
     """
     binning = max(1, round(views.geometry.detector_shape[1] / _WIDTH))
     alone = replace(views, cross_sections=np.ones((times.size, 1)))
-    motion: Motion | None = None
+    motion, follow = None, MOTION_SWEEPS
     for wide, turns in _LEVELS:
         some = _binned(alone, binning * wide)
         grid = Grid.matching(some.geometry)
@@ -80,7 +82,8 @@ def learnt_motion(
         fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion, stop), _seen(some, grid)
         for _ in range(turns):
             for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), _SWEEPS):
-                if not go_on(0, residual):
+                follow -= 1
+                if not go_on(-follow, residual):
                     return None
             if stop():
                 return None

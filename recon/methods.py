@@ -24,12 +24,14 @@ class MethodEntry:
         module, cls: of its settings class, see `recon.base.method.Method`.
         streams: it has `stream`, so that its volume can grow while views arrive.
         compared: a trade-off tries it if no methods are named; False for methods that take many times as long.
+        emission: it is compared where the sample emits, whatever `compared` says.
     """
 
     module: str
     cls: str
     streams: bool = False
     compared: bool = True
+    emission: bool = False
 
 
 REGISTRY: dict[str, MethodEntry] = {
@@ -39,8 +41,8 @@ REGISTRY: dict[str, MethodEntry] = {
     "sirt": MethodEntry("recon.voxels.methods.sirt", "Sirt"),
     "sart": MethodEntry("recon.voxels.methods.sart", "Sart"),
     "cgls": MethodEntry("recon.voxels.methods.cgls", "Cgls"),
-    "mlem": MethodEntry("recon.voxels.methods.mlem", "Mlem", compared=False),
-    "osem": MethodEntry("recon.voxels.methods.mlem", "Osem", compared=False),
+    "mlem": MethodEntry("recon.voxels.methods.mlem", "Mlem", compared=False, emission=True),
+    "osem": MethodEntry("recon.voxels.methods.mlem", "Osem", compared=False, emission=True),
     "asd-pocs": MethodEntry("recon.voxels.methods.asd_pocs", "AsdPocs"),
     "fista-tv": MethodEntry("recon.voxels.methods.fista_tv", "FistaTv"),
     "os-sirt-tv": MethodEntry("recon.voxels.methods.os_sirt_tv", "OsSirtTv"),
@@ -59,9 +61,9 @@ def names() -> tuple[str, ...]:
     return tuple(_entries())
 
 
-def names_compared() -> tuple[str, ...]:
-    """Names of the methods that a trade-off tries by default; loads no module of ours."""
-    return tuple(name for name, entry in REGISTRY.items() if entry.compared)
+def names_compared(emission: bool = False) -> tuple[str, ...]:
+    """Names of the methods that a trade-off tries by default, more where the sample emits; loads no module of ours."""
+    return tuple(name for name, entry in REGISTRY.items() if entry.compared or (emission and entry.emission))
 
 
 def streams(name: str) -> bool:

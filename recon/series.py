@@ -118,7 +118,8 @@ def fit_series(
     h_k are hats: the volume is linear in time between knots. W displaces it, smooth in space and time, and is 1 in the
     middle of the scan (`recon.voxels.motion`). This is the problem of `fit_materials`, with knots for materials and the
     hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they have in common.
-    Steps, memory, `go_on` and `stop` are as there; sweeps before those of the fit are `TRIAL_SWEEPS` at most.
+    Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, and of the motion each count
+    down to 0; they are `TRIAL_SWEEPS` at most in all.
 
     Args:
         knots: volumes, 2 or more.

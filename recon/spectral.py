@@ -78,8 +78,8 @@ def fit_materials(
         grid: of the volumes; None: as the geometry has it.
         tv_weight: of all components; None: the weights with which views held out are predicted best.
         sweeps: of about nine steps each, which see all views equally often.
-        go_on: called with (sweep, residual) after each sweep, and with (0, residual) after each sweep of a trial of
-            weights. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
+        go_on: called with (sweep, residual) after each sweep, and with (-n, residual) after each sweep of trials of
+            weights, where n may follow. These are `TRIAL_SWEEPS` at most. False ends the fit, with the volumes so far.
         stop: asked many times within a sweep, from the second step on. True ends the fit with the volumes before the
             step that it interrupts.
     """
@@ -121,10 +121,12 @@ def weights_by_views(
 
     going = True
 
-    def left(weights: F64) -> float:
+    def left(weights: F64, trials: int) -> float:
+        """What a trial leaves, after which so many may follow."""
         nonlocal going
-        for residual in fit.sweeps(weights, (ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS):
-            if not (going := go_on(0, residual)):
+        n = (ALIKE_LONGER if alike else 1) * _TRIAL_SWEEPS
+        for sweep, residual in enumerate(fit.sweeps(weights, n), 1):
+            if not (going := go_on(sweep - n * (1 + trials), residual)):
                 return math.inf
         if stop():
             going = False
@@ -133,8 +135,8 @@ def weights_by_views(
 
     weights = np.full(len(fit.z), _FIRST * fit.steepest())
     best, least, worse = weights, math.inf, 0
-    for _ in range(_TRIALS):
-        now = left(weights)
+    for trial in range(1, 1 + _TRIALS):
+        now = left(weights, _TRIALS - trial + _HEAVIER)
         if not going:
             return best
         best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
@@ -145,7 +147,7 @@ def weights_by_views(
     ladder = [best * heavier**octave for octave in range(_HEAVIER)]
     residuals: list[float] = []
     for weights in ladder:
-        residuals.append(left(weights))
+        residuals.append(left(weights, _HEAVIER - 1 - len(residuals)))
         if not going:
             return best
     limit = _AS_WELL * min(residuals)

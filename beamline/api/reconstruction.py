@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -126,14 +126,8 @@ def reconstruct(
             held.append(replace(record.volume, data=np.array(record.volume.data)))  # it may lie in a temporary file
 
     source = SourceOptions(place)
-    said: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
-    wanted = replace(selection or Selection(), **{name: value for name, value in said.items() if value is not None})
-    with ExitStack() as opened:
-        if output is None:
-            work = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="beamline-")))
-            target = OutputPaths(work / "volume.h5", None, written=False, take=take)
-        else:
-            target = OutputPaths(Path(output), report_beside(Path(output)), take=take)
+    wanted = selection_of(source, selection, rows=rows, views=views, binning=binning)
+    with target_of(output, take) as target:
         command = f"beamline.api.reconstruct({str(place)!r}, {method!r}, rows={wanted.rows}, views={wanted.views!r})"
         options = ReconOptions(source, target, wanted, chosen, command=command)
         figures = reconstruct_file(options, sink, SystemClock(), StopOnSignal())
@@ -159,6 +153,29 @@ def _method(method: str | Method) -> Method:
         return Auto() if method == AUTO else by_name(method)()
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
+
+
+def selection_of(
+    source: SourceOptions,
+    selection: Selection | None,
+    *,
+    rows: slice | tuple[int, int] | None,
+    views: str | None,
+    binning: int | None,
+) -> Selection:
+    """The selection with what is said beside it."""
+    said: dict[str, Any] = {"views": views, "binning": binning, "rows": None if rows is None else _rows(source, rows)}
+    return replace(selection or Selection(), **{name: value for name, value in said.items() if value is not None})
+
+
+@contextmanager
+def target_of(output: str | Path | None, take: Callable[[ReconRecord], None]) -> Iterator[OutputPaths]:
+    """Where a result goes, with its report; without an output `take` alone gets it."""
+    if output is not None:
+        yield OutputPaths(Path(output), report_beside(Path(output)), take=take)
+        return
+    with tempfile.TemporaryDirectory(prefix="beamline-") as work:
+        yield OutputPaths(Path(work) / "volume.h5", None, written=False, take=take)
 
 
 def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, int]:

@@ -263,13 +263,13 @@ def recon(
     settings = {name: values.pop(name) for name in SETTINGS}
     context = click.get_current_context()
     if volumes is not None:
-        refuse_others(context, values, output)
+        refuse_others(context, values)
         refuse_shared({"FILE": file, "--output": output})
         source, selection = chosen(file, seed, values)
         target = output or Path(f"{file.stem}_time.h5")
         for_series = ReconOptions(
-            source, OutputPaths(target, None), selection, seed=seed, unfinished=unfinished, memory=memory,
-            command=repeating(context, file, target),
+            source, OutputPaths(target, report_beside(target) if report else None), selection, seed=seed,
+            unfinished=unfinished, memory=memory, command=repeating(context, file, target),
         )  # fmt: skip
         recon_series(for_series, volumes, moves, dry, as_json)
         return

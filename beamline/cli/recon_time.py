@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from pathlib import Path
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -20,7 +19,7 @@ from drivers.base.clock import SystemClock
 if TYPE_CHECKING:
     from beamline.reconstruct.options import ReconOptions
 
-_TAKEN = ("volumes", "moves", "seed", "output", "unfinished", "memory", "dry", "as_json")
+_TAKEN = ("volumes", "moves", "seed", "output", "unfinished", "memory", "dry", "as_json", "report")
 
 time_options = together(
     heading(METHOD),
@@ -40,21 +39,19 @@ time_options = together(
 )
 
 
-def refuse_others(context: click.Context, of_views: Collection[str], output: Path | None) -> None:
+def refuse_others(context: click.Context, of_views: Mapping[str, Any]) -> None:
     """Raises UsageError for options that a fit of volumes in time does not take.
 
     Args:
-        of_views: names of options that choose and correct views; these it takes.
+        of_views: values of the options that choose and correct views, by name; these it takes.
     """
-    from beamline.storage.writers.recon_file import SUFFIXES  # here: help needs none of it
-
     for option in given(context):
         if option.name not in (*_TAKEN, *of_views):
             raise click.UsageError(
                 f"--time fits all volumes at once by a method of its own; --{name_of(option)} does not go with it."
             )
-    if output is not None and output.suffix.lower() not in SUFFIXES:
-        raise click.UsageError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
+    if not isinstance(of_views["axis"], float | None):
+        raise click.UsageError("Find the axis first: give --axis try without --time, then its column with --time.")
 
 
 def recon_series(options: ReconOptions, volumes: int, moves: bool | None, dry: bool, as_json: bool) -> None:

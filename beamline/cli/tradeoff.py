@@ -46,7 +46,8 @@ def listed(value: str) -> tuple[str, ...]:
     callback=parsed(listed),
     metavar="A,B,...",
     help=f"Methods to compare, of {', '.join(names())}. "
-    f"Default: all but {', '.join(name for name in names() if name not in names_compared())}.",
+    f"Default: all but {', '.join(name for name in names() if name not in names_compared())}; "
+    "of an emission also mlem and osem.",
 )
 @click.option("--quick/--full", default=True, show_default=True, help="Few and short trials, or many and long ones.")
 @heading(RESOURCES)
@@ -92,7 +93,7 @@ def tradeoff(
     folder = output or Path(f"{file.stem}_tradeoff")
     options = TradeoffOptions(
         scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
-        methods=methods or names_compared(),
+        methods=methods or (),
         depth="quick" if quick else "full",
         max_seconds=max_seconds,
         seed=seed,

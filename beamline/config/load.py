@@ -54,8 +54,6 @@ def load(path: str | Path, overrides: Iterable[str] = (), environment: Mapping[s
         raise ConfigError(f"there is no file {path}; `beamline config init > my.yaml` makes one to edit.") from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not UTF-8 text ({error}). Nothing was started.") from None
     tree = read(text, str(path))
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment)
@@ -173,7 +171,7 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     path = config_folder() / scene  # an absolute path stays as it is
     try:
         text = text_in(path, SETTINGS)
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise ConfigError(f"simulation.scene: {path} cannot be read ({error}). Nothing was started.") from None
     return read(text, str(path)).data
 

@@ -257,7 +257,7 @@ class KernelsCompiled(Event, event="progress"):
 
 class FitReached(Event, event="progress"):
     """Where a fit or iterations stand; the fields are those of `recon.base.method.Progress`, a rate and a time left
-    (of all `steps`, which the data may end after `least`).
+    (of all `steps`, which the data may end after `least_steps`).
 
     Numbers of another process are None where they are not finite.
     """
@@ -274,7 +274,7 @@ class FitReached(Event, event="progress"):
     unit: str
     per_s: float | None
     eta_s: float | None
-    least: int = 0
+    least_steps: int = 0
 
 
 class ScanDone(Event, event="scan_done"):

@@ -65,9 +65,14 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
 
 
 def text_in(path: Path, largest: int = TEXT, encoding: str = "utf-8") -> str:
-    """The content of a text file of so many bytes at most. OSError as `require_regular`; UnicodeDecodeError."""
+    """The content of a text file of so many bytes at most. OSError as `require_regular`, and for what is no UTF-8."""
     require_regular(path, largest)
-    return path.read_text(encoding=encoding)
+    try:
+        return path.read_text(encoding=encoding)
+    except UnicodeDecodeError as error:
+        raise OSError(
+            errno.EILSEQ, f"It is no UTF-8 text, by its byte {error.start}. Save it as UTF-8", str(path)
+        ) from error
 
 
 def refuse_existing(path: Path) -> None:

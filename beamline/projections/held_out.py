@@ -46,7 +46,7 @@ def hold_out(
     if n - count < 2:
         raise ConfigError(f"{n} views are too few to hold some out; choose more with --views, or {advice}.")
     # Neither the first nor the last: they have a neighbour on one side only.
-    counted = projections.weights
+    counted, emission = projections.weights, prepared.emission
     held = np.unique((np.arange(count) + 0.5) * n // count).astype(np.int64)
     used = np.setdiff1d(np.arange(n), held)
     return replace(
@@ -61,5 +61,6 @@ def hold_out(
         geometry=geometry.select(used),
         view_weights=None if prepared.view_weights is None else prepared.view_weights[used],
         shares=None if prepared.shares is None else prepared.shares[used],
+        emission=emission and emission.summed(used[:, None], geometry.select(used)),
         held_out=(projections.data[held], geometry.select(held)),
     )

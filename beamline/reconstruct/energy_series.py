@@ -23,6 +23,7 @@ from beamline.core.text import size
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of
+from beamline.reconstruct.progress import sweeps_told
 from beamline.reconstruct.slabs import SHARE
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.volumes.files import write_volume
@@ -32,7 +33,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.energy_fit import EnergyViews
 from recon.registration import register_energies
-from recon.spectral import TRIAL_SWEEPS, Materials, fit_materials
+from recon.spectral import Materials, fit_materials
 from recon.voxels.displacement import Displacement
 
 _SWEEPS = 20
@@ -76,7 +77,7 @@ def read_spectra(path: Path) -> Spectra:
         lines = [
             line for line in csv.reader(text_in(path, encoding="utf-8-sig").splitlines(True)) if "".join(line).strip()
         ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except (OSError, csv.Error) as error:
         raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
     head, *rest = lines or [[]]
     names = tuple(name.strip() for name in head[1:])
@@ -180,20 +181,15 @@ def reconstruct_materials(
         except ValueError as error:
             raise ConfigError(f"--register: {error}. Nothing was written.") from error
     grid = Grid.matching(parts[0].geometry)
-    early, tried = False, 0
+    early = False
 
     def go_on(sweep: int, residual: float) -> bool:
-        nonlocal early, tried, progress
-        if sweep:
-            progress(sweep, _SWEEPS)
-        else:
-            tried += 1
-            trials(tried, TRIAL_SWEEPS)
-            progress = counting("sweeps")
+        nonlocal early
+        heard(sweep)
         early = stopping()
         return not early
 
-    stop.ready, progress, trials = True, counting("sweeps"), counting("trial sweeps")
+    stop.ready, heard = True, sweeps_told(counting, _SWEEPS)
     try:
         with stop() as stopping:
             made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on, stop=stopping)

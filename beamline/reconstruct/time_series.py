@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,13 @@ from beamline.projections.prepare import prepare_projections
 from beamline.reconstruct.finished import require_finished
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.parameters import parameters_of
+from beamline.reconstruct.progress import sweeps_told
 from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
+from beamline.reconstruct.series_report import series_page
 from beamline.reconstruct.slabs import memory_of
+from beamline.report.html import write_report
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.writers.recon_file import ReconRecord, VolumesInTime, write_reconstruction
+from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, VolumesInTime, write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
@@ -68,9 +71,12 @@ class SeriesNeeds:
     def refuse(self) -> None:
         """ConfigError where it takes more memory than it may."""
         if self.memory > self.allowed:
+            rows = int(self.shape[1] * self.allowed / self.memory)
+            fewer = f"--rows with {rows} row{'s' * (rows > 1)} or fewer at a time, or " if rows else ""
             raise ConfigError(
                 f"--time {self.shape[0]}: {self.shape[0]} volumes of {self.shape[1:]} voxels take {size(self.memory)} "
-                f"of memory, {size(self.allowed)} may be used. Give --bin or --rows. Nothing was written."
+                f"of memory, {size(self.allowed)} may be used. Volumes in time are not made in slabs: give {fewer}"
+                "--bin. Nothing was written."
             )
 
     def lines(self) -> list[str]:
@@ -104,6 +110,7 @@ class SeriesDone:
     """
 
     output: Path
+    report: Path | None
     shape: tuple[int, ...]
     seconds: tuple[float, ...]
     axis_col: float
@@ -117,6 +124,7 @@ class SeriesDone:
         n, *shape = self.shape
         return [
             f"{'output':<10}{self.output}",
+            *([f"{'report':<10}{self.report}"] if self.report else []),
             f"{'volumes':<10}{n} of {' x '.join(map(str, shape))}, {self.seconds[0]:.4g} to {self.seconds[-1]:.4g} s",
             f"{'motion':<10}{'learnt' if self.moves else 'none'}{'; ' * bool(self.chosen)}{self.chosen}",
             f"{'axis_col':<10}{self.axis_col:.2f}",
@@ -141,6 +149,9 @@ def reconstruct_series(
         ConfigError: too little memory, or too few views. DataError: the scan cannot be reconstructed, or the output
             exists. Nothing is written then.
     """
+    output = options.target.output
+    if output.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"-o {output}: volumes in time go into an HDF5 file; give a name that ends in .h5.")
     options.target.refuse_existing()
     began, warn, phases = clock.now(), Warnings(sink, clock), Phases(sink, clock)
     with options.source.open() as source:
@@ -153,18 +164,12 @@ def reconstruct_series(
         times = _times(source, prepared.projections.view_ids, warn)
     options.target.require_room(SeriesNeeds.of(options, wanted, prepared.geometry).output)
     phases.enter("reconstruction")
-    early, tried, progress = False, 0, counting("sweeps")
-    trials = counting("trial sweeps")
+    early, heard = False, sweeps_told(counting, _SWEEPS)
 
     def go_on(sweep: int, residual: float) -> bool:
-        nonlocal early, tried, progress
-        if sweep:
-            stop.ready = True
-            progress(sweep, _SWEEPS)
-        else:
-            tried += 1
-            trials(tried, TRIAL_SWEEPS)
-            progress = counting("sweeps")  # whose clock starts when the last trial ends
+        nonlocal early
+        stop.ready = stop.ready or sweep > 0
+        heard(sweep)
         early = stopping()
         return not early
 
@@ -192,7 +197,9 @@ def reconstruct_series(
         Volume(series.data[0], made.grid), "series", clock.now() - began, (),
         settings | {"view_seconds": times - times.min()} | ({"ended_early": True} if early else {}), options.filter,
     )  # fmt: skip
-    context = ReportContext(facts, options.selection, options.command, options.seed, recipe=options.recipe)
+    context = ReportContext(
+        facts, options.selection, options.command, options.seed, warn.messages, recipe=options.recipe
+    )
     record = ReconRecord(
         volume=outcome.volume,
         length_unit=prepared.length_unit,
@@ -204,10 +211,15 @@ def reconstruct_series(
         metrics={"seconds": outcome.seconds, "residual": made.residual},
         series=series,
     )
-    write_reconstruction(options.target.output, record)
+    options.target.take(record)
+    if options.target.report is not None:
+        page = series_page(record, context, prepared.geometry.n_views, chosen)
+        write_report(options.target.report, replace(page, volume=output.name))
+    if options.target.written:
+        write_reconstruction(output, record)
     phases.end()
     return SeriesDone(
-        options.target.output, shape, tuple(series.seconds.tolist()), prepared.axis_col, made.residual,
+        output, options.target.report, shape, tuple(series.seconds.tolist()), prepared.axis_col, made.residual,
         made.motion is not None, chosen, early,
     )  # fmt: skip
 

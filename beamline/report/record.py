@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.method import Progress
 
-_FIELDS = {f.name: f.type for f in fields(Progress) if f.name not in ("unit", "least")}  # figures
+_FIELDS = {f.name: f.type for f in fields(Progress) if f.name not in ("unit", "least_steps")}  # figures
 _WORDS = {"held_out": "views held out", "residual": "views used"}
 
 

@@ -14,10 +14,13 @@ _COLUMNS = 4
 
 
 class SliceSheet:
-    """The slice [y, x] of each volume through the bright parts of the first one, by label."""
+    """The slice [y, x] of each volume through the bright parts of the first one, by label.
 
-    def __init__(self) -> None:
-        self._at = 0
+    `down`: name of the axis that goes down, of volumes that are turned.
+    """
+
+    def __init__(self, down: str = "y") -> None:
+        self._at, self._down = 0, down
         self._shown: dict[str, F32] = {}
         self._drawn: set[tuple[str, str]] = set()
 
@@ -49,6 +52,6 @@ class SliceSheet:
             top, left = i // _COLUMNS * (rows + head), i % _COLUMNS * (cols + gap)
             sheet[top + head : top + head + rows, left : left + cols] = self._shown[label]
             axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
-        axes.text(0.02 * cols, head + 0.95 * rows, "x → y ↓", fontsize=6, color="tab:orange")
+        axes.text(0.02 * cols, head + 0.95 * rows, f"x → {self._down} ↓", fontsize=6, color="tab:orange")
         axes.imshow(sheet, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
         return png(figure)

@@ -43,6 +43,6 @@ def write_emission(path: Path, scene: EmissionScene, made: Events) -> None:
     with whole_file(path) as partial, hdf5.created(partial) as file:
         group = file.create_group("emission")
         for name, values in sets.items():
-            group.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip")
+            group.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", fletcher32=True)
         group["angles"], group["pixel_size"] = np.degrees(scene.lines.angles), scene.lines.pitch
         group["angles"].attrs["units"], group["pixel_size"].attrs["units"] = "degree", "mm"

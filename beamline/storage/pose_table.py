@@ -98,7 +98,7 @@ def read_poses(text: str) -> PoseTable:
         return _of_csv(path, text_in(path, _LARGEST, "utf-8-sig"))
     except _NoPosesError as error:
         raise ValueError(str(error)) from error
-    except (OSError, UnicodeDecodeError, DataError) as error:
+    except (OSError, DataError) as error:
         raise ValueError(f"{path} cannot be read ({hdf5.reason(error)})") from error
 
 

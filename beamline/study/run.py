@@ -32,6 +32,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Plain
 from recon.base.volume import Volume
 from recon.methods import BASELINE
+from recon.voxels.emission import Emission, weighted_lines
 from recon.voxels.fbp import Filter
 
 REFERENCE = "FBP of all views"
@@ -113,7 +114,7 @@ def run_study(options: StudyOptions, sink: Sink, clock: Clock, now: Callable[[],
         write_array(work / "views.npy", scan.prepared.projections.data)
         if (rays := scan.prepared.rays_there()) is not None:
             write_array(work / "rays.npy", rays)
-        rig = _Rig(work, scan.prepared.geometry, options.seed, options.settings)
+        rig = Rig(work, scan.prepared.geometry, options.seed, options.settings, scan.prepared.emission)
         grid, truth = scan.grid, scan.truth
         del scan, rays  # from here on the views are in the file alone
         whole = StudyRow(REFERENCE, np.arange(rig.geometry.n_views)[:, None])
@@ -166,16 +167,17 @@ def _planned(options: StudyOptions, scan: OpenedScan) -> StudyTable:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rig:
+class Rig:
     """Where rows are reconstructed: a folder with the views of the scan, views.npy, and their geometry.
 
-    Where rays have weights, rays.npy has them.
+    Where rays have weights, rays.npy has them. Where the sample emits, `emission` has the counts behind the views.
     """
 
     work: Path
     geometry: Geometry
     seed: int
     settings: Mapping[str, Mapping[str, Plain]]
+    emission: Emission | None = None
 
     def reconstructed(
         self, row: StudyRow, method: str, settings: Mapping[str, Plain] | None = None
@@ -190,7 +192,11 @@ class _Rig:
         if (self.work / "rays.npy").exists():
             of_scan = np.load(self.work / "rays.npy", mmap_mode="r")
             weights = np.stack([of_scan[group].min(axis=0) for group in row.groups])
-        Data(data, geometry, None, None, weights).save(self.work / "data.npz")
+        counted = None
+        if self.emission is not None:  # of a window the counts are added
+            counted = self.emission.summed(row.groups, geometry)
+            data, weights = weighted_lines(counted)
+        Data(data, geometry, None, None, weights, counted).save(self.work / "data.npz")
         del data
         kept = self.work / "volume.npy"
         trial = Trial(
@@ -210,7 +216,7 @@ class _Rig:
 
 
 def _each(
-    table: StudyTable, rig: _Rig, judge: _Judge, slices: SliceSheet, sink: Sink, now: Callable[[], float]
+    table: StudyTable, rig: Rig, judge: _Judge, slices: SliceSheet, sink: Sink, now: Callable[[], float]
 ) -> Iterator[StudyTable]:
     """The table after each cell, and after one that Ctrl-C interrupted."""
     timed: list[Timed] = []

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 from beamline.core.files import named_on_failure
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
+from recon.voxels.emission import Emission
+
+_COUNTED = ("counts", "survival", "background")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +28,7 @@ class Data:
         held_out: views that no trial uses, and their geometry.
         truth: the volume [z, y, x] on Grid.matching(geometry).
         weights: [view, row, col] of the rays of these views, then of those held out; 0: not measured. None: all alike.
+        emission: the counts behind the views that may be used; None: the sample does not emit.
     """
 
     projections: F32
@@ -32,6 +36,7 @@ class Data:
     held_out: tuple[F32, Geometry] | None
     truth: F32 | None
     weights: F32 | None = None
+    emission: Emission | None = None
 
     def save(self, path: Path) -> None:
         """As .npz, without pickle.
@@ -46,6 +51,8 @@ class Data:
             arrays["truth"] = self.truth
         if self.weights is not None:
             arrays["weights"] = self.weights
+        if self.emission is not None:
+            arrays |= {f"emission.{name}": v for name in _COUNTED if (v := getattr(self.emission, name)) is not None}
         with named_on_failure(path):
             np.savez(path, allow_pickle=False, **arrays)
 
@@ -54,7 +61,9 @@ class Data:
         with np.load(path, allow_pickle=False) as file:
             geometry = _geometry("geometry", file)
             held = (file["held_out"], _geometry("held_out_geometry", file)) if "held_out" in file else None
-            return cls(file["projections"], geometry, held, file.get("truth"), file.get("weights"))
+            counted = {name: file.get(f"emission.{name}") for name in _COUNTED}
+            emission = None if counted["counts"] is None else Emission(geometry=geometry, **counted)
+            return cls(file["projections"], geometry, held, file.get("truth"), file.get("weights"), emission)
 
 
 def write_array(path: Path, array: F32) -> None:

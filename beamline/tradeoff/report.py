@@ -40,6 +40,9 @@ class _Column:
 _COLUMNS = {
     "psnr": _Column("PSNR", "PSNR (dB)", "dB against the truth"),
     "ssim3d": _Column("SSIM", "SSIM 3D", "mean over the slices of three directions"),
+    "recovery": _Column("hot", "contrast recovery", "contrast of hot regions over the truth's"),
+    "spillover": _Column("cold", "spillover", "level of cold regions over the body's"),
+    "variation": _Column("noise", "noise", "standard deviation of the body over its level"),
     "residual_held_out": _Column("held out", "held-out res.", "residual of views held out"),
     "resolution": _Column("FSC", "FSC ({})", "period in {} to which two halves of the views agree"),
 }

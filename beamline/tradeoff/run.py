@@ -26,7 +26,7 @@ from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
 from beamline.tradeoff.varied import Depth
 from drivers.base.clock import Clock
 from recon.base.volume import Grid
-from recon.methods import by_name
+from recon.methods import by_name, names_compared
 from recon.splatting.initialise import default_count
 
 _HELD_OUT_ONE_IN = 8  # without a truth, one view in this many is held out
@@ -38,7 +38,7 @@ class TradeoffOptions:
     """The scan and the trials to compare.
 
     Attributes:
-        methods: names in `recon.methods`.
+        methods: names in `recon.methods`; none: those that `names_compared` has for such a scan.
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
     """
 
@@ -66,7 +66,7 @@ def run_tradeoff(
     scan = opened_scan(options.scan, Warnings(sink, clock))
     data = split(scan.prepared, scan.truth)
     trials = plan(
-        options.methods,
+        options.methods or names_compared(data.emission is not None),
         data.geometry.n_views,
         default_count(Grid.of_field(data.geometry, scan.grid.voxel_size)),
         options.depth,
@@ -104,9 +104,8 @@ def split(prepared: PreparedProjections, truth: Any) -> Data:
     if truth is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     others = 0 if prepared.held_out is None else prepared.held_out[1].n_views
-    return Data(
-        prepared.projections.data, prepared.geometry, prepared.held_out, truth, prepared.rays_there(others)
-    )  # fmt: skip
+    rays = prepared.rays_there(others)
+    return Data(prepared.projections.data, prepared.geometry, prepared.held_out, truth, rays, prepared.emission)
 
 
 def _each(

@@ -116,6 +116,8 @@ TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
     **dict.fromkeys(("naf", "intratomo", "sax-nerf"), _fields),
     "sirt": partial(_iterations, (20, 60), (10, 30, 100, 300)),
     "sart": partial(_iterations, (2, 6), (1, 3, 10, 30)),
+    "osem": partial(_iterations, (8, 20), (2, 8, 20, 40)),
+    "mlem": partial(_iterations, (20, 50), (10, 20, 50, 150)),
     "cgls": partial(_iterations, (5, 15), (5, 10, 20, 40)),
     "asd-pocs": partial(_iterations, (10,), (5, 20, 50)),
     "fista-tv": partial(_iterations, (5, 20), (5, 10, 20, 40)),
@@ -125,6 +127,6 @@ TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
 COLOURS: Mapping[str, str] = {
     "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
-    "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
+    "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
 }  # fmt: skip
-_SPARE = ("tab:pink", "black", "gold", "teal")
+_SPARE = ("tab:pink", "black")

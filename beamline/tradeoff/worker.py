@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from beamline.tradeoff.trials import Trial
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
-from recon.base.arrays import F32
+from recon.base.arrays import F32, I64
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -68,16 +69,17 @@ def run(
     """
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
-    weights, n = data.weights, data.geometry.n_views
-    unseen_rays = None if weights is None else weights[n:]
-    if weights is not None:
-        weights = np.concatenate((weights[views], weights[n:]))
+    n, use = data.geometry.n_views, _of_views(DataUse(data.weights, emission=data.emission), views, geometry)
+    unseen_rays = None if data.weights is None else data.weights[n:]
+    seen = use
+    if use.weights is not None and unseen_rays is not None:
+        seen = replace(use, weights=np.concatenate((use.weights, unseen_rays)))
     grid = Grid.matching(data.geometry)
     # On a toy of the same kind, so that compilation is in no trial's time.
     warm_up(trial.build(), data.geometry)
     reset_peak_memory()
     before = cpu()
-    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now), weights)
+    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now), seen)
     cpu_seconds = cpu() - before
     peak = peak_memory()  # before measuring, which has needs of its own
     volume = on_grid(result.volume, grid)
@@ -87,6 +89,8 @@ def run(
     if data.truth is not None:
         found["psnr"] = metrics.psnr(data.truth, volume.data)
         found["ssim3d"] = metrics.ssim3d(data.truth, volume.data)
+        if data.emission is not None:
+            found |= metrics.contrast(data.truth, volume.data)
     left: list[float] = []
     if data.held_out is not None:
         found["residual_held_out"] = data_residual(volume, *data.held_out, unseen_rays)
@@ -96,7 +100,7 @@ def run(
             squares *= unseen_rays
         left = squares.sum(axis=(1, 2), dtype=np.float64).tolist()
     if trial.halves and trial.views >= 4:
-        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, weights)
+        found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
     return {
         "seconds": result.seconds,
         "cpu_seconds": cpu_seconds,
@@ -110,18 +114,24 @@ def run(
 
 
 def half_set_resolution(
-    trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int, weights: F32 | None = None
+    trial: Trial, projections: F32, geometry: Geometry, grid: Grid, seed: int, use: DataUse
 ) -> float:
     """Full period (mm, half-bit) to which reconstructions from the even and from the odd views agree."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
 
     def half(views: NDArray[np.int64]) -> F32:
-        rays = None if weights is None else weights[views]
-        result = reconstruct(trial, projections[views], geometry.select(views), grid, None, seed, None, rays)
+        some = geometry.select(views)
+        result = reconstruct(trial, projections[views], some, grid, None, seed, None, _of_views(use, views, some))
         return on_grid(result.volume, grid).data
 
     even, odd = half(np.sort(order[::2])), half(np.sort(order[1::2]))
     return fourier_shell_correlation(even, odd, grid.spacing, soft_cylinder(grid.shape)).resolution_mm
+
+
+def _of_views(use: DataUse, views: I64, geometry: Geometry) -> DataUse:
+    """What is known of these views, which `geometry` is of."""
+    emission = None if use.emission is None else use.emission.summed(views[:, None], geometry)
+    return DataUse(None if use.weights is None else use.weights[views], (), emission)
 
 
 def reconstruct(
@@ -132,21 +142,21 @@ def reconstruct(
     held_out: tuple[F32, Geometry] | None,
     seed: int,
     on_progress: Callable[[recon.Progress], None] | None,
-    weights: F32 | None = None,
+    use: DataUse,
 ) -> Reconstruction:
     """The one place that turns a trial into a call of recon.reconstruct.
 
-    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel. `weights`
-    are of the views, and of those held out after them.
+    A model without voxels fills `grid` from binned views all the same; others have one voxel a binned pixel. Weights
+    of `use` are of the views, and of those held out after them; it names no views held out.
     """
-    method, unseen = trial.build(), list[int]()
+    method, unseen, weights = trial.build(), list[int](), use.weights
     if method.traits.held_out:
         projections, geometry, unseen = with_held_out(projections, geometry, held_out)
     if weights is not None:
         weights = weights[: len(projections)]
         if trial.binning > 1:
             projections, weights = masked(projections, weights)[0], bin_views(weights, trial.binning)
-    use = DataUse(weights, unseen)
+    use = DataUse(weights, unseen, use.emission if trial.binning == 1 and not unseen else None)
     binned, coarse = bin_views(projections, trial.binning), geometry.binned(trial.binning)
     target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(coarse)
     control = RunControl(on_progress=on_progress)

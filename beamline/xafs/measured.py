@@ -28,6 +28,7 @@ Reals = NDArray[np.float64]
 EV_BEYOND, KEV_BELOW = 500.0, 0.05
 """keV: no beamline has energies above the first or below the second, so that their unit is wrong."""
 _KEV = {"keV": 1.0, "eV": 1e-3}
+_MOST = 1e30  # absorption in any unit: more is a fault of the file, and squares of more are beyond floats
 
 
 def read_table(path: Path, unit: str | None) -> XafsCurve:
@@ -42,7 +43,7 @@ def read_table(path: Path, unit: str | None) -> XafsCurve:
     """
     try:
         lines = text_in(path, encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise DataError(f"{path} cannot be read ({error}).") from error
     rows = []
     for number, line in enumerate(lines, start=1):
@@ -213,6 +214,8 @@ def _finite(path: Path, name: str, values: Any) -> Reals:
     found = np.asarray(values, dtype=np.float64)
     if not np.isfinite(found).all():
         raise DataError(f"{path}: {name} is not a number at {int((~np.isfinite(found)).sum())} energies.")
+    if beyond := np.count_nonzero(np.abs(found) > _MOST):
+        raise DataError(f"{path}: {name} is beyond ±{_MOST:g} at {beyond} energies; expected a measured value.")
     return found
 
 
@@ -222,8 +225,12 @@ def _in_kev(path: Path, values: Reals, unit: str | None) -> Reals:
         return energies
     low, high = float(energies.min()), float(energies.max())
     if not KEV_BELOW <= low <= high <= EV_BEYOND:
-        other = "keV" if high < EV_BEYOND and unit == "eV" else "eV"
+        other = "keV" if unit == "eV" else "eV"
+        factor = _KEV[other] / _KEV[unit or "keV"]
+        possible = KEV_BELOW <= low * factor <= high * factor <= EV_BEYOND
+        advice = f"; if they are {other}, give --unit {other}" if possible else ""
         raise DataError(
-            f"{path}: energies from {low:g} to {high:g} keV are impossible; if they are {other}, give --unit {other}."
+            f"{path}: energies from {low:g} to {high:g} keV are impossible, expected {KEV_BELOW:g} to {EV_BEYOND:g}"
+            f"{advice}."
         )
     return energies

@@ -36,7 +36,7 @@ class Progress:
         held_out: ||rendered - measured|| / ||measured|| of views that the fit does not see; NaN without such views.
         unit: name of the steps of a direct method or of a part of the work, such as slices; loss and residual are then
         NaN.
-        least: steps after which the data may end it, before `steps`; 0: they cannot.
+        least_steps: after which the data may end it, before `steps`; 0: they cannot.
     """
 
     step: int
@@ -48,7 +48,7 @@ class Progress:
     n_views: int
     held_out: float = float("nan")
     unit: str = ""
-    least: int = 0
+    least_steps: int = 0
 
 
 @dataclass(frozen=True, eq=False)

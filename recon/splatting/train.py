@@ -163,7 +163,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         history.append(
             Progress(
                 state.step, schedule.steps or 0, at - begin, float(state.loss), float(state.residual), state.n,
-                seen.n_views, tracker.value, least=schedule.least(state.step, tries_finish),
+                seen.n_views, tracker.value, least_steps=schedule.least(state.step, tries_finish),
             )
         )  # fmt: skip
         if control.on_progress is not None:

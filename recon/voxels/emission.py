@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.special import xlogy
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector
@@ -52,6 +52,20 @@ class Emission:
                 raise ValueError(f"{name} [view, row, col] have shape {values.shape}, the geometry says {expected}")
             if not (np.isfinite(values).all() and values.min() >= 0):
                 raise ValueError(f"{name} must be finite and 0 or more, got {values.min()} to {values.max()}")
+
+    def summed(self, views: I64, geometry: Geometry) -> Emission:
+        """Counts of some of these views, or of neighbours that count as one view; activity keeps its scale.
+
+        Args:
+            views: [view, window], numbers of the views that are added.
+            geometry: of the views that are made.
+        """
+
+        def added(values: F32 | None) -> F32 | None:
+            return None if values is None else values[views].sum(axis=1)
+
+        survival = added(np.ones_like(self.counts) if self.survival is None else self.survival)
+        return Emission(self.counts[views].sum(axis=1), geometry, survival, added(self.background))
 
 
 def attenuation_factors(mu: Volume, geometry: Geometry) -> F32:

@@ -146,6 +146,26 @@ def test_views_held_out_tell_a_sample_that_moves_from_one_that_changes_in_place(
         assert (found.motion is not None) == (with_motion < without) == moving
 
 
+@pytest.mark.parametrize(("motion", "stages"), [(None, 2), (False, 1), (True, 2)])
+def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: int) -> None:
+    """Weights, then whether it moves (here not), or the motion itself."""
+    heard = list[int]()
+
+    def go_on(sweep: int, residual: float) -> bool:
+        heard.append(sweep)
+        return True
+
+    fit_series(views_of(48, noise=0.05), 3, motion=motion, sweeps=2, go_on=go_on)
+    assert heard[-2:] == [1, 2]
+    trials = np.array(heard[:-2])
+    parts = np.split(trials, np.flatnonzero(np.diff(trials) < 1) + 1)
+    assert len(parts) == stages
+    for part in parts:
+        assert part[-1] == 0 and len(part) <= 1 - part[0]
+    for fixed in parts[1:]:
+        np.testing.assert_array_equal(fixed, np.arange(1 - len(fixed), 1))
+
+
 @pytest.mark.parametrize("asked", [1, 40])
 def test_a_stop_within_a_sweep_gives_volumes(asked: int) -> None:
     """Also while the weight is tried."""

@@ -24,7 +24,7 @@ def load_angles(angles: Angles) -> NDArray[np.float64]:
         path = Path(angles)
         try:
             return parse_angles(text_in(path), str(path))
-        except (OSError, UnicodeDecodeError) as error:
+        except OSError as error:
             raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
     return np.atleast_1d(np.asarray(angles, np.float64))
 

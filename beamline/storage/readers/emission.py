@@ -30,6 +30,7 @@ class EmissionSource(StacksSource):
             path, file, [FrameStack(FrameKind.PROJECTION, views.name, views)], format="emission",
             facts={"title": f"Emission counts of {path.stem}"},
         )  # fmt: skip
+        self._counts = views
         self.dtype, self.quantity = np.dtype(np.float32), "line_integrals"
         self._sets = {name: found for name in SETS if (found := hdf5.dataset(file, f"{GROUP}/{name}")) is not None}
         for name, found in self._sets.items():
@@ -42,6 +43,10 @@ class EmissionSource(StacksSource):
         self.angles = angles
         self.pixel_size_mm = hdf5.scalar(file, f"{GROUP}/pixel_size", {"mm": 1.0})
         self.axis_col = (self.shape[1] - 1) / 2
+
+    @property
+    def checksummed(self) -> bool:
+        return all(item.fletcher32 for item in (self._counts, *self._sets.values()))
 
     @property
     def emission(self) -> EmissionOf:

@@ -48,7 +48,7 @@ class Osem:
     label: ClassVar[str] = "OSEM"
     traits: ClassVar[Traits] = Traits()
 
-    iterations: int = 8
+    iterations: int = 20
     subsets: int = 10
 
     def run(self, problem: ReconProblem, control: RunControl) -> MethodResult:

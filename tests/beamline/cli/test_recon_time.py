@@ -10,8 +10,10 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline import api
 from beamline.page.tiles import TileRegion
 from beamline.page.volume import ShownVolume
+from beamline.projections.selection import Selection
 from beamline.storage.volumes.files import opened_volume
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flagged
@@ -74,6 +76,42 @@ def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: 
     assert beamline("export", str(tmp_path / "last.h5"), "--at", "0", "-o", str(tmp_path / "n.npy")).exit_code == 5
 
 
+@pytest.fixture
+def weight_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No trials of weights, which take most of the time."""
+    monkeypatch.setattr("recon.series.weights_by_views", lambda *_, **__: np.full(2, 0.01))
+
+
+@pytest.mark.usefixtures("weight_given")
+def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path: Path) -> None:
+    page = series.with_suffix(".html").read_text(encoding="utf-8")
+    assert "2 volumes in time" in page and "Slices of each time" in page and "beamline view series.h5" in page
+    assert "Data residual, views used" in page and "data:image/png" in page
+    done = beamline("recon", str(scan), "--time", "2", "--no-moves", "--no-report", "-o", str(tmp_path / "s.h5"))
+    assert done.exit_code == 0, done.output
+    assert left(tmp_path) == {"s.h5"}
+
+
+@pytest.mark.usefixtures("weight_given")
+def test_a_script_gets_the_volumes_that_the_command_writes(scan: Path, tmp_path: Path) -> None:
+    command = beamline("recon", str(scan), "--time", "2", "--no-moves", "--axis", "19.5", "-o", str(tmp_path / "c.h5"))
+    assert command.exit_code == 0, command.output
+    wanted = Selection(axis_col=19.5)
+    found = api.reconstruct_series(scan, 2, moves=False, selection=wanted, say=None)
+    assert found.output is None and found.report is None and not found.moves and found.units == "1/mm"
+    assert found.seconds == pytest.approx((0, SPAN)) and found.axis_col == 19.5
+    with h5py.File(tmp_path / "c.h5") as file:
+        np.testing.assert_array_equal(found.volumes, file["entry/data/data"][()])
+    kept = api.reconstruct_series(scan, 2, moves=False, selection=wanted, output=tmp_path / "kept.h5", say=None)
+    assert left(tmp_path) == {"c.h5", "c.html", "kept.h5", "kept.html"} and kept.report == tmp_path / "kept.html"
+    np.testing.assert_array_equal(kept.volumes, found.volumes)
+    assert kept.residual == found.residual > 0 and not kept.ended_early
+    with pytest.raises(api.ConfigError, match="12 views or more for each"):
+        api.reconstruct_series(scan, 4, selection=wanted, say=None)
+    with pytest.raises(api.ConfigError, match=r"ends in \.h5"):
+        api.reconstruct_series(scan, 2, output=tmp_path / "other.tif", say=None)
+
+
 def test_the_series_is_described_and_valid(series: Path) -> None:
     facts = json.loads(beamline("info", str(series), "--json").output.splitlines()[-1])
     assert facts["times_s"] == [0.0, SPAN]
@@ -106,8 +144,10 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
         (("--time", "1"), 2, "--time"),
         (("--moves",), 2, "give --time N"),
         (("--time", "4"), 2, "12 views or more for each"),
-        (("--time", "2", "--memory", "100K"), 2, "may be used. Give --bin or --rows"),
-        (("--time", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Give --bin or --rows"),
+        (("--time", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
+        (("--time", "2", "--memory", "300K"), 2, "made in slabs: give --rows with 1 row or fewer at a time, or --bin"),
+        (("--time", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
+        (("--time", "2", "--axis", "try:18:20:1"), 2, "Find the axis first: give --axis try without --time"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(

@@ -55,19 +55,57 @@ def test_tables_of_any_manner(tmp_path: Path, text: str) -> None:
         assert (table.energies.tolist(), table.absorption.tolist()) == ([8.30, 8.31], [1.5, 1.6])
 
 
+@pytest.mark.parametrize("value", ["1e300", "-1e31", "1e999"])
+def test_an_absorption_that_nothing_has_is_refused(tmp_path: Path, value: str) -> None:
+    path = _text(tmp_path / "mu.csv", f"8.30 1\n8.31 {value}")
+    with pytest.raises(DataError, match=r"absorption .* at 1 energ"), open_measured(path, None, None):
+        pass
+    path = _hdf5(tmp_path / "mu.h5", energy=ENERGIES, mu=np.full(ENERGIES.size, float(value)))
+    with pytest.raises(DataError, match=rf"mu .* at {ENERGIES.size} energ"), open_measured(path, None, None):
+        pass
+
+
+def test_a_table_in_another_encoding_is_refused_in_our_words(tmp_path: Path) -> None:
+    (tmp_path / "mu.csv").write_text("8.30 1\n8.31 2", encoding="utf-16")
+    with (
+        pytest.raises(DataError, match=r"mu.csv cannot be read .*It is no UTF-8 text.*Save it as UTF-8") as refused,
+        open_measured(tmp_path / "mu.csv", None, None),
+    ):
+        pass
+    assert "codec" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("unit", "energies", "advice"),
+    [
+        (None, (0.0083, 0.0084), ""), (None, (8300.0, 8400.0), "; if they are eV, give --unit eV"),
+        (None, (8.3, 8300.0), ""), ("eV", (8.3, 8.4), "; if they are keV, give --unit keV"), ("eV", (8e6, 9e6), ""),
+    ],
+)  # fmt: skip
+def test_a_unit_is_advised_only_where_it_makes_the_energies_possible(
+    tmp_path: Path, unit: str | None, energies: tuple[float, float], advice: str
+) -> None:
+    path = _text(tmp_path / "mu.csv", "\n".join(f"{energy} 1" for energy in energies))
+    with pytest.raises(DataError) as refused, open_measured(path, unit, None):
+        pass
+    assert str(refused.value).endswith(f"keV are impossible, expected 0.05 to 500{advice}.")
+
+
 def test_energies_in_ev_are_read_where_it_is_said(tmp_path: Path) -> None:
     (tmp_path / "mu.csv").write_text("8300 1\n8310 2", encoding="utf-8")
     with open_measured(tmp_path / "mu.csv", "eV", None) as table:
         np.testing.assert_allclose(table.energies, [8.3, 8.31])
     with (
         pytest.raises(
-            DataError, match=r"energies from 0.0083 to 0.00831 keV are impossible; .* are keV, give --unit keV"
+            DataError, match=r"energies from 0.0083 to 0.00831 keV are impossible, .* are keV, give --unit keV"
         ),
         open_measured(_text(tmp_path / "kev.csv", "8.30 1\n8.31 2"), "eV", None),
     ):
         pass
     with (
-        pytest.raises(DataError, match="energies from 8300 to 8310 keV are impossible; if they are eV, give --unit eV"),
+        pytest.raises(
+            DataError, match=r"energies from 8300 to 8310 keV are impossible, .* if they are eV, give --unit eV"
+        ),
         open_measured(tmp_path / "mu.csv", None, None),
     ):
         pass
