@@ -27,10 +27,9 @@ _POWER, _MOST = 3.0, 4.0  # of noise / residual, and the largest factor by it
 # Added where views determine a volume (0.9 π / 2 views a column), none where they are half as many. It gives +1.0,
 # +0.7, -0.6 dB on a battery, a walnut and a thorax of 180 views, +1.5 on the demo.
 _MANY_VIEWS, _HALF = 0.3, 0.45
-# The part of the views that no volume explains, where it is known before. 2.5 gave +0.1 to +2.8 dB on seven of eight
-# cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views. On nine, 2.0 gives up to 0.4 dB more, -0.1 to -0.6 on a
-# shell of 64³.
-_KNOWN_BEFORE = 2.0
+# The part of the views that no volume explains, where it is known before. It gives +0.1 to +2.8 dB on seven of eight
+# cones of 64³ and 128³ voxels, -0.2 on a thorax of 25 views.
+_KNOWN_BEFORE = 2.5
 # Where only the residual shows it: what it adds to the weight and the largest factor, chosen by eye. A tooth with rings
 # gets 2.6 (at 8 its hairlines fade), faint plastic around a metal wire 5. A battery in a field too narrow, with a black
 # band, gains 0.1 dB at 5 and loses 0.6 at 8, 2.3 at 16 (OS-SIRT-TV).
