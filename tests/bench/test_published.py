@@ -30,6 +30,7 @@ DEPARTURES = {
     "not rectified": replace(PUBLISHED, fit=replace(FIT, rays=replace(FIT.rays, rectified=False))),
     "our start": replace(PUBLISHED, start="fbp"),
     "our split and clone": replace(PUBLISHED, fit=replace(FIT, policy=DensityPolicy())),
+    "7645 Gaussians at the start": replace(PUBLISHED, gaussians=7645),
     "compact kernel": replace(PUBLISHED, fit=replace(FIT, kernel=Kernel.COMPACT)),
     "least width of 0.3 pixels": replace(PUBLISHED, fit=replace(FIT, smallest=0.3)),
     "total variation moves centres": replace(PUBLISHED, fit=replace(FIT, tv_moves=True)),
@@ -53,7 +54,7 @@ TOWARDS = {
     "ours, no total variation": ours(tv_weight=0.0),
     "ours, Gaussian kernel": ours(kernel=Kernel.GAUSSIAN),
     "ours, Gaussian kernel, no finish": ours(400, 0, kernel=Kernel.GAUSSIAN),
-    "ours, their split and clone": ours(policy=replace(OURS.policy, rule="published")),
+    "ours, their split and clone": ours(policy=DensityPolicy(rule="published")),
     "ours, their start": replace(ours(), start="published"),
     "ours, their total variation": ours(tv_weight=0.05, tv_size=32, tv_moves=False),
     "ours, no SSIM": ours(ssim_weight=0.0),
@@ -68,6 +69,11 @@ TOWARDS = {
     "ours, few Gaussians, 1600 steps, no finish, Gaussian kernel": ours(1600, 0, FEW, kernel=Kernel.GAUSSIAN),
     "ours, few Gaussians, 1600 steps, no finish, no total variation": ours(1600, 0, FEW, tv_weight=0.0),
     "ours, few Gaussians, 1600 steps, no total variation": ours(1600, None, FEW, tv_weight=0.0),
+    "ours, few Gaussians, 800 steps, no finish, no total variation": ours(800, 0, FEW, tv_weight=0.0),
+    "ours, few Gaussians, 3200 steps, no finish, no total variation": ours(3200, 0, FEW, tv_weight=0.0),
+    "ours, 25 000 Gaussians": ours(400, None, 25_000),
+    "ours, 25 000 Gaussians, 1000 steps": ours(1000, None, 25_000),
+    "ours, 25 000 Gaussians, 1000 steps, no finish": ours(1000, 0, 25_000),
     "ours, 40 000 Gaussians, 1600 steps, no finish": ours(1600, 0, 40_000),
 }
 """The reverse: from ours towards the published settings, and what joins them."""
