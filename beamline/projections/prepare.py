@@ -281,7 +281,7 @@ def report_defects(projections: Projections, warn: Warn) -> None:
     unseen = areas(projections.masked)
     masked = float((projections.masked & ~unseen).mean())
     if unseen.mean() > 1e-3:
-        warn(f"{unseen.mean():.1%} of the detector got no beam: its rays count as not measured.")
+        warn(f"{unseen.mean():.1%} of the detector got no beam, or is saturated: its rays count as not measured.")
     if masked > 1e-3:
         warn(f"{masked:.1%} of the detector's pixels are dead or hot and were filled from their neighbours.")
     if projections.replaced > 1e-3:

@@ -282,7 +282,7 @@ def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wal
     data = np.concatenate([np.full((1, 6, 40), DARK), np.full((1, 6, 40), DARK + BEAM), counts])
     source = ArraySource(data, [2, 1] + [0] * len(counts), np.concatenate([[np.nan] * 2, scan.angles]))
     prepared = prepare_projections(source, Selection(steps=PLAIN), warnings.append)  # type: ignore[arg-type]
-    assert "35.0% of the detector got no beam: its rays count as not measured." in warnings
+    assert "35.0% of the detector got no beam, or is saturated: its rays count as not measured." in warnings
     assert prepared.measured is not None and not prepared.measured[:, :14].any() and prepared.measured[:, 14:].all()
     assert prepared.axis_col == pytest.approx(scan.axis_col, abs=0.3)
     use = DataUse(prepared.ray_weights())
