@@ -269,11 +269,11 @@ def test_an_end_before_its_time_leaves_nothing(
 
 
 def test_the_memory_is_that_of_a_few_frames(tmp_path: Path) -> None:
-    """Of 60 at most three, of 131 kB: two are held, beside objects of h5py and checksums (0.3 kB a frame)."""
-    raw, frame = tmp_path / "scan.h5", 256 * 256 * 2
+    """Of 30 at most three, of 524 kB: two are held, beside about 140 kB of objects that do not grow with a frame."""
+    raw, frame = tmp_path / "scan.h5", 512 * 512 * 2
     with h5py.File(raw, "w") as file:
-        file["exchange/data"] = np.random.default_rng(1).integers(0, 400, (60, 256, 256)).astype(np.uint16)
-        file["exchange/theta"] = np.linspace(0, 180, 60)
+        file["exchange/data"] = np.random.default_rng(1).integers(0, 400, (30, 512, 512)).astype(np.uint16)
+        file["exchange/theta"] = np.linspace(0, 180, 30)
         file["exchange/theta"].attrs["units"] = "deg"
     archive(raw, tmp_path / "first.h5")  # which imports what it needs
     tracemalloc.start()
