@@ -37,7 +37,7 @@ def measured_speeds(projections: F32, geometry: Geometry, grid: Grid, now: Clock
         ValueError: the scan holds no matter.
     """
     field = Grid.for_fit(geometry, grid)
-    count = default_count(field)
+    count = default_count(field, geometry.is_cone)
     slab, part = _slab(projections, geometry)
     slices = Grid.of_field(part, part.sample_pitch)
     whole = field.shape[0] / slices.shape[0]

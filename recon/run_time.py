@@ -205,7 +205,8 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     seconds = 0.0
     for height in extent.heights:
         voxels = height * extent.cols**2
-        count = _count(height, extent.cols) if given is None else given * height / extent.slices
+        first = default_count(Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone)
+        count = first if given is None else given * height / extent.slices
         seconds += max(less + slope * (_work(voxels, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     planned, fewest = method.planned_steps or 0, method.least_steps or 0
@@ -222,7 +223,7 @@ def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[floa
     """The work of a step of a small fit, and its seconds."""
     cols, rows = _within(extent, cols, rows)
     geometry, data = _sample(extent, min(extent.views, _FITTED_VIEWS), cols, rows)
-    count = _count(rows, cols)
+    count = default_count(Grid((rows, cols, cols)), geometry.is_cone)
 
     def took(steps: int) -> float:
         begin = now()
@@ -234,10 +235,6 @@ def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[floa
     step, mean = (long - short) / (_STEPS[1] - _STEPS[0]), long / _STEPS[1]
     step = min(max(step, mean / 3), mean)  # on a busy machine the longer run may take less
     return _work(rows * cols**2, count), step
-
-
-def _count(rows: int, cols: int) -> int:
-    return default_count(Grid((rows, cols, cols)))
 
 
 def _work(voxels: float, gaussians: float) -> float:

@@ -102,7 +102,8 @@ class ReconOptions:
         """The method for these views, with the steps and Gaussians of the preset, if there is one."""
         if self.quality is None or not isinstance(self.method, PresetMethod):
             return self.method
-        return self.method.with_quality(self.quality, default_count(Grid.of_field(geometry, geometry.sample_pitch)))
+        field = Grid.of_field(geometry, geometry.sample_pitch)
+        return self.method.with_quality(self.quality, default_count(field, geometry.is_cone))
 
     @property
     def stops_early(self) -> bool:

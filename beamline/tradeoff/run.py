@@ -68,7 +68,7 @@ def run_tradeoff(
     trials = plan(
         options.methods or names_compared(data.emission is not None),
         data.geometry.n_views,
-        default_count(Grid.of_field(data.geometry, scan.grid.voxel_size)),
+        default_count(Grid.of_field(data.geometry, scan.grid.voxel_size), data.geometry.is_cone),
         options.depth,
     )
     table = TrialTable(

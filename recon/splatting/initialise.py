@@ -60,10 +60,15 @@ def density_unit(volume: Volume) -> float:
     return float(np.percentile(positive, 99.5)) if positive.size else 0.0
 
 
-def default_count(grid: Grid) -> int:
-    """Default number of Gaussians for a grid: one for 60 voxels of its inscribed cylinder, from 2000 to 200 000."""
-    nz, ny, nx = grid.shape
-    return int(np.clip(np.pi / 4 * nz * ny * nx / 60, 2000, 200_000))
+def default_count(field: Grid, cone: bool) -> int:
+    """Default number of Gaussians: one for 60 voxels of the field's inscribed cylinder, from 2000 to 200 000.
+
+    Of a cone, whose field is often much larger than the sample, at most V^(2/3) for V voxels: Gaussians gather at
+    surfaces (docs/published.md).
+    """
+    voxels = math.prod(field.shape)
+    count = np.pi / 4 * voxels / 60
+    return int(np.clip(min(count, voxels ** (2 / 3)) if cone else count, 2000, 200_000))
 
 
 def place(
@@ -90,7 +95,8 @@ def place(
     Raises:
         ValueError: for a count below 1, and for data without matter or that are not line integrals.
     """
-    wanted = default_count(Grid.of_field(geometry, grid.voxel_size)) if count is None else operator.index(count)
+    field = Grid.of_field(geometry, grid.voxel_size)
+    wanted = default_count(field, geometry.is_cone) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
     if factor == 1:

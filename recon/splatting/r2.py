@@ -150,7 +150,11 @@ class R2:
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        count = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians or default_count(grid)
+        count = (
+            self.gaussians.n
+            if isinstance(self.gaussians, Gaussians)
+            else self.gaussians or default_count(grid, cone=False)
+        )
         grown = growth(self.fit) / DensityPolicy.growth
         of_gaussians = round(1000 * grown * min(count, math.prod(grid.shape)))
         return of_gaussians + iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)

@@ -123,7 +123,13 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
         factor = 1 if method.seconds is None else _factor_in_time(method, seen, field_grid, now, end)
-        state = _first_state(data[used], seen, field_grid, method, problem.seed, backend, factor)
+        start = method.gaussians
+        if not isinstance(start, Gaussians):
+            start = place(
+                data[used], seen, field_grid, start, np.random.default_rng(problem.seed), start=method.start,
+                rays=settings.rays, kernel=settings.kernel, factor=factor,
+            )  # fmt: skip
+        state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, geometry.n_views, backend)
     n_start, unit = state.n, state.unit
@@ -240,7 +246,7 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     """
     if isinstance(method.gaussians, Gaussians):
         return 1
-    count = method.gaussians or default_count(Grid.of_field(geometry, grid.voxel_size))
+    count = method.gaussians or default_count(Grid.of_field(geometry, grid.voxel_size), geometry.is_cone)
     needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
     needed += first_draw_seconds(grid, count, now)
     left = max(end - now(), 0.0)
@@ -302,19 +308,6 @@ def split_views(n_views: int, held_out: tuple[int, ...], early_stop: bool) -> tu
     if early_stop and not kept_back.size:
         raise ValueError("early_stop looks at views held out, and there are none")
     return np.setdiff1d(np.arange(n_views), kept_back), kept_back
-
-
-def _first_state(
-    data: F32, geometry: Geometry, field_grid: Grid, method: FitMethod, seed: int, backend: Backend[Any], factor: int
-) -> FitState:
-    start = method.gaussians
-    if not isinstance(start, Gaussians):
-        rng = np.random.default_rng(seed)
-        start = place(
-            data, geometry, field_grid, start, rng, start=method.start, rays=method.fit.rays, kernel=method.fit.kernel,
-            factor=factor,
-        )  # fmt: skip
-    return fit.init(start, seed, growth(method.fit), backend)
 
 
 def _resumed(checkpoint: Mapping[str, NDArray[Any]], n_views: int, backend: Backend[Any]) -> FitState:
