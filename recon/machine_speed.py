@@ -14,7 +14,7 @@ from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.in_time import sweep_seconds
-from recon.splatting.initialise import MATTER, default_count, density_unit, first_volume, sample_gaussians
+from recon.splatting.initialise import MATTER, count_for, density_unit, first_volume, sample_gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import voxelize
@@ -37,7 +37,7 @@ def measured_speeds(projections: F32, geometry: Geometry, grid: Grid, now: Clock
         ValueError: the scan holds no matter.
     """
     field = Grid.for_fit(geometry, grid)
-    count = default_count(field, geometry.is_cone)
+    count = count_for(field, geometry.is_cone)
     slab, part = _slab(projections, geometry)
     slices = Grid.of_field(part, part.sample_pitch)
     whole = field.shape[0] / slices.shape[0]

@@ -21,7 +21,7 @@ from recon.reconstruction import reconstruct
 from recon.splatting.finish import SWEEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import default_count
+from recon.splatting.initialise import count_for
 from recon.splatting.r2 import R2
 from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
@@ -205,7 +205,7 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     seconds = 0.0
     for height in extent.heights:
         voxels = height * extent.cols**2
-        first = default_count(Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone)
+        first = count_for(Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone)
         count = first if given is None else given * height / extent.slices
         seconds += max(less + slope * (_work(voxels, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
@@ -223,7 +223,7 @@ def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[floa
     """The work of a step of a small fit, and its seconds."""
     cols, rows = _within(extent, cols, rows)
     geometry, data = _sample(extent, min(extent.views, _FITTED_VIEWS), cols, rows)
-    count = default_count(Grid((rows, cols, cols)), geometry.is_cone)
+    count = count_for(Grid((rows, cols, cols)), geometry.is_cone)
 
     def took(steps: int) -> float:
         begin = now()

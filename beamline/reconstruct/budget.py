@@ -147,9 +147,7 @@ def within(
     now, begin = control.now, control.now()
     data, geometry = prepared.projections.data, prepared.geometry
     speeds = measured_speeds(data, geometry, Grid.matching(geometry), now)
-    unbinned = default_count(
-        Grid.of_field(geometry, geometry.sample_pitch), geometry.is_cone
-    )  # the curves count in these
+    unbinned = default_count(geometry, geometry.sample_pitch)  # the curves count in these
     direct = has_direct_method(geometry)
     taking = {method.name: method for method in methods if direct or not method.traits.direct}
     modelled = {name: method for name, method in taking.items() if method.traits.any_grid or method.traits.direct}
@@ -199,7 +197,7 @@ def _chosen(
             break
     else:
         return by_curves, f"{expected}the scan has too few rows for a trial in this time"
-    count = default_count(Grid.of_field(part.geometry, part.geometry.sample_pitch), part.geometry.is_cone)
+    count = default_count(part.geometry, part.geometry.sample_pitch)
     trial = RunControl(_until(control, control.now() + _TRIAL_SLACK * seconds), now=control.now)
     liked = sorted(tried, key=lambda c: list(plan.methods).index(c.method))
     order = [liked.index(c) for c in tried]

@@ -16,7 +16,6 @@ from beamline.storage.writers.partial_volume import can_become
 from recon.base.choices import Quality
 from recon.base.geometry import Geometry
 from recon.base.method import Method, PresetMethod
-from recon.base.volume import Grid
 from recon.methods import names, streams
 from recon.splatting.fit_method import StreamingMethod
 from recon.splatting.initialise import default_count
@@ -102,8 +101,7 @@ class ReconOptions:
         """The method for these views, with the steps and Gaussians of the preset, if there is one."""
         if self.quality is None or not isinstance(self.method, PresetMethod):
             return self.method
-        field = Grid.of_field(geometry, geometry.sample_pitch)
-        return self.method.with_quality(self.quality, default_count(field, geometry.is_cone))
+        return self.method.with_quality(self.quality, default_count(geometry, geometry.sample_pitch))
 
     @property
     def stops_early(self) -> bool:

@@ -25,7 +25,6 @@ from beamline.tradeoff.table import TrialTable
 from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
 from beamline.tradeoff.varied import Depth
 from drivers.base.clock import Clock
-from recon.base.volume import Grid
 from recon.methods import by_name, names_compared
 from recon.splatting.initialise import default_count
 
@@ -68,7 +67,7 @@ def run_tradeoff(
     trials = plan(
         options.methods or names_compared(data.emission is not None),
         data.geometry.n_views,
-        default_count(Grid.of_field(data.geometry, scan.grid.voxel_size), data.geometry.is_cone),
+        default_count(data.geometry, scan.grid.voxel_size),
         options.depth,
     )
     table = TrialTable(

@@ -60,8 +60,13 @@ def density_unit(volume: Volume) -> float:
     return float(np.percentile(positive, 99.5)) if positive.size else 0.0
 
 
-def default_count(field: Grid, cone: bool) -> int:
-    """Default number of Gaussians: one for 60 voxels of the field's inscribed cylinder, from 2000 to 200 000.
+def default_count(geometry: Geometry, voxel_size: float) -> int:
+    """Default number of Gaussians for the field of these views, see `count_for`."""
+    return count_for(Grid.of_field(geometry, voxel_size), geometry.is_cone)
+
+
+def count_for(field: Grid, cone: bool) -> int:
+    """Number of Gaussians for a field: one for 60 voxels of its inscribed cylinder, from 2000 to 200 000.
 
     Of a cone, whose field is often much larger than the sample, at most V^(2/3) for V voxels: Gaussians gather at
     surfaces (docs/published.md).
@@ -95,8 +100,7 @@ def place(
     Raises:
         ValueError: for a count below 1, and for data without matter or that are not line integrals.
     """
-    field = Grid.of_field(geometry, grid.voxel_size)
-    wanted = default_count(field, geometry.is_cone) if count is None else operator.index(count)
+    wanted = default_count(geometry, grid.voxel_size) if count is None else operator.index(count)
     if wanted < 1:
         raise ValueError(f"a model needs at least one Gaussian, got {wanted}")
     if factor == 1:

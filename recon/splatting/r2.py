@@ -150,11 +150,8 @@ class R2:
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
-        count = (
-            self.gaussians.n
-            if isinstance(self.gaussians, Gaussians)
-            else self.gaussians or default_count(grid, cone=False)
-        )
+        given = self.gaussians.n if isinstance(self.gaussians, Gaussians) else self.gaussians
+        count = given or default_count(geometry, grid.voxel_size)
         grown = growth(self.fit) / DensityPolicy.growth
         of_gaussians = round(1000 * grown * min(count, math.prod(grid.shape)))
         return of_gaussians + iterative_memory(geometry, grid, 10, 9, 9 * weighted, filtered=True)

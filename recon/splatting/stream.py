@@ -306,7 +306,7 @@ class StreamingFit:
         field = Grid.for_fit(self._template, self._grid, wider=wider)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / _PLACED_FROM) / 3))
         rough = Grid.for_fit(self._template, replace(field, voxel_size=coarser * field.voxel_size), wider=wider)
-        count = self._count or default_count(Grid.of_field(self._template, field.voxel_size), geometry.is_cone)
+        count = self._count or default_count(self._template, field.voxel_size)
         kernel = self._settings.kernel
         if known is None or self._problem is None or geometry.is_cone:  # the first volume of a cone is not linear
             placed = place(data, geometry, rough, count, self._rng, kernel=kernel)

@@ -246,7 +246,7 @@ def _factor_in_time(method: FitMethod, geometry: Geometry, grid: Grid, now: Call
     """
     if isinstance(method.gaussians, Gaussians):
         return 1
-    count = method.gaussians or default_count(Grid.of_field(geometry, grid.voxel_size), geometry.is_cone)
+    count = method.gaussians or default_count(geometry, grid.voxel_size)
     needed = sweeps_of_start(geometry, method.start) * first_sweep_seconds(geometry, grid, now)
     needed += first_draw_seconds(grid, count, now)
     left = max(end - now(), 0.0)

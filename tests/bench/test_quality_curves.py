@@ -90,7 +90,7 @@ def measured(data: F32, geometry: Geometry, truth: F32) -> dict[Kind, list[tuple
     """
     now, grid = time.process_time, Grid.matching(geometry)
     base = psnr(truth, fbp(data, geometry, filter="hann"))
-    count = default_count(Grid.of_field(geometry, grid.voxel_size), geometry.is_cone)
+    count = default_count(geometry, grid.voxel_size)
     out: dict[Kind, list[tuple[float, float, float]]] = {}
     for kind in KINDS:
         name, counted, binning, share, numbers = kind

@@ -49,7 +49,7 @@ def test_every_beam_is_measured_by_its_own_pixels_at_the_axis(beam: str, monkeyp
     grid, ticks = Grid.matching(geometry), iter(range(100_000))
     speeds = measured_speeds(_views(geometry), geometry, grid, lambda: float(next(ticks)))
     # As many Gaussians as a fit would start from, within the field, and not wider than a few of its pixels.
-    assert spread[0].n == default_count(Grid.of_field(geometry, 0.1), geometry.is_cone) == 2000
+    assert spread[0].n == default_count(geometry, 0.1) == 2000
     assert np.abs(spread[0].means.numpy()[:, :2]).max() <= 0.1 * 60 / 2 * 1.5
     assert 0.05 <= float(spread[0].scales.max()) < 0.5
     assert spread[0].kernel is FitSettings().kernel

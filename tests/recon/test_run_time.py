@@ -17,7 +17,7 @@ from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
 from recon.run_time import Extent, RunTime, run_seconds
-from recon.splatting.initialise import default_count
+from recon.splatting.initialise import count_for
 
 
 def extent(views: int, cols: int, heights: Sequence[int], decided: bool = False) -> Extent:
@@ -102,7 +102,7 @@ def test_the_time_of_a_fit_that_the_data_may_end_is_said_twice(
     monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], least: float
 ) -> None:
     """Where a step takes a second, and a quarter more once Gaussians are added, and a finish takes none."""
-    work = run_time._work(16 * 128**2, default_count(Grid((16, 128, 128)), cone=False))
+    work = run_time._work(16 * 128**2, count_for(Grid((16, 128, 128)), cone=False))
     monkeypatch.setattr(run_time, "_step_of_fit", lambda *_: (work, 1.0))
     monkeypatch.setattr(run_time, "_of_direct", lambda *_: 0.0)
     monkeypatch.setattr(run_time, "_of_iterations", lambda *_: 0.0)

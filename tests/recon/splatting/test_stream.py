@@ -17,7 +17,7 @@ from recon.splatting import stream
 from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import default_count
+from recon.splatting.initialise import count_for
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
@@ -330,15 +330,15 @@ def test_a_template_whose_views_differ_is_refused_and_one_shift_is_kept(data: np
 
 
 def test_the_count_follows_the_grid() -> None:
-    assert default_count(Grid((4, 4, 4)), cone=False) == 2000
-    assert default_count(Grid((100, 200, 200)), cone=False) == pytest.approx(np.pi / 4 * 4e6 / 60, rel=0.01)
-    assert default_count(Grid((2048, 2048, 2048)), cone=False) == 200_000
+    assert count_for(Grid((4, 4, 4)), cone=False) == 2000
+    assert count_for(Grid((100, 200, 200)), cone=False) == pytest.approx(np.pi / 4 * 4e6 / 60, rel=0.01)
+    assert count_for(Grid((2048, 2048, 2048)), cone=False) == 200_000
 
 
 def test_the_count_of_a_cone_grows_with_the_area_of_its_field() -> None:
     small, large = Grid((100, 100, 100)), Grid((200, 200, 200))
-    assert default_count(large, cone=True) == pytest.approx(4 * default_count(small, cone=True), rel=1e-3)
-    assert default_count(Grid((20, 20, 20)), cone=True) == 2000
+    assert count_for(large, cone=True) == pytest.approx(4 * count_for(small, cone=True), rel=1e-3)
+    assert count_for(Grid((20, 20, 20)), cone=True) == 2000
 
 
 def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray, phantom: Phantom) -> None:
