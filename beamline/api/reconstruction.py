@@ -42,7 +42,7 @@ class ReconResult:
         figures: figures of merit by name (residual, snr, seconds, ...), see docs/tradeoff.md.
         settings: everything that the volume depends on, by name.
         axis_col: rotation axis in columns of the full detector.
-        units: of the volume, 1/mm, or 1/px if the pixel size is unknown.
+        units: of the volume, 1/mm, or 1/px if the pixel size is unknown; of an emission counts/mm.
         warnings: sentences.
         ended_early: Ctrl-C ended it with the volume so far.
         output, report: files; None if not requested.

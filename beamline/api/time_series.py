@@ -122,7 +122,7 @@ def reconstruct_series(
     return TimeSeriesResult(
         seconds=done.seconds,
         grid=record.volume.grid,
-        units=f"1/{record.length_unit}",
+        units=record.unit,
         moves=done.moves,
         chosen=done.chosen,
         residual=done.residual,

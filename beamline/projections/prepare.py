@@ -122,7 +122,12 @@ def prepare_projections(
     on_disk, column = spill is not None, places.axis_col
     found = assemble(source, selection, projections, places.of(ids), (column, axis), usable, warn, on_disk)
     if others is not None:
-        found = replace(found, held_out=(others.data, places.of(others.view_ids)), held_out_ids=others.view_ids)
+        found = replace(
+            found,
+            held_out=(others.data, places.of(others.view_ids)),
+            held_out_ids=others.view_ids,
+            held_out_weights=others.weights,
+        )
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     done = {**correction.done, **tilt, **places.done}
     found = replace(found, done=done)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.steps.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
 from recon.base.geometry import Geometry
@@ -31,6 +32,7 @@ class PreparedProjections:
         axis: how it was found; None where it was given.
         held_out: line integrals of some views that are not used, and their geometry; None where all are used.
         held_out_ids: rows of the file of these views; None: unknown.
+        held_out_weights: of their rays, as `projections.weights` of the views used; None: as a usual ray of these.
         n_projections: how many views the scan has.
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, "line_integrals", or "emission".
@@ -61,7 +63,13 @@ class PreparedProjections:
     done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
     held_out_ids: NDArray[np.int64] | None = None
+    held_out_weights: NDArray[np.float32] | None = None
     emission: Emission | None = None
+
+    @property
+    def kind(self) -> VoxelKind:
+        """What voxels of these views are."""
+        return VoxelKind.ATTENUATION if self.emission is None else VoxelKind.ACTIVITY
 
     @property
     def on_disk(self) -> bool:
@@ -83,6 +91,7 @@ class PreparedProjections:
             projections=replace(found, data=found.data[:, rows], masked=found.masked[rows], weights=cut(found.weights)),
             geometry=geometry,
             held_out=held,
+            held_out_weights=cut(self.held_out_weights),
             measured=cut(self.measured),
             shares=shares,
             shares_of=None,
@@ -107,13 +116,17 @@ class PreparedProjections:
         """Weights [view, row, col], computed only where they are asked for; None: one for all rays.
 
         Args:
-            others: views held out after these, which weigh 1, as a usual ray of these does; 0: none.
+            others: views held out after these. Without weights of their own they weigh 1, as a usual ray of these does.
         """
         factors: list[NDArray[np.float32]] = []
         if self.view_weights is not None:
             factors.append(_and_ones(self.view_weights, others)[:, None, None])
         if (counted := self.projections.weights) is not None:
-            factors.append(_and_ones(counted / counted.mean(where=counted > 0), others))
+            usual, unseen = counted.mean(where=counted > 0), self.held_out_weights
+            if unseen is not None and len(unseen) == others:
+                factors.append(np.concatenate((counted, unseen)) / usual)
+            else:
+                factors.append(_and_ones(counted / usual, others))
         if self.measured is not None:
             factors.append(self.measured.astype(np.float32)[None])
         if self.leaves_slices:

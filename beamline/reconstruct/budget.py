@@ -250,7 +250,7 @@ def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
         weights = bin_views(counted, factor)
         sums = bin_views(counted * projections.data, factor)
         data = np.divide(sums, weights, out=data, where=weights > 0)
-    held, measured = prepared.held_out, prepared.measured
+    held, unseen, measured = prepared.held_out, prepared.held_out_weights, prepared.measured
     if measured is not None:
         measured = bin_views(measured[None].astype(np.float32), factor)[0] == 1
     return replace(
@@ -260,4 +260,5 @@ def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
         measured=measured,
         shares=None if prepared.shares is None else bin_views(prepared.shares, factor),
         held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
+        held_out_weights=None if unseen is None else bin_views(unseen, factor),
     )

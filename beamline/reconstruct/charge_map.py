@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import size
+from beamline.core.voxel_kind import VoxelKind
 from beamline.reconstruct.energy_series import Spectra
 from beamline.reconstruct.slabs import SHARE
 from beamline.report.figures import downwards, dpi_for, planes, png
@@ -110,7 +111,7 @@ def charge_map(
         title=f"share of {names[-1]} (state of charge)",
         sample=first.sample,
         time=time,
-        is_share=True,
+        kind=VoxelKind.SHARE,
         parameters={"method": "share", "volumes": ", ".join(str(path.resolve()) for path in paths), "least": least},
         metrics={
             "mean": float(filled.mean()),
@@ -161,13 +162,13 @@ def _refuse_unlike(paths: Sequence[Path], records: Sequence[ReconRecord], spectr
                 f"{path} has voxels at other places than {paths[0]}: {_words(own)}, not {_words(grid)}. Reconstruct "
                 "both with the same --axis, --rows and --bin. Nothing was written."
             )
-        if spectra is None and not record.is_share:
+        if spectra is None and record.kind is not VoxelKind.SHARE:
             raise ConfigError(
                 f"{path} holds attenuation and not volume fractions, as `beamline materials` writes them; volumes of "
                 "several energies need --spectra. Nothing was written."
             )
-        if spectra is not None and (record.is_share or record.length_unit != "mm"):
-            unit = "a volume fraction" if record.is_share else f"in 1/{record.length_unit}"
+        if spectra is not None and record.unit != "1/mm":
+            unit = f"in {record.unit}" if record.unit else "a volume fraction"
             raise ConfigError(f"{path} is {unit}; with --spectra volumes in 1/mm are expected. Nothing was written.")
 
 

@@ -20,6 +20,7 @@ from beamline.core.files import refuse_existing, remove, text_in
 from beamline.core.machine import free_memory
 from beamline.core.signals import StopOnSignal
 from beamline.core.text import size
+from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection, cone_of
@@ -288,7 +289,7 @@ def _write(
                 title=f"volume fraction of {name}",
                 sample="not stated",
                 time=time,
-                is_share=True,
+                kind=VoxelKind.SHARE,
                 parameters={
                     "method": "materials",
                     "scans": ", ".join(paths),

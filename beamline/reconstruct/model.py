@@ -147,7 +147,7 @@ def write_ply(path: Path, model: Model) -> None:
     head = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment lengths in {unit}, densities in 1/{unit}, kernel {model.gaussians.kernel}",
+        f"comment lengths in {unit}, densities in {model.record.unit}, kernel {model.gaussians.kernel}",
         f"element vertex {len(rows)}",
         *(f"property float {name}" for name in names),
         "end_header",

@@ -218,7 +218,7 @@ def compose(
         flags=[*context.scan_flags, *context.facts.remarks, *context.warnings],
         pictures=[
             *_pictures(made, prepared, truth, volumes, left),
-            *_stray_mass(context.stray, made.volume.grid, prepared.length_unit),
+            *_stray_mass(context.stray, made.volume.grid, prepared),
             *_frame_pictures(context.facts),
         ],
         command=context.command,
@@ -291,14 +291,14 @@ def _footnotes(
     return footnotes
 
 
-def _stray_mass(stray: NDArray[np.float32] | None, grid: Grid, unit: str) -> list[Picture]:
+def _stray_mass(stray: NDArray[np.float32] | None, grid: Grid, prepared: PreparedProjections) -> list[Picture]:
     if stray is None:
         return []
     caption = (
         "The highest density above each other, of voxels that the views show to be empty. All of it is an artefact: "
         "less is better."
     )
-    return [Picture("Stray mass", caption, figures.stray_mass(stray, grid, unit))]
+    return [Picture("Stray mass", caption, figures.stray_mass(stray, grid, prepared.length_unit, prepared.kind))]
 
 
 def _frame_pictures(facts: ScanFacts) -> list[Picture]:
@@ -327,7 +327,7 @@ def _pictures(
     left: Unexplained | None,
 ) -> list[Picture]:
     data, geometry, unit = prepared.projections.data, prepared.geometry, prepared.length_unit
-    row = geometry.detector_shape[0] // 2
+    kind, row = prepared.kind, geometry.detector_shape[0] // 2
     shown = {"Truth": truth} if truth is not None else {}
     shown |= {label_of(method): volume for method, volume in volumes.items()}
     pictures = [
@@ -335,18 +335,18 @@ def _pictures(
             "Slices",
             "Three orthogonal slices through the centre of mass of the bright voxels, y and z downwards as in image "
             "viewers. All share one grey window (1st to 99.5th percentile).",
-            figures.orthogonal_slices(shown, unit),
+            figures.orthogonal_slices(shown, unit, kind),
         ),
         Picture(
             "Slices, low contrast",
             "The same slices, brighter: the 2nd to 90th percentile, for weak matter; fewer streaks are better.",
-            figures.orthogonal_slices(shown, unit, (2.0, 90.0)),
+            figures.orthogonal_slices(shown, unit, kind, (2.0, 90.0)),
         ),
         Picture(
             "Sharpest edge, and values",
             "Along a line through the sharpest edge: steeper is sharper, dips and overshoots beside the edge are "
             "artefacts. Values: narrower peaks are better, unless the sample has values between them.",
-            figures.profile_and_values(shown, unit),
+            figures.profile_and_values(shown, unit, kind),
         ),
     ]
     if unseen := unseen_wedges(geometry):
@@ -357,7 +357,7 @@ def _pictures(
                 "Differences",
                 f"What each volume has more (red) or less (blue) than {next(iter(shown))}, in the first slice. "
                 + ("Nearer to white is better." if truth is not None else _NO_REFERENCE),
-                figures.differences(shown, unit),
+                figures.differences(shown, unit, kind),
             )
         )
     if made.deviation is not None:
@@ -366,7 +366,7 @@ def _pictures(
                 "Error bars",
                 "A slice, and the standard deviation of its voxels. About two of three voxels of the true sample are "
                 "within one deviation of the volume. Fine texture that the method has smoothed away may lie outside.",
-                figures.error_bars(made.volume, made.deviation, unit),
+                figures.error_bars(made.volume, made.deviation, unit, kind),
             )
         )
     if left is not None:
@@ -391,7 +391,7 @@ def _pictures(
     pictures += [
         Picture(
             "Projection",
-            "One corrected view: the line integral of the attenuation along each ray. Air is better the nearer "
+            f"One corrected view: the line integral of the {kind.value} along each ray. Air is better the nearer "
             "to 0 and the more even it is.",
             figures.projection(data, geometry, 0, unit),
         ),

@@ -58,6 +58,7 @@ def write_result(
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,
+        kind=prepared.kind,
         raw_file=str(context.facts.path.resolve()),
         title=f"{label_of(made.method)} reconstruction of {context.facts.name}",
         sample=context.facts.sample or "not stated",
@@ -96,7 +97,7 @@ def write_result(
             axis_col=prepared.axis_col,
             n_views=prepared.geometry.n_views,
             shape=record.volume.grid.shape,
-            units=f"1/{prepared.length_unit}",
+            units=record.unit,
             elapsed=clock.now() - context.started,
             times=phases.seconds,
             metrics=own,

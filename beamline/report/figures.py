@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from beamline.core.voxel_kind import VoxelKind
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.voxels.view_weights import Wedge
@@ -103,14 +104,20 @@ def downwards(axis: str, unit: str) -> str:
     return f"← {axis} ({unit})"
 
 
-def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: GreyWindow = (1.0, 99.5)) -> bytes:
+def orthogonal_slices(
+    volumes: Mapping[str, Volume],
+    unit: str,
+    kind: VoxelKind = VoxelKind.ATTENUATION,
+    percentiles: GreyWindow = (1.0, 99.5),
+) -> bytes:
     """Three orthogonal slices through each volume, in one grey window; y and z downwards, as image viewers show them.
 
     They intersect at the centre of mass of the bright voxels of the last volume.
 
     Args:
         volumes: by name, all on the same grid.
-        unit: of length; the volumes are in 1/unit.
+        unit: of length.
+        kind: what the voxels are.
         percentiles: of all the values shown, which become black and white.
     """
     first = next(iter(volumes.values())).grid
@@ -141,11 +148,11 @@ def orthogonal_slices(volumes: Mapping[str, Volume], unit: str, percentiles: Gre
             if i == 0:
                 axes.set_title(name, fontsize=11)
     bar = figure.colorbar(shown, ax=panels, shrink=0.6, pad=0.02, aspect=30)
-    bar.set_label(f"attenuation (1/{unit})")
+    bar.set_label(kind.label(unit))
     return png(figure)
 
 
-def differences(volumes: Mapping[str, Volume], unit: str) -> bytes:
+def differences(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """What each volume has more (red) or less (blue) than the first one, in the slice z of `orthogonal_slices`."""
     (first, reference), *others = volumes.items()
     z = bright_centre(list(volumes.values())[-1].data)[0]
@@ -165,11 +172,11 @@ def differences(volumes: Mapping[str, Volume], unit: str) -> bytes:
         axes.xaxis.set_major_locator(MaxNLocator(7, prune="both"))
         axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit))
         axes.set_title(f"{name} − {first}", fontsize=10)
-    figure.colorbar(shown, ax=figure.axes, label=f"difference (1/{unit})", shrink=0.8, pad=0.02)
+    figure.colorbar(shown, ax=figure.axes, label=f"difference ({kind.unit(unit)})", shrink=0.8, pad=0.02)
     return png(figure)
 
 
-def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
+def profile_and_values(volumes: Mapping[str, Volume], unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """Each volume along a line through the sharpest edge of the last one, and how often its values occur.
 
     The line lies in the slice z of `orthogonal_slices`, along the gradient where that is largest after a blur of a
@@ -193,9 +200,9 @@ def profile_and_values(volumes: Mapping[str, Volume], unit: str) -> bytes:
         count, edges = np.histogram(few, bins=120, range=(low, high))
         right.stairs(count / few.size, edges, lw=1.2, label=name)
     left.xaxis.set_major_locator(MaxNLocator(5))
-    left.set(xlabel=f"along the line ({unit})", ylabel=f"attenuation (1/{unit})")
+    left.set(xlabel=f"along the line ({unit})", ylabel=kind.label(unit))
     left.set_title(f"Edge at y = {y}, x = {x} of slice {z} (voxels)", fontsize=9)
-    right.set(xlabel=f"attenuation (1/{unit})", ylabel="share of voxels", yscale="log")
+    right.set(xlabel=kind.label(unit), ylabel="share of voxels", yscale="log")
     right.set_title("Values", fontsize=9)
     for axes in (left, right):
         axes.grid(alpha=0.3)
@@ -214,14 +221,14 @@ def significance(image: NDArray[np.float32], grid: Grid, at: int, unit: str) -> 
     return png(figure)
 
 
-def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str) -> bytes:
+def stray_mass(image: NDArray[np.float32], grid: Grid, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """The map [y, x] of density in empty voxels."""
     figure, axes = _figure((6.4, 5.4))
     (y, x), (_, cy, cx) = image.shape, grid.centre
     extent = (*_edges(cx, x, grid.voxel_size), *_edges(cy, y, grid.voxel_size)[::-1])
     shown = axes.imshow(image, cmap="magma", extent=extent, interpolation="nearest")
     axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title="Highest density where views show nothing")
-    figure.colorbar(shown, ax=axes, label=f"attenuation (1/{unit})", pad=0.02)
+    figure.colorbar(shown, ax=axes, label=kind.label(unit), pad=0.02)
     return png(figure)
 
 
@@ -242,7 +249,7 @@ def wedges(volume: Volume, unseen: Sequence[Wedge], unit: str) -> bytes:
     return png(figure)
 
 
-def error_bars(volume: Volume, deviation: Volume, unit: str) -> bytes:
+def error_bars(volume: Volume, deviation: Volume, unit: str, kind: VoxelKind = VoxelKind.ATTENUATION) -> bytes:
     """A slice through the bright voxels, and its standard deviation, each with its colour bar and a scale bar."""
     at = bright_centre(volume.data)[0]
     grid = volume.grid
@@ -252,7 +259,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str) -> bytes:
         *_edges(grid.centre[1], grid.shape[1], grid.voxel_size)[::-1],
     )
     length = round_length(grid.shape[2] * grid.voxel_size / 5)
-    panels = ((volume, "attenuation", "gray"), (deviation, "standard deviation", "magma"))
+    panels = ((volume, kind.value, "gray"), (deviation, "standard deviation", "magma"))
     for axes, (shown, label, colours) in zip(figure.subplots(1, 2), panels, strict=True):
         image = shown.data[at]
         low, high = grey_window([image], 0.5, 99.5)
@@ -261,7 +268,7 @@ def error_bars(volume: Volume, deviation: Volume, unit: str) -> bytes:
         axes.plot([left, left + length], [top, top], color="white", lw=3, solid_capstyle="butt")
         axes.text(left, top + length / 8, f"{length:g} {unit}", color="white", fontsize=8, va="top")
         axes.set(xlabel=f"x ({unit})", ylabel=downwards("y", unit), title=f"Slice {at}")
-        figure.colorbar(drawn, ax=axes, label=f"{label} (1/{unit})", shrink=0.8)
+        figure.colorbar(drawn, ax=axes, label=f"{label} ({kind.unit(unit)})", shrink=0.8)
     return png(figure)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.files import whole_file
+from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import hdf5
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -23,17 +24,18 @@ BYTES_A_VOXEL = 16  # Peak memory as measured: 12 for solids (float64 and float3
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """True attenuation and labels of a sample.
+    """True voxels and labels of a sample.
 
     Attributes:
-        attenuation: float32 [z, y, x], 1/mm.
+        values: float32 [z, y, x]; lengths are in mm.
         labels: uint8 [z, y, x]; 0 is air, k the k-th of `names`.
     """
 
     grid: Grid
-    attenuation: NDArray[np.float32]
+    values: NDArray[np.float32]
     labels: NDArray[np.uint8]
     names: tuple[str, ...]
+    kind: VoxelKind = VoxelKind.ATTENUATION
 
 
 def geometry_of(detector: Detector, angles: NDArray[np.float64]) -> Geometry:
@@ -67,7 +69,8 @@ def truth_of(sample: Sample, detector: Detector, binning: int) -> Truth:
 def truth_of_emission(scene: EmissionScene, scale: float) -> Truth:
     """The activity in counts per mm of line, `scale` in the body, in voxels of a line's width."""
     grid, sample = _grid(scene.lines.detector, 1), scene.emission.activity
-    return Truth(grid, sample.attenuation(grid) * np.float32(scale), sample.labels(grid), sample.names)
+    activity = sample.attenuation(grid) * np.float32(scale)
+    return Truth(grid, activity, sample.labels(grid), sample.names, VoxelKind.ACTIVITY)
 
 
 def _grid(detector: Detector, binning: int) -> Grid:
@@ -97,8 +100,8 @@ def write_truth(path: Path, truth: Truth) -> None:
         data = entry.create_group("data")
         data.attrs["NX_class"], data.attrs["signal"], data.attrs["axes"] = "NXdata", "data", ["z", "y", "x"]
         chunks = (1, *truth.grid.shape[1:])
-        data.create_dataset("data", data=truth.attenuation, chunks=chunks)
-        data["data"].attrs["units"] = "1/mm"
+        data.create_dataset("data", data=truth.values, chunks=chunks)
+        data["data"].attrs["units"] = truth.kind.unit("mm")
         data.create_dataset("labels", data=truth.labels, chunks=chunks, compression="gzip", compression_opts=1)
         data["labels"].attrs["names"] = ["air", *truth.names]
         for name, centres in zip(("z", "y", "x"), truth.grid.coordinates(), strict=True):

@@ -17,6 +17,7 @@ from zlib_ng import zlib_ng
 
 from beamline.core.errors import DataError
 from beamline.core.shipped import version
+from beamline.core.voxel_kind import VoxelKind
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
@@ -173,7 +174,7 @@ def record_of(facts: Mapping[str, Any], values: Any) -> ReconRecord:
         time=datetime.fromisoformat(facts["date"]).timestamp(),
         parameters={**facts["parameters"], **window},
         metrics=facts["metrics"],
-        is_share=facts.get("values") == "",
+        kind=VoxelKind.of_unit(str(facts.get("values"))),
     )
 
 

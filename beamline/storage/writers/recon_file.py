@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
 from beamline.core.shipped import version
+from beamline.core.voxel_kind import VoxelKind
 from beamline.storage import hdf5
 from beamline.storage.structure import require_harmless
 from recon.base.volume import Grid, Volume
@@ -27,10 +28,11 @@ FBP, DEVIATION = "fbp", "data_errors"
 SUFFIXES = (".h5", ".hdf5", ".nxs")
 _SLAB = 16  # slices written at a time
 _UNITS_OF_MODEL = {
-    "centres": "length", "widths": "length", "densities": "1/length", "density_unit": "1/length",
+    "centres": "length", "widths": "length", "densities": "voxel", "density_unit": "voxel",
     "pixel_pitch": "length", "source_distances": "length", "view_angles": "rad", "view_roll": "rad", "view_tilt": "rad",
     "view_shifts": "px", "axis": "px",
 }  # fmt: skip
+_LONG_NAMES = {VoxelKind.ATTENUATION: "linear attenuation coefficient"}
 Value = str | int | float | bool | NDArray[Any]
 
 
@@ -75,7 +77,7 @@ class ReconRecord:
         deviation: float32 [z, y, x], the standard deviation of each voxel in the volume's unit; None: not known.
         fbp: float32 [z, y, x], FBP of the same views, where the volume may hide or lack something; None: not kept.
         series: all volumes in time, where `volume` is one of several; None: it is the only one.
-        is_share: the voxels are shares of the volume that a material fills, without a unit, and no attenuation.
+        kind: what the voxels are.
         model: the Gaussians behind the volume and the geometry of their views, see `reconstruct.model`; empty: none.
     """
 
@@ -91,13 +93,13 @@ class ReconRecord:
     model: Mapping[str, Any] = field(default_factory=dict)
     deviation: NDArray[np.float32] | None = None
     fbp: NDArray[np.float32] | None = None
-    is_share: bool = False
+    kind: VoxelKind = VoxelKind.ATTENUATION
     series: VolumesInTime | None = None
 
     @property
     def unit(self) -> str:
         """Of the voxels; empty for shares."""
-        return "" if self.is_share else f"1/{self.length_unit}"
+        return self.kind.unit(self.length_unit)
 
 
 def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = False) -> None:
@@ -167,9 +169,8 @@ def _write_entry(file: hdf5.NewFile, record: ReconRecord, empty: bool) -> None:
         other.attrs["units"] = record.unit
         other.attrs["long_name"] = f"{meaning} ({record.unit})"
     data["data"].attrs["units"] = record.unit
-    data["data"].attrs["long_name"] = (
-        "volume fraction" if record.is_share else f"linear attenuation coefficient ({record.unit})"
-    )
+    what = f"{_LONG_NAMES.get(record.kind, record.kind.value)} ({record.unit})"
+    data["data"].attrs["long_name"] = what.removesuffix(" ()")
     for name, centres in zip(("z", "y", "x"), record.volume.grid.coordinates(), strict=True):
         data[name] = centres
         data[name].attrs["units"] = record.length_unit
@@ -198,7 +199,7 @@ def _write_facts(entry: h5py.Group, record: ReconRecord) -> None:
         for name, value in values.items():
             node[name] = value
     for name, unit in _UNITS_OF_MODEL.items() if record.model else ():
-        process["gaussians"][name].attrs["units"] = unit.replace("length", record.length_unit)
+        process["gaussians"][name].attrs["units"] = {"length": record.length_unit, "voxel": record.unit}.get(unit, unit)
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str) -> h5py.Group:
@@ -279,7 +280,7 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
         model={name: value_of(node) for name, node in process.get("gaussians", {}).items()},
         deviation=data.get(DEVIATION),
         fbp=data.get(FBP),
-        is_share=data["data"].attrs.get("units") == "",
+        kind=VoxelKind.of_unit(str(data["data"].attrs.get("units"))),
         series=series,
     )
 

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from beamline.cli.main import main
+from beamline.core.voxel_kind import VoxelKind
 from beamline.storage.volumes.files import opened_volume, write_volume
 from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
@@ -73,7 +74,7 @@ def test_files_and_regions_are_states(tmp_path: Path) -> None:
 
 def fraction(path: Path, values: np.ndarray, grid: Grid, **other: Any) -> Path:
     facts: dict[str, Any] = {"length_unit": "mm", "raw_file": "scan.h5", "title": "t", "sample": "s", "time": 0.0}
-    facts |= {"is_share": True, "parameters": {"material": path.stem}} | other
+    facts |= {"kind": VoxelKind.SHARE, "parameters": {"material": path.stem}} | other
     write_volume(path, ReconRecord(volume=Volume(values.astype(np.float32), grid), **facts))
     return path
 
@@ -137,7 +138,12 @@ def _other_grid(folder: Path) -> list[Any]:
 
 def _attenuation(folder: Path) -> list[Any]:
     grid = Grid((2, 8, 8), 0.01)
-    return [fraction(folder / f"{n}.h5", np.ones(grid.shape), grid, is_share=n == "a") for n in "ab"]
+    return [
+        fraction(
+            folder / f"{n}.h5", np.ones(grid.shape), grid, kind=VoxelKind.SHARE if n == "a" else VoxelKind.ATTENUATION
+        )
+        for n in "ab"
+    ]
 
 
 def _nothing(folder: Path) -> list[Any]:

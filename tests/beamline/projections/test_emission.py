@@ -14,10 +14,12 @@ from click.testing import CliRunner, Result
 import recon
 from beamline.cli.main import main
 from beamline.core.errors import DataError
+from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.held_out import hold_out
 from beamline.projections.prepare import Spill, prepare_projections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.volumes.files import opened_volume
 from beamline.study.run import Rig
 from beamline.study.studies import StudyRow
 from beamline.tradeoff.data import Data
@@ -77,6 +79,13 @@ def test_recon_reads_it_and_gives_what_the_function_gives(pet: Path, tmp_path: P
                           recon.Grid.matching(geometry), 3, 10)  # fmt: skip
     with h5py.File(out) as file:
         np.testing.assert_array_equal(file["entry/data/data"][()], expected.data)
+        assert file["entry/data/data"].attrs["units"] == "counts/mm"
+        assert file["entry/data/data"].attrs["long_name"] == "activity (counts/mm)"
+    with opened_volume(out) as record, h5py.File(truth) as file:
+        assert record.kind is VoxelKind.ACTIVITY and file["entry/data/data"].attrs["units"] == record.unit
+    assert _beamline("export", str(out), "-o", str(tmp_path / "o.tif")).exit_code == 0
+    with opened_volume(tmp_path / "o.tif") as record:
+        assert record.kind is VoxelKind.ACTIVITY
 
 
 def test_other_methods_take_its_weighted_lines(pet: Path, tmp_path: Path) -> None:

@@ -64,10 +64,10 @@ def test_it_lies_where_the_reconstruction_of_the_file_lies(
     grid = Grid.matching(prepared.geometry)
     assert (grid.shape, grid.centre) == (truth.grid.shape, pytest.approx(truth.grid.centre))
     volume = (fdk if overrides else fbp)(prepared.projections.data, prepared.geometry, grid, "hann")
-    for found, stands in zip(_centroid(volume, grid), _centroid(truth.attenuation, truth.grid), strict=True):
+    for found, stands in zip(_centroid(volume, grid), _centroid(truth.values, truth.grid), strict=True):
         assert found == pytest.approx(stands, abs=0.15 * 0.012)
     assert _centroid(truth.labels * np.float32(4), truth.grid) == pytest.approx(
-        _centroid(truth.attenuation, truth.grid), abs=0.25 * truth.grid.voxel_size
+        _centroid(truth.values, truth.grid), abs=0.25 * truth.grid.voxel_size
     )
 
 

@@ -1,0 +1,30 @@
+"""What the voxels of a volume are, with the unit that this gives them."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class VoxelKind(Enum):
+    """What a voxel says of the sample."""
+
+    ATTENUATION = "attenuation"
+    """Linear attenuation coefficient, of views in transmission."""
+    ACTIVITY = "activity"
+    """Counts per length of a line of response, of a sample that emits."""
+    SHARE = "volume fraction"
+    """Share of the voxel that a material fills, without a unit."""
+
+    def unit(self, length: str) -> str:
+        """Of a voxel, where lengths are in `length`, "mm" or "px"; empty for shares."""
+        return {self.ATTENUATION: f"1/{length}", self.ACTIVITY: f"counts/{length}", self.SHARE: ""}[self]
+
+    def label(self, length: str) -> str:
+        """Of an axis or a colour bar: what is shown, and its unit."""
+        unit = self.unit(length)
+        return f"{self.value} ({unit})" if unit else self.value
+
+    @classmethod
+    def of_unit(cls, unit: str) -> VoxelKind:
+        """The kind whose voxels have this unit; attenuation where a file says another one."""
+        return cls.SHARE if unit == "" else cls.ACTIVITY if unit.startswith("counts/") else cls.ATTENUATION
