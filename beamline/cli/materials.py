@@ -37,7 +37,11 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "-o", "--output", metavar="PATH.h5", type=_FILE, required=True, help="_NAME joins its stem for each material."
 )
-@click.option("--register", is_flag=True, help="Find how the sample stood in each scan, by shift and turn; correct it.")
+@click.option(
+    "--register",
+    is_flag=True,
+    help="Find where the sample stood in each scan, and its magnification; correct them.",
+)
 @selection_options
 @heading(OUTPUT)
 @json_option
@@ -48,7 +52,8 @@ def materials(
 
     Each SCAN states its energy; the folder of a series (`scan.energies`) stands for its scans. Few views an energy are
     enough: all views together determine the materials. Views of different energies should have different angles. The
-    sample must not move between the scans, or --register finds how it did.
+    sample must not move between the scans, nor its magnification change, or --register finds how. Views of another
+    pixel size are interpolated to that of the first scan.
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
@@ -71,6 +76,9 @@ def materials(
         click.echo("\n".join(f"{name:<20}{path}" for name, path in made.outputs.items()))
         for path, move in zip(files, made.moves, strict=False):
             at = ", ".join(f"{1e3 * value:+.2f}" for value in (move.x, move.y, move.z))
-            click.echo(f"{'displaced':<20}{at} µm along x, y, z and {math.degrees(move.turn):+.3f}°: {path}")
+            click.echo(
+                f"{'displaced':<20}{at} µm along x, y, z and {math.degrees(move.turn):+.3f}°; "
+                f"image {1e3 * move.image:+.2f} µm along the rows, magnified {move.magnification:.4f}: {path}"
+            )
     if made.early:
         raise ScanStopped("The fit was stopped; the volumes are those reached so far.")

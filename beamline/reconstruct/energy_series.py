@@ -6,7 +6,7 @@ import csv
 import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from beamline.core.text import size
 from beamline.core.voxel_kind import VoxelKind
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection, cone_of
+from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.progress import sweeps_told
 from beamline.reconstruct.slabs import SHARE
 from beamline.storage.readers.open import SourceOptions
@@ -35,10 +35,11 @@ from recon.base.volume import Grid, Volume
 from recon.energy_fit import EnergyViews
 from recon.registration import register_energies
 from recon.spectral import Materials, fit_materials
-from recon.voxels.displacement import Displacement
+from recon.voxels.displacement import Displacement, measured_unmagnified, unmagnified
 
 _SWEEPS = 20
 _COPIES = 8  # of all line integrals: of the scans, joined, as lines and of a subset; with a weight each
+_PIXELS_ALIKE = 0.1  # pixel sizes of two scans may differ by this share: views are interpolated to those of the first
 _ARCS_ALIKE = 0.01  # arcs of two scans may differ by this share of the larger one
 _SUFFIX = ".h5"
 
@@ -133,11 +134,12 @@ def reconstruct_materials(
 ) -> MaterialRun:
     """Fit the volume fraction of each material to all scans, and write OUTPUT's stem + _NAME.h5 for each of them.
 
-    The rotation axis of the first scan is used for the others, unless it is told. Ctrl-C ends the fit with the volumes
-    so far.
+    The rotation axis of the first scan is used for the others, unless it is told. Views of another pixel size, as a
+    lens gives it at another energy, are interpolated to that of the first scan. Ctrl-C ends the fit with the volumes so
+    far.
 
     Args:
-        register: find where the sample stood in each scan, and correct it.
+        register: find where the sample stood in each scan, and how the image is shifted and magnified; correct it.
 
     Raises:
         ConfigError: scans that do not fit together, energies that are missing or do not tell the materials apart, or
@@ -149,6 +151,7 @@ def reconstruct_materials(
     for path in outputs.values():
         refuse_existing(path)
     parts: list[PreparedProjections] = []
+    middles: list[float] = []
     attenuation, axis_col, progress = [], None, counting("scans")
 
     def warn(said: str) -> None:
@@ -172,9 +175,11 @@ def reconstruct_materials(
             held, alike = sum(part.projections.data.size for part in parts), len(scans) - len(parts)
             check = partial(_refuse_memory, len(spectra.names), held, alike)
             parts.append(prepare_projections(scan, chosen, warn, check=check))
+            middles.append(((scan.shape[0] - 1) / 2 - rows_of(scan, chosen).start + 0.5) / chosen.binning - 0.5)
         axis_col = parts[0].axis_col
         progress(n, len(scans))
-    views = _joined(parts, np.array(attenuation))
+    _refuse_unlike(parts)
+    views = _joined([_of_pixels(part, parts[0], row) for part, row in zip(parts, middles, strict=True)], attenuation)
     moves: tuple[Displacement, ...] = ()
     if register:
         try:
@@ -199,14 +204,34 @@ def reconstruct_materials(
         raise ConfigError(f"{error}. Nothing was written.") from error
     facts: dict[str, Any] = {"ended_early": True} if early else {}
     if moves:
-        facts |= {"displacements": np.array([(move.x, move.y, move.z, move.turn) for move in moves])}
+        facts |= {"displacements": np.array([astuple(move) for move in moves])}
     _write(made, parts[0], scans, outputs, facts, clock.now())
     return MaterialRun(outputs, made.residual, early, moves)
 
 
-def _joined(parts: Sequence[PreparedProjections], attenuation: NDArray[np.float64]) -> EnergyViews:
+def _of_pixels(part: PreparedProjections, first: PreparedProjections, middle: float) -> PreparedProjections:
+    """The views in the pixels of the first scan, magnified about the middle of the detector, whose row is `middle`."""
+    own, pitch = part.geometry, first.geometry.pixel_pitch
+    if (factor := pitch / own.pixel_pitch) == 1:
+        return part
+    centre, weight = (middle, (own.detector_shape[1] - 1) / 2), part.ray_weights()
+    there = np.ones(part.projections.data.shape, np.bool_) if weight is None else weight > 0
+    usual = there.astype(np.float32) if weight is None else weight
+    shares = unmagnified(usual, factor, centre, order=1) * measured_unmagnified(there, factor, centre)
+    data = unmagnified(np.where(there, part.projections.data, np.float32(0)), factor, centre)
+    return replace(
+        part,
+        projections=replace(part.projections, data=data, weights=None),
+        geometry=replace(own, pixel_pitch=pitch, shifts=own.shifts / factor),
+        view_weights=None,
+        measured=None,
+        shares=shares,
+        shares_of=None,
+    )
+
+
+def _joined(parts: Sequence[PreparedProjections], attenuation: Sequence[NDArray[np.float64]]) -> EnergyViews:
     """The views of all scans; those of a scan with another rotation axis than the first are displaced."""
-    _refuse_unlike(parts)
     weights = [part.ray_weights() for part in parts]
     data = np.concatenate([part.projections.data for part in parts])
     weight = None
@@ -224,7 +249,7 @@ def _joined(parts: Sequence[PreparedProjections], attenuation: NDArray[np.float6
         geometry = geometry.followed_by(replace(own, shifts=own.shifts + displaced))
     energy = np.repeat(np.arange(len(parts)), [part.geometry.n_views for part in parts])
     try:
-        return EnergyViews(data, geometry, energy, attenuation, weight)
+        return EnergyViews(data, geometry, energy, np.array(attenuation), weight)
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
 
@@ -233,9 +258,8 @@ def _refuse_unlike(parts: Sequence[PreparedProjections]) -> None:
     """One geometry is of all views: they share detector, beam, and the motion of the stage in an exposure."""
     first = parts[0].geometry
     for n, own in enumerate((part.geometry for part in parts[1:]), 2):
-        if (own.detector_shape, own.pixel_pitch, own.sod, own.sdd) != (
-            first.detector_shape, first.pixel_pitch, first.sod, first.sdd
-        ):  # fmt: skip
+        alike = math.isclose(own.pixel_pitch, first.pixel_pitch, rel_tol=0 if own.is_cone else _PIXELS_ALIKE)
+        if (own.detector_shape, own.sod, own.sdd) != (first.detector_shape, first.sod, first.sdd) or not alike:
             raise ConfigError(
                 f"The scans do not fit together: {first.detector_shape} pixels of {first.pixel_pitch:g} "
                 f"{parts[0].length_unit}, and {own.detector_shape} of {own.pixel_pitch:g}. Nothing was written."

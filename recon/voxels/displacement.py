@@ -3,7 +3,8 @@
 Views of one part of the scan predict those of another if both see the sample from near directions. So a volume of
 the longest part is projected into the views of the others. A shift and a turn of the sample explain the differences.
 Then all views together, corrected, give the next volume (joint reconstruction and reprojection: Gürsoy et al. 2017,
-Sci. Rep. 7, 11818; here with one rigid displacement a part in place of one shift a view).
+Sci. Rep. 7, 11818; here with one rigid displacement a part in place of one shift a view). Where the optics change
+between parts, a shift of the image and its magnification are found, too.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import affine_transform, gaussian_filter1d
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -33,21 +34,26 @@ FARTHEST = 4.0  # most pixels of a step
 RELAXED = 1.5  # factor on a step: the corrected views are in the volume, too, and make steps too small
 _STEPS = 4  # steps of the first registration
 _HELD_OUT = 8  # one of so many views judges
+_MEASURED = 0.99  # of the weight that interpolation gives a pixel: less, and a neighbour was not measured
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """How the sample was moved on its stage: first turned about the axis, then shifted.
+    """How the sample was moved on its stage, first turned about the axis, then shifted; and how the optics changed.
 
     Attributes:
         x, y, z: mm, in the sample's frame.
         turn: radians, in the sense in which angles grow.
+        image: mm by which the image is shifted along the rows, in all views alike.
+        magnification: of the image about the axis and the middle of the rows, over that of the other views.
     """
 
     x: float = 0.0
     y: float = 0.0
     z: float = 0.0
     turn: float = 0.0
+    image: float = 0.0
+    magnification: float = 1.0
 
     def farthest(self, radius: float) -> float:
         """Approximate upper bound of the motion, mm, of a point at this distance from the axis."""
@@ -76,6 +82,8 @@ class Judgement:
 def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -> Geometry:
     """The geometry of views of a sample that was moved in some parts of the scan; parallel beam.
 
+    A magnification is no part of it: `unmagnified` corrects the views.
+
     Args:
         parts: [view] number of the part that each belongs to.
         moves: of each part.
@@ -85,10 +93,30 @@ def displaced(geometry: Geometry, parts: Parts, moves: Sequence[Displacement]) -
     """
     if geometry.is_cone:
         raise ValueError("views of a cone beam are not corrected by shifts: they differ by more than these")
-    x, y, z, turn = np.array([(m.x, m.y, m.z, m.turn) for m in moves])[parts].T
+    x, y, z, turn, image = np.array([(m.x, m.y, m.z, m.turn, m.image) for m in moves])[parts].T
     c, s = np.cos(geometry.angles), np.sin(geometry.angles)
-    across, down = (x * c + y * s) / geometry.pixel_pitch, z / geometry.pixel_pitch
+    across, down = (x * c + y * s + image) / geometry.pixel_pitch, z / geometry.pixel_pitch
     return replace(geometry, angles=geometry.angles + turn, shifts=geometry.shifts + np.stack((across, down), axis=1))
+
+
+def unmagnified(images: F32, factor: float, centre: tuple[float, float], order: int = 3) -> F32:
+    """Images [view, row, col] that are magnified by `factor`, as they are without; 0 beyond what they show.
+
+    Args:
+        centre: row and column that keep their place.
+        order: of the interpolation, 3 cubic, 1 linear.
+    """
+    if factor == 1:
+        return images
+    scale, made = np.full(2, factor), np.empty_like(images)
+    for view, image in enumerate(images):
+        affine_transform(image, scale, (1 - scale) * centre, output=made[view], order=order)
+    return made
+
+
+def measured_unmagnified(there: NDArray[np.bool_], factor: float, centre: tuple[float, float]) -> NDArray[np.bool_]:
+    """Pixels [view, row, col] of `unmagnified` that pixels which were measured alone determine."""
+    return unmagnified(there.astype(np.float32), factor, centre, order=1) > _MEASURED
 
 
 def displacements(
@@ -98,6 +126,7 @@ def displacements(
     known: NDArray[np.bool_],
     start: Sequence[Displacement] | None = None,
     rounds: int = 3,
+    optics: bool = False,
 ) -> list[Displacement]:
     """The displacement of each part against the longest one.
 
@@ -111,21 +140,22 @@ def displacements(
         known: [row, col] pixels that were measured.
         start: displacements from coarser pixels; None: begin with the longest part alone.
         rounds: number of volumes of all views.
+        optics: find shift and magnification of the image, too; else they stay those of `start`.
     """
-    problem = _Problem(projections, geometry, parts, known)
+    problem = _Problem(projections, geometry, parts, known, optics)
     moves = list(start) if start is not None else [Displacement()] * problem.count
     if not problem.others:
         return moves
     if start is None:
         own = np.flatnonzero(parts == problem.longest)
-        volume = problem.volume(geometry, own)
+        volume = problem.volume(moves, own)
         for part in problem.others:
             views = np.flatnonzero(parts == part)
             weight = np.exp(-0.5 * (_apart(geometry, views, own) / NEAR) ** 2)
             for _ in range(_STEPS):
                 moves[part] = problem.registered(volume, moves[part], views, weight)
     for _ in range(rounds):
-        volume = problem.volume(displaced(geometry, parts, moves), np.arange(geometry.n_views))
+        volume = problem.volume(moves, np.arange(geometry.n_views))
         for part in problem.others:
             views = np.flatnonzero(parts == part)
             moves[part] = problem.registered(volume, moves[part], views, np.ones(views.size), RELAXED)
@@ -139,15 +169,15 @@ def judge(
 
     If the displacement is right, the other parts improve the prediction of the longest part's views.
     """
-    problem, corrected = _Problem(projections, geometry, parts, known), displaced(geometry, parts, moves)
+    problem = _Problem(projections, geometry, parts, known)
     views = np.arange(geometry.n_views)
     held = views[_HELD_OUT // 2 :: _HELD_OUT]
     used = np.setdiff1d(views, held)
-    whole = problem.volume(corrected, used)
-    alone = problem.volume(corrected, used[parts[used] == problem.longest])
+    whole = problem.volume(moves, used)
+    alone = problem.volume(moves, used[parts[used] == problem.longest])
 
     def deviations(volume: Volume) -> NDArray[np.float64]:
-        left, weight = problem.residual(volume, corrected, held)
+        left, weight = problem.residual(volume, moves, held)
         return np.sqrt((left**2).sum(axis=(1, 2)) / np.maximum(weight.sum(axis=(1, 2)), 1))
 
     def typical(each: NDArray[np.float64], part: int) -> float:
@@ -172,6 +202,7 @@ class _Problem:
     geometry: Geometry
     parts: Parts
     known: NDArray[np.bool_]
+    optics: bool = False
 
     @property
     def count(self) -> int:
@@ -189,22 +220,29 @@ class _Problem:
     def grid(self) -> Grid:
         return Grid.matching(self.geometry)
 
-    def weights(self, geometry: Geometry) -> F32:
-        seen = seen_rays(geometry, self.grid)
-        return (seen & self.known).astype(np.float32)
+    def corrected(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, Geometry, F32]:
+        """Some views as they are without these displacements, their geometry, and the weights of their rays."""
+        geometry, parts = self.geometry.select(views), self.parts[views]
+        data = self.projections[views]
+        known = np.repeat(self.known[None], views.size, 0)
+        centre = geometry.axis_row, geometry.axis_col
+        for part in np.unique(parts):
+            own, factor = parts == part, moves[part].magnification
+            data[own] = unmagnified(data[own], factor, centre)
+            known[own] = measured_unmagnified(self.known[None], factor, centre)
+        there = displaced(geometry, parts, moves)
+        return data, there, (seen_rays(there, self.grid) & known).astype(np.float32)
 
-    def volume(self, geometry: Geometry, views: NDArray[np.integer]) -> Volume:
-        geometry, projections = geometry.select(views), self.projections[views]
+    def volume(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> Volume:
+        data, geometry, weight = self.corrected(moves, views)
         # The weight follows the noise: views held out would judge a sample that still stands in two places.
-        projector, weight = Projector(geometry, self.grid), self.weights(geometry)
-        return solve(OsSirtTv(SWEEPS, momentum=True), projector, projections, weight=weight, on_trial=lambda: True)
+        method, projector = OsSirtTv(SWEEPS, momentum=True), Projector(geometry, self.grid)
+        return solve(method, projector, data, weight=weight, on_trial=lambda: True)
 
-    def residual(self, volume: Volume, geometry: Geometry, views: NDArray[np.integer]) -> tuple[F32, F32]:
+    def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:
         """Views less those of the volume, without smooth differences, and the weights of their rays."""
-        geometry = geometry.select(views)
-        weight = self.weights(geometry)
-        left = self.projections[views] - Projector(geometry, self.grid).forward(volume.data)
-        return _without_smooth(left, weight), weight
+        data, geometry, weight = self.corrected(moves, views)
+        return _without_smooth(data - Projector(geometry, self.grid).forward(volume.data), weight), weight
 
     def registered(
         self, volume: Volume, move: Displacement, views: NDArray[np.integer], weight: NDArray[np.float64],
@@ -213,26 +251,41 @@ class _Problem:
         """The displacement of these views after a step of least squares (Gauss-Newton) towards the volume's views."""
         geometry = self.geometry.select(views)
         pitch, all_one = geometry.pixel_pitch, np.zeros(views.size, np.int64)
-        now = np.array([move.x, move.y, move.z, move.turn])
-        trial = TRIAL * pitch * np.array([1, 1, 1, 2 / (geometry.detector_shape[1] * pitch)])
+        half = geometry.detector_shape[1] / 2  # columns
+        trial = TRIAL * np.array([pitch, pitch, pitch, 1 / half, pitch, 1 / half])
+        now = np.array([move.x, move.y, move.z, move.turn, move.image, move.magnification])
 
-        def shown(at: NDArray[np.float64]) -> tuple[F32, F32]:
+        def shown(at: NDArray[np.float64]) -> F32:
             moved = displaced(geometry, all_one, [Displacement(*at.tolist())])
-            return Projector(moved, self.grid).forward(volume.data), self.weights(moved)
+            return Projector(moved, self.grid).forward(volume.data)
 
-        image, rays = shown(now)
-        left = _without_smooth(self.projections[views] - image, rays)
-        change = []
-        for i in range(now.size):
+        data, _, rays = _Problem(self.projections[views], geometry, all_one, self.known).corrected(
+            [move], np.arange(views.size)
+        )
+        image = shown(now)
+        left = _without_smooth(data - image, rays)
+        change: list[NDArray[np.floating]] = []
+        for i in range(5 if self.optics else 4):
             step = np.where(np.arange(now.size) == i, trial, 0)
-            change.append(_without_smooth(shown(now + step)[0] - shown(now - step)[0], rays) / 2)
-        across = np.stack(change).reshape(now.size, views.size, -1)
+            change.append(_without_smooth(shown(now + step) - shown(now - step), rays) / 2)
+        if self.optics:
+            change.append(_without_smooth(trial[5] * _outwards(image, geometry), rays))
+        across = np.stack(change).reshape(len(change), views.size, -1)
         normal = np.einsum("avp,bvp,v->ab", across, across, weight, optimize=True)
         slope = np.einsum("avp,vp,v->a", across, left.reshape(views.size, -1), weight, optimize=True)
-        best = np.linalg.lstsq(normal, slope, rcond=1e-6)[0] * relaxation
+        best = np.zeros(now.size)
+        best[: len(change)] = np.linalg.lstsq(normal, slope, rcond=1e-6)[0] * relaxation
         longest = float(np.abs(best).max()) * TRIAL
         after = now + best * trial * min(1.0, FARTHEST / max(longest, 1e-12))
         return Displacement(*after.tolist())
+
+
+def _outwards(image: F32, geometry: Geometry) -> F32:
+    """Derivative of views [view, row, col] by a magnification about the axis and the middle of the rows."""
+    rows, cols = geometry.detector_shape
+    across, down = np.arange(cols) - geometry.axis_col, np.arange(rows)[:, None] - geometry.axis_row
+    along_rows = -across * np.gradient(image, axis=2)
+    return np.asarray(along_rows - down * np.gradient(image, axis=1) if rows > 1 else along_rows, np.float32)
 
 
 def _apart(geometry: Geometry, views: NDArray[np.integer], others: NDArray[np.integer]) -> NDArray[np.float64]:

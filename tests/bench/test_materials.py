@@ -95,12 +95,17 @@ def test_charge(energies: tuple[float, ...], each: int, photons: float) -> None:
     assert joint < apart[best]
 
 
-def test_shifts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six energies of 15 views; the sample stood up to 3 pixels elsewhere at each but the first."""
+@pytest.mark.parametrize("optics", [0.0, 1.0])
+def test_shifts(monkeypatch: pytest.MonkeyPatch, optics: float) -> None:
+    """Six energies of 15 views; the sample stood up to 3 pixels elsewhere at each but the first.
+
+    With optics the image is shifted by up to 2 pixels, too, and magnified by up to 2 %.
+    """
     monkeypatch.setattr("tests.bench.test_materials.ROWS", 16)
     fine, each, photons, rng = grains(), 15, 5000, np.random.default_rng(3)
     half = np.concatenate([rng.integers(-6, 7, (len(SIX), 2)), rng.integers(-3, 4, (len(SIX), 1))], 1)  # half pixels
-    half[0] = 0
+    images, magnified = optics * rng.uniform(-2, 2, len(SIX)), 1 + optics * rng.uniform(-0.02, 0.02, len(SIX))
+    half[0], images[0], magnified[0] = 0, 0, 1
     n = len(SIX) * each
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(SIX)
     geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH), np.zeros((n, ROWS, SIDE))
@@ -109,15 +114,19 @@ def test_shifts(monkeypatch: pytest.MonkeyPatch) -> None:
     materials = replace(oxide, state_of_charge=0.0), replace(oxide, state_of_charge=1.0), liquid
     sections = np.stack([material.attenuation(SIX) for material in materials], 1)
     for e, (x, y, z) in enumerate(half):
-        own = np.flatnonzero(energy == e)
+        own, factor = np.flatnonzero(energy == e), magnified[e]
+        axis_col = geometry.axis_col + images[e] * factor
+        seen = replace(geometry.select(own), pixel_pitch=PITCH / factor, axis_col=axis_col)
         for volume, mu in zip(fine, sections[e], strict=True):
-            depth[own] += mu * seen_by_simulator(np.roll(volume, (z, y, x), (0, 1, 2)), geometry.select(own), PITCH / 2)
+            depth[own] += mu * seen_by_simulator(np.roll(volume, (z, y, x), (0, 1, 2)), seen, PITCH / 2)
     counts = np.random.default_rng(2).poisson(photons * np.exp(-depth)).clip(1)
     views = recon.EnergyViews((-np.log(counts / photons)).astype(np.float32), geometry, energy, sections)
     began = time.process_time()
     corrected, moves = recon.register_energies(views)
     took = time.process_time() - began
     apart = np.array([(move.x, move.y, move.z) for move in moves]) / PITCH - half / 2
+    by_optics = [np.array([move.image for move in moves]) / PITCH - images]
+    by_optics.append(np.array([move.magnification for move in moves]) - magnified)
     truth = fine.reshape(3, ROWS, 2, SIDE, 2, SIDE, 2).mean((2, 4, 6))
     oxides = truth[:2].sum(0)
     matter, charge = oxides > 0.9, truth[1] / np.maximum(oxides, 0.1)
@@ -130,7 +139,8 @@ def test_shifts(monkeypatch: pytest.MonkeyPatch) -> None:
     true = displaced(geometry, energy, [Displacement(*(at / 2 * PITCH)) for at in half])
     errors = [error(each) for each in (views, corrected, replace(views, geometry=true))]
     print(
-        f"\nlargest errors of x, y, z {np.abs(apart).max(0).round(3)} px ({took:.1f} CPU s); charge's error "
+        f"\nlargest errors of x, y, z {np.abs(apart).max(0).round(3)} px, of the image "
+        f"{np.abs(by_optics[0]).max():.3f} px and {100 * np.abs(by_optics[1]).max():.2f} % ({took:.1f} CPU s); charge's error "
         f"{errors[0]:.3f} as it is, {errors[1]:.3f} registered, {errors[2]:.3f} with the true shifts"
     )
     assert errors[1] < 0.5 * errors[0]

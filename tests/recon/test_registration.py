@@ -18,6 +18,7 @@ from tests.bench.quality_cases import seen_by_simulator
 SIDE, ROWS, PITCH, EACH, PHOTONS = 48, 16, 1.1e-3, 10, 5000
 # NMC811, fresh and charged, 1/mm at 8.320 ... 8.380 keV, and a liquid that is the same at all of them.
 SECTIONS = np.array([[28.2, 28.1, 1.2], [31.7, 30.4, 1.2], [117.4, 96.7, 1.2], [114.3, 128.8, 1.2], [91.4, 91.4, 1.2]])
+ALIKE = np.zeros(len(SECTIONS))
 MOVES = np.array([[0, 0, 0], [3, -2, 0], [-4, 1, 2], [2, 4, -2], [-1, -3, 1]])  # x, y, z in half pixels
 
 
@@ -34,15 +35,17 @@ def grains() -> F32:
     return np.stack([grain * (1 - charge), grain * charge, liquid]).astype(np.float32)
 
 
-def seen(fine: F32, moves: np.ndarray) -> EnergyViews:
+def seen(fine: F32, moves: np.ndarray, images: np.ndarray = ALIKE, magnified: np.ndarray = ALIKE) -> EnergyViews:
     n = len(SECTIONS) * EACH
     angles, energy = np.arange(n) * np.pi / n, np.arange(n) % len(SECTIONS)
     geometry, depth = Geometry.parallel(angles, (ROWS, SIDE), pixel_pitch=PITCH), np.zeros((n, ROWS, SIDE))
     for e, (x, y, z) in enumerate(moves):
-        own = np.flatnonzero(energy == e)
+        own, factor = np.flatnonzero(energy == e), 1 + magnified[e]
+        axis_col = geometry.axis_col + images[e] * factor
+        views = replace(geometry.select(own), pixel_pitch=PITCH / factor, axis_col=axis_col)
         for volume, mu in zip(fine, SECTIONS[e], strict=True):
             stood = np.ascontiguousarray(np.roll(volume, (z, y, x), (0, 1, 2)))
-            depth[own] += mu * seen_by_simulator(stood, geometry.select(own), PITCH / 2)
+            depth[own] += mu * seen_by_simulator(stood, views, PITCH / 2)
     counts = np.random.default_rng(2).poisson(PHOTONS * np.exp(-depth)).clip(1)
     return EnergyViews((-np.log(counts / PHOTONS)).astype(np.float32), geometry, energy, SECTIONS)
 
@@ -67,6 +70,20 @@ def test_shifts_between_energies_are_found_and_the_charge_with_them() -> None:
     true = replace(views, geometry=seen_where(views, MOVES / 2))
     errors = [charge_error(each, fine) for each in (views, corrected, true)]
     assert errors[1] < 0.5 * errors[0] and errors[1] < 1.3 * errors[2]
+
+
+def test_the_image_of_other_optics_is_that_of_the_reference() -> None:
+    """The sample stands elsewhere, too; the image is shifted by up to 2 pixels and magnified by up to 3 %."""
+    fine, images, magnified = grains(), np.array([0, 1.5, -1, 0.5, 2]), np.array([0, 0.02, -0.015, 0.01, -0.03])
+    views = seen(fine, MOVES, images, magnified)
+    corrected, moves = register_energies(views)
+    assert [move.image / PITCH for move in moves] == pytest.approx(images, abs=0.1)
+    assert [move.magnification - 1 for move in moves] == pytest.approx(magnified, abs=0.005)
+    assert np.array([(move.x, move.y) for move in moves]) / PITCH == pytest.approx(MOVES[:, :2] / 2, abs=0.1)
+    assert corrected.weight is not None and (corrected.weight[corrected.energy == 0] == 1).all()
+    lost = corrected.weight[corrected.energy == 4]  # what is magnified by 0.97 ... shows more than the reference
+    assert (lost[:, 2:-2, 3:-3] == 1).all() and (corrected.weight[corrected.energy == 1] == 1).mean() > 0.8
+    assert charge_error(corrected, fine) < 0.5 * charge_error(views, fine)
 
 
 def seen_where(views: EnergyViews, moves: np.ndarray) -> Geometry:

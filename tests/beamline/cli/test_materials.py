@@ -137,6 +137,30 @@ def test_a_line_of_blanks_in_the_table_is_no_line(tmp_path: Path) -> None:
     assert list(read_spectra(tmp_path / "table.csv").at(8.35)) == pytest.approx([1.5])
 
 
+@pytest.mark.parametrize(("larger", "code"), [(1.04, 0), (1.2, 2)])
+def test_a_scan_of_larger_pixels_is_interpolated_to_those_of_the_first(
+    scans: list[Path], tmp_path: Path, larger: float, code: int
+) -> None:
+    """Edges of the grains lie up to 0.8 pixels elsewhere in its views; the volumes are those of equal pixels."""
+    other = tmp_path / "larger.h5"
+    words = "--set", f"beam.energy_kev={ENERGIES[2]}", "--seed", "2", "-o", other
+    pixels = f"detector.pixel_size_um={2.2 * larger}"
+    assert run("simulate", scans[0].with_name("scene.yaml"), *words, "--set", pixels).exit_code == 0
+    words = "--spectra", spectra(tmp_path), "--axis", "31.5"
+    done = run("materials", *scans[:2], other, scans[3], *words, "-o", tmp_path / "out.h5")
+    assert done.exit_code == code, done.output
+    if code:
+        assert "The scans do not fit together" in done.output and not list(tmp_path.glob("out*"))
+        return
+    assert run("materials", *scans, *words, "-o", tmp_path / "equal.h5").exit_code == 0
+    volumes = []
+    for name in ("out", "equal"):
+        with opened_volume(tmp_path / f"{name}_charged.h5") as record:
+            volumes.append(np.asarray(record.volume.data[3]))
+    assert np.abs(volumes[0] - volumes[1]).max() < 0.25
+    assert np.sqrt(np.mean((volumes[0] - volumes[1]) ** 2)) < 0.02
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with a name are of POSIX")
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.csv")

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.voxels.displacement import Displacement, displaced, displacements, judge
+from recon.voxels.displacement import (
+    Displacement,
+    displaced,
+    displacements,
+    judge,
+    measured_unmagnified,
+    unmagnified,
+)
 from tests.recon.voxels.balls import ball_views
 
 SHAPE, PITCH = (8, 48), 0.5
@@ -57,6 +64,23 @@ def test_displaced_views_are_those_of_a_geometry_with_shifts() -> None:
         assert across / PITCH + origin[0] - GEOMETRY.axis_col == pytest.approx(col[view] / PITCH)
         assert down / PITCH + origin[1] - GEOMETRY.axis_row == pytest.approx((point[2] + later[view] * MOVED.z) / PITCH)
     assert Displacement(3.0, 4.0, 0.0, 0.1).farthest(10.0) == pytest.approx(6.0)
+
+
+def test_an_unmagnified_image_is_that_of_the_reference() -> None:
+    """A Gaussian spot whose place and width grow with the magnification about a pixel that keeps its place."""
+    row, col = np.mgrid[:40, :60].astype(float)
+
+    def spot(factor: float) -> np.ndarray:
+        at = (18 + factor * 5, 25 + factor * 9)
+        return np.exp(-((row - at[0]) ** 2 + (col - at[1]) ** 2) / 2 / (3 * factor) ** 2).astype(np.float32)[None]
+
+    for factor in (0.95, 1.0, 1.04):
+        np.testing.assert_allclose(unmagnified(spot(factor), factor, (18, 25)), spot(1.0), atol=2e-3)
+    there = np.ones((1, 40, 60), np.bool_)
+    there[0, 7, 11] = False
+    smaller = measured_unmagnified(there, 1.1, (18, 25))[0]
+    assert not smaller[8, 12] and smaller[12:30, 18:50].all() and not smaller[0].any() and not smaller[:, -2:].any()
+    assert (measured_unmagnified(there, 1.0, (18, 25)) == there).all()
 
 
 def test_a_cone_is_refused() -> None:
