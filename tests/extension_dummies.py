@@ -65,7 +65,7 @@ from click.testing import CliRunner
 from beamline.cli.method_options import takers
 from beamline.cli.recon import recon as command
 from beamline.cli.tradeoff import tradeoff
-from beamline.reconstruct.recon_report import label_of
+from beamline.reconstruct.outcome import label_of
 from beamline.tradeoff.figures import pareto_plot
 from beamline.tradeoff.trials import plan
 from recon import methods

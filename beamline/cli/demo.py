@@ -132,9 +132,9 @@ def run_demo(config: Config, runs: Path | None, sinks: Sequence[Sink], stop: Sto
     from beamline.projections.prepare import prepare_projections
     from beamline.projections.selection import Selection
     from beamline.reconstruct.model import read_model
+    from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
     from beamline.reconstruct.output_paths import OutputPaths
     from beamline.reconstruct.parameters import axis_of
-    from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
     from beamline.reconstruct.result import write_result
     from beamline.report.record import history_from
     from beamline.storage.readers.open import open_scan

@@ -27,8 +27,8 @@ from beamline.reconstruct.error_bars import deviation_by_slabs, deviation_of, ma
 from beamline.reconstruct.in_time import Deadline, fit_within, warnings_told
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.region import RegionOfRows, locate
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping

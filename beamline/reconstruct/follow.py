@@ -13,8 +13,8 @@ from beamline.core.text import count
 from beamline.reconstruct.growing import ScanFollower
 from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.outcome import ReportContext, facts_of
 from beamline.reconstruct.progress import compilation_events
-from beamline.reconstruct.recon_report import ReportContext, facts_of
 from beamline.reconstruct.result import write_result
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.writer_lock import held

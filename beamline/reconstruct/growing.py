@@ -25,8 +25,8 @@ from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDo
 from beamline.reconstruct.axis_search import AxisSearch
 from beamline.reconstruct.enough import EnoughViews, NotPlannedError, planned_views
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.outcome import ReconOutcome
 from beamline.reconstruct.progress import corrections_done, progress_events
-from beamline.reconstruct.recon_report import ReconOutcome
 from beamline.reconstruct.snapshots import Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from beamline.core.events import Sink, StateEntered, Warned
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import measure, regions, residual_share
+from beamline.reconstruct.outcome import ReconOutcome, ReportContext
 from beamline.reconstruct.output_paths import OutputPaths
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext
 from beamline.reconstruct.remarks import (
     hiding_warning,
     lost_mass_warning,

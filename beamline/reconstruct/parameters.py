@@ -10,7 +10,7 @@ import numpy as np
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.steps.registry import recorded
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext
+from beamline.reconstruct.outcome import ReconOutcome, ReportContext
 from beamline.storage.writers.recon_file import Value
 from recon.prep.align import AxisEstimate
 

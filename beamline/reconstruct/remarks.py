@@ -7,7 +7,7 @@ from collections.abc import Callable
 from beamline.core.text import count
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.recon_report import ReconOutcome, label_of
+from beamline.reconstruct.outcome import ReconOutcome, label_of
 from recon.assess.lost_mass import Comparison
 from recon.base.geometry import Geometry
 from recon.methods import by_name

@@ -11,9 +11,10 @@ from beamline.core.files import remove
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.judge import judge
 from beamline.reconstruct.model import arrays_of_model
+from beamline.reconstruct.outcome import ReconOutcome, ReportContext, label_of
 from beamline.reconstruct.output_paths import OutputPaths
 from beamline.reconstruct.parameters import parameters_of
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, compose, label_of
+from beamline.reconstruct.recon_report import compose
 from beamline.report.html import write_report
 from beamline.report.record import history_arrays
 from beamline.storage.volumes.files import write_volume

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from beamline.reconstruct.recon_report import ReportContext
+from beamline.reconstruct.outcome import ReportContext
 from beamline.report.html import Picture, Report
 from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.writers.recon_file import ReconRecord

@@ -19,9 +19,9 @@ from beamline.projections.poses import stated_geometry
 from beamline.projections.prepare import prepare_projections
 from beamline.reconstruct.finished import require_finished
 from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.parameters import parameters_of
 from beamline.reconstruct.progress import sweeps_told
-from beamline.reconstruct.recon_report import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.series_report import series_page
 from beamline.reconstruct.slabs import memory_of
 from beamline.report.html import write_report

@@ -14,7 +14,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.scan_statistics import Light, LightAsked, light_in
 from beamline.projections.selection import Selection
 from beamline.reconstruct.measure import fit_truth, read_truth
-from beamline.reconstruct.recon_report import facts_of
+from beamline.reconstruct.outcome import facts_of
 from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32
 from recon.base.volume import Grid

@@ -139,7 +139,6 @@ def test_shifts(monkeypatch: pytest.MonkeyPatch, optics: float) -> None:
     true = displaced(geometry, energy, [Displacement(*(at / 2 * PITCH)) for at in half])
     errors = [error(each) for each in (views, corrected, replace(views, geometry=true))]
     image, larger = np.abs(by_optics[0]).max(), 100 * np.abs(by_optics[1]).max()
-    image, larger = np.abs(by_optics[0]).max(), 100 * np.abs(by_optics[1]).max()
     print(
         f"\nlargest errors of x, y, z {np.abs(apart).max(0).round(3)} px, of the image {image:.3f} px and "
         f"{larger:.2f} %, {took:.1f} CPU s; charge's error {errors[0]:.3f} as it is, {errors[1]:.3f} registered, "

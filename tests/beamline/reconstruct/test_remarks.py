@@ -9,7 +9,7 @@ import pytest
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.recon_report import ReconOutcome
+from beamline.reconstruct.outcome import ReconOutcome
 from beamline.reconstruct.remarks import needles_warning, odd_views_warning, stray_mass_warning
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from beamline.reconstruct.recon_report import ReconOutcome
+from beamline.reconstruct.outcome import ReconOutcome
 from beamline.report.record import history_arrays, history_from, residual_curve
 from beamline.report.time_curves import quality_against_time
 from recon.assess.time_model import next_decibel, next_decibel_of_fit
