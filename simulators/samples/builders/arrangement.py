@@ -4,6 +4,9 @@ A force-biased packing (Mościński, Bargieł, Rycerz and Jacobs, Mol. Simul. 3,
 from the beginning. Each overlapping pair is pushed apart along the direction in which it overlaps least. It
 reaches beyond 0.5 of the volume, where random sequential addition stalls at 0.38. Bodies keep their orientation. Two
 bodies count as apart only where a separating plane is known, so that no overlap is missed.
+
+Each sweep enlarges a small difference between two starts, and numerical libraries round differently on other
+processors. So bodies and starts are rounded first, and a seed gives the same places everywhere.
 """
 
 from __future__ import annotations
@@ -29,6 +32,8 @@ SKIN = 0.3
 """Margin within which a body's neighbours are listed, over the median reach, so that the list serves several sweeps."""
 TRIALS, DECAY = 12, 0.8
 """Directions tried for a separating plane until two bodies count as overlapping, and the ratio of successive turns."""
+FINEST = 2.0**-26
+"""Bodies and starts are rounded to this part of the median reach, far above a double's rounding."""
 
 
 class Bodies(NamedTuple):
@@ -101,6 +106,12 @@ def arrange(
     turn, out = rng.uniform(0, 2 * math.pi, n), room * np.sqrt(rng.uniform(0, 1, n))
     centres = np.stack([out * np.cos(turn), out * np.sin(turn), tall * rng.uniform(-1, 1, n)], axis=1)
     middling = float(np.median(bodies.reach))
+    step = FINEST * 2.0 ** math.floor(math.log2(middling))
+    reach, across, up, spread, corners, room, tall, centres = (
+        np.round(lengths / step) * step
+        for lengths in (bodies.reach, bodies.across, bodies.up, bodies.spread, bodies.corners, room, tall, centres)
+    )
+    bodies = Bodies(reach, across, up, spread, bodies.first, corners)
     gap = max(gap, 1e-6 * middling)
     left = _part(centres, bodies, room, tall, gap, gap + SPARE * middling, SKIN * middling, sweeps)
     if left:

@@ -134,6 +134,21 @@ def test_the_same_seed_gives_the_same_places() -> None:
     assert (first != other).any()
 
 
+def test_places_do_not_depend_on_how_a_processor_rounds(rng: np.random.Generator) -> None:
+    """Each sweep enlarges a difference of the last digit: without rounding, the same seed gave another sample."""
+    bodies = bodies_of(_loose(np.random.default_rng(3), 30))
+    elsewhere = bodies._replace(
+        **{
+            name: lengths * (1 + 2e-16 * rng.choice((-1, 1), lengths.shape))
+            for name in ("reach", "across", "up", "spread", "corners")
+            for lengths in (getattr(bodies, name),)
+        }
+    )
+    assert (elsewhere.corners != bodies.corners).any()
+    here, there = (arrange(np.random.default_rng(1), some, 0.08, 0.08) for some in (bodies, elsewhere))
+    np.testing.assert_array_equal(here, there)
+
+
 def test_what_cannot_be_is_refused(rng: np.random.Generator) -> None:
     balls = [Ellipsoid((0.01,) * 3, 1.0)] * 50
     with pytest.raises(ValueError, match="of 20 um does not fit into"):
