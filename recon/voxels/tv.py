@@ -14,7 +14,7 @@ def difference_weights(grid: Grid) -> tuple[float, float, float]:
     return 1.0, 1.0, grid.voxel_size / grid.spacing[0]
 
 
-_TURNS: tuple[tuple[int, ...], ...] = (), (1, 2), (0, 2), (0, 1)  # axes that are reversed: four mirror images
+_BACK = (0, 0), (1, 0), (0, 1), (1, 1)  # the four mirror images, but for reflections in a point
 
 
 class TotalVariationProx:
@@ -24,43 +24,31 @@ class TotalVariationProx:
     Teboulle 2009, IEEE Trans. Image Process. 18, 2419). The dual field stays from one call to the next: in an outer
     iteration x changes little, so later calls continue the steps. Memory: three volumes.
 
-    Differences of a voxel are those to its three next ones; `turn` takes the next ones on other sides.
+    Differences of a voxel are those to its three next ones; `turn` takes the ones before along y, x or both.
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
-        # Of one slice the kernels see [y, z, x]: the last axis is the vector's.
-        self._order = (0, 2, 1) if shape[2] == 1 else (0, 1, 2)
-        self._shape = (shape[self._order[0]], shape[self._order[1]], shape[self._order[2]])
-        self._dual = np.zeros((3, *self._shape), np.float32)
-        self._scratch = tv_cpu.dual_scratch(self._shape)
-        self._weights = (weights[self._order[0]], weights[self._order[1]], weights[self._order[2]])
-        self._nonnegative, self._steps = nonnegative, steps
-        self._turn = 0
+        # Of one slice the kernels see [y, z, x]: the last axis is the vector's. They turn along y alone.
+        order = (0, 2, 1) if shape[2] == 1 else (0, 1, 2)
+        self._shape = (shape[order[0]], shape[order[1]], shape[order[2]])
+        self._weights = (weights[order[0]], weights[order[1]], weights[order[2]])
+        self._dual, self._scratch = tv_cpu.dual_field(self._shape), tv_cpu.dual_scratch(self._shape)
+        self._nonnegative, self._steps, self._turn = nonnegative, steps, 0
 
     def __call__(self, x: F32, threshold: float) -> None:
         """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
         x = x.reshape(self._shape)
         if threshold > 0:
-            reversed_axes = self._reversed(_TURNS[self._turn])
-            tv_cpu.mirror(x, reversed_axes)
+            given, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
             for _ in range(self._steps):
-                tv_cpu.dual_step(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch)
-            tv_cpu.primal(x, self._dual, threshold, self._weights, self._nonnegative, self._scratch, x)
-            tv_cpu.mirror(x, reversed_axes)
+                tv_cpu.dual_step(x, self._dual, *given, back)
+            tv_cpu.primal(x, self._dual, *given, x)
         elif self._nonnegative:
             np.maximum(x, 0, out=x)
 
     def turn(self) -> None:
-        """Take the next of four mirror images from here on, so that no side is preferred.
+        """Take the differences of the next of four mirror images from here on, so that no side is preferred.
 
         The differences, which the dual field holds, stay: only which three of them belong to a voxel changes.
         """
-        before, self._turn = self._turn, (self._turn + 1) % len(_TURNS)
-        axes = self._reversed(tuple(set(_TURNS[before]) ^ set(_TURNS[self._turn])))
-        for axis, part in enumerate(self._dual):
-            if self._shape[axis] > 1:  # else there are no differences
-                tv_cpu.mirror(part, axes, axis)
-
-    def _reversed(self, axes: tuple[int, ...]) -> tuple[int, ...]:
-        """These axes of (y, x, z), of more than one voxel, as the kernels number them."""
-        return tuple(at for at in map(self._order.index, axes) if self._shape[at] > 1)
+        self._turn = (self._turn + 1) % len(_BACK)

@@ -14,7 +14,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.volume import Grid
-from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
+from recon.kernels.cpu.vectors import extrapolate, replace_by_residual, turn_of_steps
 from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
@@ -94,16 +94,11 @@ class Momentum:
 
     def __call__(self, x: F32) -> None:
         """Move x from the end of a step to the start of the next step, in place."""
-        combine(1.0, self._from, -1.0, x, self._from)  # back along the step
-        combine(1.0, x, -1.0, self._last, self._last)  # from the last point reached to this one
-        if self._decide("restart", lambda: dot(self._from, self._last) > 0):
+        if self._decide("restart", lambda: turn_of_steps(self._last, self._from, x) > 0):
             self._t = 1.0
         after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
-        change, self._last = self._last, self._from
-        self._last[...] = x
-        combine(1.0, x, (self._t - 1) / after, change, x)
-        change[...] = x
-        self._from, self._t = change, after
+        extrapolate(x, (self._t - 1) / after, self._last, self._from)
+        self._t = after
 
 
 def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:

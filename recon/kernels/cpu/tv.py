@@ -2,7 +2,7 @@
 
     TV(x) = Σ |D x|,   (D x)_a = w_a (x[i + 1] - x[i]) along axis a, zero at the end;   w: for voxels that are not cubes
 
-Volumes are [a, b, c], dual fields [3, a, b, c]. Each thread takes a run of planes and keeps two of them in its cache,
+Volumes are [a, b, c], dual fields three of them. Each thread takes a run of planes and keeps two of them in its cache,
 so a step reads and writes every array once.
 """
 
@@ -19,7 +19,9 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 
 _f = np.float32
 _NO_FLOOR = -3.0e38
+_APART = 17 * 16  # values: 17 lines of the cache
 Weights = tuple[float, float, float]
+DualField = tuple[F32, F32, F32]
 
 
 class DualScratch(NamedTuple):
@@ -30,14 +32,14 @@ class DualScratch(NamedTuple):
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
-def _primal_plane(x, p, i, threshold, w0, w1, w2, floor, zero, out):
+def _primal_plane(x, pa, pb, pc, i, threshold, w0, w1, w2, floor, zero, out):
     """Plane i of max(x - threshold Dᵀ p, floor) into out [b, c + 1]; the last column is repeated."""
     nb, nc = x.shape[1], x.shape[2]
     for j in range(nb):
         here, row = x[i, j], out[j]
-        p0, p1, p2 = p[0, i, j], p[1, i, j], p[2, i, j]
-        before0 = p[0, i - 1, j] if i > 0 else zero
-        before1 = p[1, i, j - 1] if j > 0 else zero
+        p0, p1, p2 = pa[i, j], pb[i, j], pc[i, j]
+        before0 = pa[i - 1, j] if i > 0 else zero
+        before1 = pb[i, j - 1] if j > 0 else zero
         row[0] = max(here[0] - threshold * (w0 * (before0[0] - p0[0]) + w1 * (before1[0] - p1[0]) - w2 * p2[0]), floor)
         for k in range(1, nc):
             pull = w0 * (before0[k] - p0[k]) + w1 * (before1[k] - p1[k]) + w2 * (p2[k - 1] - p2[k])
@@ -45,53 +47,73 @@ def _primal_plane(x, p, i, threshold, w0, w1, w2, floor, zero, out):
         row[nc] = row[nc - 1]
 
 
+@njit(fastmath=True, error_model="numpy", cache=True)
+def _dual_plane(pa, pb, pc, v, pair, near, far, here, back1, s0, s1, s2):
+    """The differences that belong to the voxels of plane v: from u `near` to `far` at `pair`, and within `here`."""
+    nb, nc = pb.shape[1], pb.shape[2]
+    for j in range(nb):
+        start = j - back1 if j >= back1 else nb - 1  # from the last row there is no difference: 0, and stays so
+        row, near0, far0, near1, far1 = here[j], near[j], far[j], here[start], here[min(start + 1, nb - 1)]
+        p0, p1, p2 = pa[pair, j], pb[v, start], pc[v, j]
+        for k in range(nc):
+            q0 = p0[k] + s0 * (far0[k] - near0[k])
+            q1 = p1[k] + s1 * (far1[k] - near1[k])
+            q2 = p2[k] + s2 * (row[k + 1] - row[k])
+            shrink = _f(1) / max(_f(1), np.sqrt(q0 * q0 + q1 * q1 + q2 * q2))
+            p0[k], p1[k], p2[k] = q0 * shrink, q1 * shrink, q2 * shrink
+
+
 @njit(**OPTIONS)
 def _dual_step(
-    x: F32, p: F32, threshold: float, pace: float, weights: Weights, floor: float, edges: F32, planes: F32
-) -> None:
-    na, nb, nc = x.shape
+    x: F32, pa: F32, pb: F32, pc: F32, threshold: float, pace: float, weights: Weights, floor: float,
+    back0: int, back1: int, edges: F32, planes: F32,
+) -> None:  # fmt: skip
+    na, _, nc = x.shape
     runs = edges.shape[0]
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
     zero = np.zeros(nc, np.float32)
     # The first plane of each run, before another thread changes the dual fields that it depends on.
     for run in prange(runs):
-        _primal_plane(x, p, run * na // runs, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
+        _primal_plane(x, pa, pb, pc, run * na // runs, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):
         first, last = run * na // runs, (run + 1) * na // runs
         s0, s1, s2 = _f(pace) * w0, _f(pace) * w1, _f(pace) * w2
+        if back0 and run == 0:  # before the first plane there is no difference
+            start = edges[0]
+            _dual_plane(pa, pb, pc, 0, na - 1, start, start, start, back1, s0, s1, s2)
         for i in range(first, last):
             here = edges[run] if i == first else planes[run, i % 2]
             if i + 1 < last:
                 after = planes[run, (i + 1) % 2]
-                _primal_plane(x, p, i + 1, _f(threshold), w0, w1, w2, _f(floor), zero, after)
+                _primal_plane(x, pa, pb, pc, i + 1, _f(threshold), w0, w1, w2, _f(floor), zero, after)
             else:
                 after = edges[run + 1] if run + 1 < runs else here
-            for j in range(nb):
-                row, next_plane, next_row = here[j], after[j], here[min(j + 1, nb - 1)]
-                p0, p1, p2 = p[0, i, j], p[1, i, j], p[2, i, j]
-                for k in range(nc):
-                    q0 = p0[k] + s0 * (next_plane[k] - row[k])
-                    q1 = p1[k] + s1 * (next_row[k] - row[k])
-                    q2 = p2[k] + s2 * (row[k + 1] - row[k])
-                    shrink = _f(1) / max(_f(1), np.sqrt(q0 * q0 + q1 * q1 + q2 * q2))
-                    p0[k], p1[k], p2[k] = q0 * shrink, q1 * shrink, q2 * shrink
+            if not back0:
+                _dual_plane(pa, pb, pc, i, i, here, after, here, back1, s0, s1, s2)
+            elif i + 1 < na:
+                _dual_plane(pa, pb, pc, i + 1, i, here, after, after, back1, s0, s1, s2)
 
 
 @njit(**OPTIONS)
-def _primal(x: F32, p: F32, threshold: float, weights: Weights, floor: float, planes: F32, out: F32) -> None:
+def _primal(
+    x: F32, pa: F32, pb: F32, pc: F32, threshold: float, weights: Weights, floor: float, planes: F32, out: F32
+) -> None:
     na, nb, nc = x.shape
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
     zero = np.zeros(nc, np.float32)
     runs = planes.shape[0]
     for run in prange(runs):
         for i in range(run * na // runs, (run + 1) * na // runs):
-            _primal_plane(x, p, i, _f(threshold), w0, w1, w2, _f(floor), zero, planes[run, 0])
+            _primal_plane(x, pa, pb, pc, i, _f(threshold), w0, w1, w2, _f(floor), zero, planes[run, 0])
             for j in range(nb):
                 for k in range(nc):
                     out[i, j, k] = planes[run, 0, j, k]
 
 
-def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch) -> None:
+def dual_step(
+    x: F32, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch,
+    back: tuple[int, int] = (0, 0),
+) -> None:  # fmt: skip
     """p <- projection onto |p| <= 1 of p + pace D P(x - threshold Dᵀ p), in place; P clips negative values or none.
 
     Projected gradient ascent of the dual of min ½|y - x|² + threshold TV(y) (Chambolle 2004; with P: Beck & Teboulle
@@ -100,56 +122,31 @@ def dual_step(x: F32, p: F32, threshold: float, weights: Weights, nonnegative: b
 
     Args:
         scratch: see `dual_scratch`.
+        back: of the first two axes: 1 where |p| of a voxel takes the difference from the voxel before, 0 where it
+            takes the one to the next. It is total variation as a mirror image sees it.
     """
     pace = 1.5 / (4 * sum(w * w for w in weights)) / threshold
     floor = 0.0 if nonnegative else _NO_FLOOR
-    _dual_step(x, p, threshold, pace, weights, floor, *scratch)
+    _dual_step(x, *p, threshold, pace, weights, floor, *back, *scratch)
 
 
 def primal(
-    x: F32, p: F32, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch, out: F32
+    x: F32, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch, out: F32
 ) -> None:
     """out = P(x - threshold Dᵀ p); `out` may be `x`."""
-    _primal(x, p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch.planes, out)
+    _primal(x, *p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch.planes, out)
 
 
-@njit(**OPTIONS)
-def _mirror(x: F32, span0: int, span1: int, span2: int, sign: float) -> None:
-    na, nb, nc = x.shape
-    s = _f(sign)
-    for job in prange(na):
-        i = np.int64(job)
-        to = span0 - 1 - i if span0 > 0 else i
-        if to < i:
-            continue  # done from the other end; also what lies beyond the span
-        for j in range(nb):
-            there = span1 - 1 - j if span1 > 0 else j
-            if there < 0 or (to == i and there < j):
-                continue
-            here, other = x[i, j], x[to, there]
-            alone = to == i and there == j
-            for k in range(span2 if span2 > 0 else nc):
-                end = span2 - 1 - k if span2 > 0 else k
-                if alone and end < k:
-                    break
-                value = here[k]
-                here[k] = s * other[end]
-                other[end] = s * value
+def dual_field(shape: tuple[int, int, int]) -> DualField:
+    """Zeros [a, b, c] for the differences along each axis: at i, that from i to i + 1.
 
-
-def mirror(x: F32, axes: tuple[int, ...], differences: int | None = None) -> None:
-    """Reverse [a, b, c] along `axes` in place; with `differences`, the axis of these, as part of a dual field.
-
-    The difference from i to i + 1 lies at i. Seen from the other end it changes its sign, and lies at n - 2 - i; the
-    last place holds none, and stays.
+    Each begins some cache lines later than a multiple of its size. Else the fields of 1024 x 1024 x 64 voxels, and
+    rows within them, lie a power of two apart, share one set of the cache, and take three times as long.
     """
-    if not axes:
-        return
-    spans = [n if axis in axes else 0 for axis, n in enumerate(x.shape)]
-    sign = 1.0
-    if differences in axes:
-        spans[differences], sign = max(x.shape[differences] - 1, 1), -1.0
-    _mirror(x, *spans, sign)
+    size = math.prod(shape)
+    room = np.zeros(3 * (size + _APART), np.float32)
+    a, b, c = (room[at : at + size].reshape(shape) for at in (n * (size + _APART) for n in range(3)))
+    return a, b, c
 
 
 def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:

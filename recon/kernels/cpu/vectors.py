@@ -83,3 +83,38 @@ def replace_by_residual(data: F32, model: F32, weight: F32 | None = None, scale:
     weights, scales = (empty if array is None else array.reshape(-1) for array in (weight, scale))
     _replace_by_residual(data.reshape(-1), model.reshape(-1), weights, scales, sums)
     return float(sums.sum())
+
+
+@njit(**OPTIONS)
+def _turn_of_steps(before: F32, start: F32, end: F32, sums: NDArray[np.float64]) -> None:
+    parts = sums.size
+    for part in prange(parts):
+        total = np.float64(0)
+        stop = (part + 1) * end.size // parts
+        for first in range(part * end.size // parts, stop, _RUN):
+            run = _f(0)
+            for i in range(first, min(first + _RUN, stop)):
+                run += (start[i] - end[i]) * (end[i] - before[i])
+            total += run
+        sums[part] = total
+
+
+def turn_of_steps(before: F32, start: F32, end: F32) -> float:
+    """<start - end, end - before>: above zero where the step from `start` to `end` points back to `before`."""
+    sums = np.empty(get_num_threads())
+    _turn_of_steps(before.reshape(-1), start.reshape(-1), end.reshape(-1), sums)
+    return float(sums.sum())
+
+
+@njit(**OPTIONS)
+def _extrapolate(x: F32, factor: float, last: F32, start: F32) -> None:
+    p = _f(factor)
+    for i in prange(x.size):
+        end = x[i]
+        ahead = end + p * (end - last[i])
+        last[i], start[i], x[i] = end, ahead, ahead
+
+
+def extrapolate(x: F32, factor: float, last: F32, start: F32) -> None:
+    """x += factor (x - last), and `last` becomes x before that, `start` x after it."""
+    _extrapolate(x.reshape(-1), factor, last.reshape(-1), start.reshape(-1))

@@ -157,7 +157,7 @@ def test_the_step_bound_is_the_largest_eigenvalue_from_above() -> None:
         assert exact * (1 - 1e-5) <= bound < 1.1 * exact
 
 
-MIRRORS: tuple[tuple[int, ...], ...] = ((), (1, 2), (0, 2), (0, 1))  # axes of [z, y, x] that are reversed
+MIRRORS: tuple[tuple[int, ...], ...] = ((), (1,), (2,), (1, 2))  # axes of [z, y, x] that are reversed
 
 
 def mirrored_variation(x: NDArray[np.float64]) -> float:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.tv import total_variation as total_variation_cpu
 from recon.voxels.tv import TotalVariationProx, difference_weights
 from tests.recon.voxels.tv_reference import total_variation, transposed_differences
@@ -25,7 +24,7 @@ def test_the_gap_to_the_dual_closes(nonnegative: bool, rng: np.random.Generator)
     wide = x.astype(np.float64)
     value = 0.5 * ((y - wide) ** 2).sum() + threshold * total_variation(y.astype(np.float64), weights)
     # max over |p| <= 1 of min over y of ½|y - x|² + t <Dᵀp, y>: its value at y(p) = P(x - t Dᵀp).
-    shifted = wide - threshold * transposed_differences(prox._dual.astype(np.float64), weights)
+    shifted = wide - threshold * transposed_differences(np.stack(prox._dual).astype(np.float64), weights)
     best = np.maximum(shifted, 0) if nonnegative else shifted
     bound = 0.5 * ((best - wide) ** 2).sum() + (best * (wide - shifted)).sum()
     assert bound <= value * (1 + 1e-6)
@@ -75,21 +74,6 @@ def test_the_sum_of_changes_equals_the_reference(rng: np.random.Generator) -> No
     assert total_variation_cpu(np.ones((1, 2, 1), np.float32), weights) == 0
 
 
-@pytest.mark.parametrize("axes", [(), (0,), (1, 2), (0, 2), (0, 1, 2)])
-@pytest.mark.parametrize("shape", [(5, 4, 7), (4, 6, 1), (1, 1, 8)])
-def test_a_mirror_image_has_the_same_differences(
-    axes: tuple[int, ...], shape: tuple[int, int, int], rng: np.random.Generator
-) -> None:
-    x = rng.random(shape, dtype=np.float32)
-    image, fields = x.copy(), [np.diff(x, axis=axis, append=x.take([-1], axis)) for axis in range(3)]
-    tv_cpu.mirror(image, axes)
-    np.testing.assert_array_equal(image, np.flip(x, axes))
-    for axis, field in enumerate(fields):
-        mirrored = field.copy()
-        tv_cpu.mirror(mirrored, axes, axis)
-        np.testing.assert_array_equal(mirrored, np.diff(image, axis=axis, append=image.take([-1], axis)))
-
-
 def test_no_side_is_preferred(rng: np.random.Generator) -> None:
     """Four turns see four mirror images alike."""
     x = rng.random((5, 6, 7), dtype=np.float32)
@@ -100,7 +84,7 @@ def test_no_side_is_preferred(rng: np.random.Generator) -> None:
             prox.turn()
         prox(y, 0.2)
         found.append(y)
-    for y, axes in zip(found, ((), (1, 2), (0, 2), (0, 1), ()), strict=True):
+    for y, axes in zip(found, ((), (0,), (1,), (0, 1), ()), strict=True):
         prox, image = TotalVariationProx(x.shape, CUBES, True, 3), np.flip(x, axes).copy()
         prox(image, 0.2)
         np.testing.assert_allclose(np.flip(image, axes), y, atol=1e-6)
@@ -108,14 +92,16 @@ def test_no_side_is_preferred(rng: np.random.Generator) -> None:
 
 
 def test_a_single_slice_is_one_of_two_equal_slices(rng: np.random.Generator) -> None:
-    """Of one slice the kernels see the axes in another order, also when they turn."""
+    """Of one slice the kernels see the axes in another order. It turns along y alone, which shows it both diagonals."""
     x = rng.normal(size=(20, 33, 1)).astype(np.float32)
     found = []
-    for slices in (1, 2):
+    for slices, turns in ((1, 1), (2, 1), (1, 2), (2, 4)):
         prox = TotalVariationProx((20, 33, slices), (1.0, 1.0, 0.7), True, steps=3)
         y = np.repeat(x, slices, axis=2)
-        for _ in range(5):
-            prox(y, 0.2)
+        prox(y, 0.2)
+        for _ in range(turns):
             prox.turn()
+        prox(y, 0.2)
         found.append(y[:, :, 0])
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+    np.testing.assert_allclose(found[2], found[3], atol=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.kernels.cpu.vectors import add_product, combine, dot, replace_by_residual
+from recon.kernels.cpu.vectors import add_product, combine, dot, extrapolate, replace_by_residual, turn_of_steps
 
 
 @pytest.mark.parametrize("n", [1, 5, 100_001])
@@ -22,6 +22,13 @@ def test_results_equal_those_of_numpy(n: int, rng: np.random.Generator) -> None:
     model = b.copy()
     total = replace_by_residual(a, model, np.abs(w), w)
     np.testing.assert_allclose(model, wide[2] * (wide[0] - wide[1]), atol=2e-6)
+    bend = float(((wide[1] - wide[2]) * (wide[2] - wide[0])).sum())
+    assert turn_of_steps(a, b, w) == pytest.approx(bend, rel=1e-6, abs=1e-6 * n)
+    x, last, start = w.copy(), a.copy(), b.copy()
+    extrapolate(x, 0.4, last, start)
+    np.testing.assert_allclose(x, wide[2] + 0.4 * (wide[2] - wide[0]), atol=1e-6)
+    np.testing.assert_array_equal(last, w)
+    np.testing.assert_array_equal(start, x)
     assert total == pytest.approx(float((np.abs(wide[2]) * (wide[0] - wide[1]) ** 2).sum()), rel=1e-6)
 
 
