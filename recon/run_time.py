@@ -21,7 +21,7 @@ from recon.reconstruction import reconstruct
 from recon.splatting.finish import SWEEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import count_for
+from recon.splatting.initialise import binning_for, count_for
 from recon.splatting.r2 import R2
 from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
@@ -95,7 +95,8 @@ def run_seconds(method: Method, extent: Extent, now: Clock) -> RunTime:
 
     Small runs are made of the scan's own beam, with its lean, its exposures and as many rows, if they are few.
     Iterations cost views times voxels, plus voxels for their work on the volume alone. A weight of total variation is
-    chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover.
+    chosen once, on sixteen rows. A step of a fit costs voxels^(2/3) Gaussians^(1/3), as many pixels as they cover; of
+    joined pixels there are fewer voxels.
     """
     if isinstance(method, FitMethod):
         return _of_fit(method, extent, now)
@@ -204,10 +205,11 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
     seconds = 0.0
     for height in extent.heights:
-        voxels = height * extent.cols**2
-        first = count_for(Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone)
+        field, cone = Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone
+        first = count_for(field, cone)
         count = first if given is None else given * height / extent.slices
-        seconds += max(less + slope * (_work(voxels, count) - few), 0.0)
+        joined = method.fit.binning or binning_for(field, cone, max(count, first), (height, extent.cols))
+        seconds += max(less + slope * (_work(math.prod(field.shape) / joined**3, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     planned, fewest = method.planned_steps or 0, method.least_steps or 0
     most = method.seconds if method.seconds is not None else planned * seconds * grown

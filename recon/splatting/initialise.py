@@ -49,6 +49,8 @@ _WILD, _WILD_VIEWS = 10.0, 0.1
 _FARTHEST, _EMPTY = 0.95, 0.15
 
 _SCALED_BY = 12  # views
+_COUNTS = 2000, 200_000  # Gaussians
+_LEAST_JOINED = 4  # pixels
 _MIDDLE = 8  # slices on each side of the middle, whose changes are looked at
 _SWEEP_WEIGHT = 0.004  # density units
 _SWEEPS = 10  # of ordered-subset TV for a first volume: with momentum, more sweeps fit the noise
@@ -71,9 +73,23 @@ def count_for(field: Grid, cone: bool) -> int:
     Of a cone, whose field is often much larger than the sample, at most V^(2/3) for V voxels: Gaussians gather at
     surfaces (docs/published.md).
     """
+    return int(np.clip(_count_of(field, cone), *_COUNTS))
+
+
+def binning_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
+    """The factor by which pixels [row, col] are joined for a fit of so many Gaussians.
+
+    Fewer Gaussians than one for 60 voxels are wider, by the cube root of what is missing. They show nothing that joined
+    pixels do not. Of a cone they cover surfaces: the square root. At least four rows are left.
+    """
+    wider = (_count_of(field, cone) / count) ** (1 / 2 if cone else 1 / 3)
+    return max(1, min(int(wider), detector[0] // _LEAST_JOINED, detector[1] // _LEAST_JOINED))
+
+
+def _count_of(field: Grid, cone: bool) -> float:
     voxels = math.prod(field.shape)
     count = np.pi / 4 * voxels / 60
-    return int(np.clip(min(count, voxels ** (2 / 3)) if cone else count, 2000, 200_000))
+    return min(count, voxels ** (2 / 3)) if cone else count
 
 
 def place(

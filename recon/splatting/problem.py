@@ -141,36 +141,27 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
     if factor > min(geometry.detector_shape):
         rows, cols = geometry.detector_shape
         raise ValueError(
-            f"coarse={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set `coarse` to "
-            f"{min(rows, cols)} or less (1: the fit begins on single pixels)"
+            f"binning={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set it to "
+            f"{min(rows, cols)} or less (1: the fit sees single pixels)"
         )
     return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
 
 
-def coarser(problem: FitProblem, factor: int, loss: Loss, ssim_weight: float) -> FitProblem:
-    """The same problem on binned pixels: a first look at the large scales for a fraction of the time.
+def joined(projections: F32, weights: F32 | None, geometry: Geometry, factor: int) -> tuple[F32, F32 | None, Geometry]:
+    """Views [view, row, col], their weights and geometry with factor x factor pixels joined.
 
-    A binned pixel is the weighted mean of its pixels and has their mean weight. Unmeasured pixels thus do not
-    contribute.
+    A joined pixel is the weighted mean of its pixels and has their mean weight, so that unmeasured ones do not count.
 
     Raises:
         ValueError: as `binned_geometry`.
     """
-    geometry = binned_geometry(problem.geometry, factor)
-    data, weights = problem.projections, None
-    if any(w is not None for w in problem.weights):
-        ones = np.ones(problem.geometry.detector_shape, np.float32)
-        each = np.stack([ones if w is None else problem.backend.numpy(w) for w in problem.weights])
-        weights = bin_views(each, factor)
-        sums = bin_views(each * data, factor)
-        data = np.divide(sums, weights, out=np.zeros_like(sums), where=weights > 0)  # make_problem fills the others
-    else:
-        data = bin_views(data, factor)
-    binned = make_problem(
-        data, geometry, problem.grid, problem.unit, problem.backend,
-        weights=weights, loss=loss, ssim_weight=ssim_weight,
-    )  # fmt: skip
-    return replace(binned, change=problem.change)
+    if factor == 1:
+        return projections, weights, geometry
+    binned = binned_geometry(geometry, factor)
+    if weights is None:
+        return bin_views(projections, factor), None, binned
+    sums, known = bin_views(weights * projections, factor), bin_views(weights, factor)
+    return np.divide(sums, known, out=np.zeros_like(sums), where=known > 0), known, binned
 
 
 def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> FitProblem:

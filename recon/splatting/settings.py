@@ -49,7 +49,8 @@ class FitSettings:
         truncation: where Gaussians end; a compact kernel ends by itself.
         smallest: least standard deviation, in pixels: point sampling sees nothing thinner.
         views_per_step: gradients of so many views are averaged.
-        coarse, coarse_until: the fit begins on pixels binned by this factor, until this fraction of its steps.
+        binning: pixels of the views are joined by this factor for the fit, not for its finish. None joins as many as
+            Gaussians are wide, see `initialise.binning_for`: of large volumes alone.
         rays: the integral of a Gaussian along a ray; matters for cones.
         kernel: radial profile of the Gaussians, also by its name; a fit that starts from a model keeps the model's.
     """
@@ -66,16 +67,15 @@ class FitSettings:
     truncation: Truncation = field(default_factory=Truncation)
     smallest: float = 0.3
     views_per_step: int = 2
-    coarse: int = 1
-    coarse_until: float = 0.2
+    binning: int | None = None
     rays: RayModel = field(default_factory=RayModel)
     kernel: Kernel = KERNEL
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))
-        for name in ("views_per_step", "coarse", "tv_size"):
+        for name in ("views_per_step", "binning", "tv_size"):
             value = getattr(self, name)
-            if value is None and name == "tv_size":
+            if value is None and name != "views_per_step":
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of 1 or more, got {value!r}")
@@ -86,8 +86,6 @@ class FitSettings:
         for name in ("pace", "decay", "smallest"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
-        if not 0 <= self.coarse_until <= 1:
-            raise ValueError(f"coarse_until is a fraction of the steps, 0 to 1, got {self.coarse_until}")
         if len(self.rates) != len(NAMES) or not all(0 <= rate < math.inf for rate in self.rates):
             raise ValueError(
                 f"rates must be {len(NAMES)} finite numbers of 0 or more ({', '.join(NAMES)}), got {self.rates}"

@@ -35,9 +35,16 @@ from recon.splatting.in_time import (
     first_draw_seconds,
     first_sweep_seconds,
 )
-from recon.splatting.initialise import default_count, leaves_the_field, mean_change, place, sweeps_of_start
+from recon.splatting.initialise import (
+    binning_for,
+    default_count,
+    leaves_the_field,
+    mean_change,
+    place,
+    sweeps_of_start,
+)
 from recon.splatting.optimise import FitState
-from recon.splatting.problem import FitProblem, binned_geometry, coarser
+from recon.splatting.problem import FitProblem, joined
 from recon.splatting.schedule import TRIAL_AT, Schedule
 from recon.splatting.settings import FitSettings, growth, tv_size, tv_weight
 from recon.splatting.splat import voxelize
@@ -116,35 +123,37 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     blank = kept_back[~data[kept_back].any(axis=(1, 2))]
     if blank.size:
         raise ValueError(f"held_out: views {blank.tolist()} are zero everywhere and can judge nothing; name others")
-    seen, known = geometry.select(used), None if weights is None else weights[used]
-    wider = leaves_the_field(data[used], seen)
-    field_grid = Grid.for_fit(geometry, problem.grid, wider=wider)
-    binned_geometry(seen, settings.coarse)  # refuses views that cannot be binned before any computation
+    views = geometry.select(used)
+    wider = leaves_the_field(data[used], views)
+    start, pixel_grid = method.gaussians, Grid.for_fit(geometry, problem.grid)
+    usual = default_count(views, pixel_grid.voxel_size)
+    count = start.n if isinstance(start, Gaussians) else usual if start is None else start
+    binning = settings.binning or binning_for(
+        pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
+    )  # fmt: skip
+    measured, trusted = data[used], None if weights is None else weights[used]
+    p, known, seen = joined(measured, trusted, views, binning)
+    field_grid = Grid.for_fit(seen, problem.grid, wider=wider)
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
         factor = 1 if method.seconds is None else _factor_in_time(method, seen, field_grid, now, end)
-        start = method.gaussians
         if not isinstance(start, Gaussians):
             start = place(
-                data[used], seen, field_grid, start, np.random.default_rng(problem.seed), start=method.start,
+                p, seen, field_grid, count, np.random.default_rng(problem.seed), start=method.start,
                 rays=settings.rays, kernel=settings.kernel, factor=factor,
             )  # fmt: skip
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, geometry.n_views, backend)
     n_start, unit = state.n, state.unit
-    fine = fit.problem_of(data[used], seen, field_grid, unit, settings, backend, known)
+    fitting = fit.problem_of(p, seen, field_grid, unit, settings, backend, known)
     if settings.tv_weight is None:
-        fine = replace(fine, change=decide("change", lambda: mean_change(data[used], seen, field_grid)))
-    rough = fine
-    if settings.coarse > 1:
-        rough = coarser(fine, settings.coarse, settings.loss, settings.ssim_weight)
+        fitting = replace(fitting, change=decide("change", lambda: mean_change(p, seen, field_grid)))
     unseen = None
     if kept_back.size:
         others = None if weights is None else weights[kept_back]
-        unseen = fit.problem_of(
-            data[kept_back], geometry.select(kept_back), field_grid, unit, settings, backend, others
-        )  # fmt: skip
+        q, others, apart = joined(data[kept_back], others, geometry.select(kept_back), binning)
+        unseen = fit.problem_of(q, apart, field_grid, unit, settings, backend, others)
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
     by_content = method.least_steps != method.planned_steps
@@ -153,8 +162,10 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         seconds = max(0.0, end - fill_seconds(fit.gaussians_of(state, backend), problem.grid, now) - now())
     schedule = Schedule(method.planned_steps, seconds, by_content)
     schedule = Schedule.resumed(schedule, control.resume or {})
-    tries_finish = by_content and method.finish is None and not (wider or method.early_stop or seen.is_cone)
-    fitted = replace(problem, projections=data[used], geometry=told.select(used), use=DataUse(known))
+    # The trial costs more than all steps on joined pixels.
+    tries_finish = by_content and method.finish is None and binning == 1
+    tries_finish = tries_finish and not (wider or method.early_stop or seen.is_cone)
+    fitted = replace(problem, projections=measured, geometry=told.select(used), use=DataUse(trusted))
     history: list[Progress] = []
 
     def of_model() -> tuple[Volume, Gaussians]:
@@ -188,15 +199,15 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         if schedule.seconds is not None and spent >= schedule.seconds and done > 0:
             break
         fraction = schedule.fraction(state.step, spent)
-        fit.step(state, rough if fraction < settings.coarse_until else fine, settings, fraction)
+        fit.step(state, fitting, settings, fraction)
         done += 1
         if not planned and done == _TIMED and schedule.seconds is not None:
             spent = now() - fit_begin
             left, step, planned = schedule.seconds - spent, spent / done, True
-            fitting = partial(_finish_in_time, method, seen, problem.grid, now, left, step)
-            wanted, finishing, trials = decide("finish", fitting)
+            finish_in_time = partial(_finish_in_time, method, views, problem.grid, now, left, step)
+            wanted, finishing, trials = decide("finish", finish_in_time)
             schedule.seconds = max(spent, schedule.seconds - finishing)
-        schedule.look(state, fine)
+        schedule.look(state, fitting)
         if state.step % _LOOK == _LOOK - 1:  # before density control, whose changes take some steps to settle
             tracker.look(state, method.early_stop)
         if now() - reported > 0.1 or done == 1:
@@ -214,7 +225,8 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
         state = state_from(tracker.kept, backend)
     volume, model = of_model()
     if not planned:  # the fit has ended before
-        wanted, _, trials = decide("finish", lambda: _finish_in_time(method, seen, problem.grid, now, end - now(), 0.0))
+        left = end - now()
+        wanted, _, trials = decide("finish", lambda: _finish_in_time(method, views, problem.grid, now, left, 0.0))
     if wanted == 0 or now() >= end or (control.should_stop is not None and control.should_stop()):
         sweeps = 0
     if sweeps:
@@ -231,7 +243,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     record = {
         **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,
-        "finish": sweeps, "tv_weight": tv_weight(settings, fine, state.limit),
+        "finish": sweeps, "binning": binning, "tv_weight": tv_weight(settings, fitting, state.limit),
         "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
     checkpoint = arrays_of(last, backend) | tracker.arrays() | schedule.arrays()

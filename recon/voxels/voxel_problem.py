@@ -20,7 +20,7 @@ from recon.voxels.fbp import Filter, fbp_memory
 from recon.voxels.projector import Projector, projection_images, volume_lines
 from recon.voxels.sweeps import Sweeps
 
-_ROUNDS = 6  # of power iteration
+_ROUNDS, _ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,13 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
 
     For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
     So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side.
+    Where each row sees a slice of its own, and alike, sixteen of them tell it.
     """
+    if weight is None and _rows_are_alike(projector):
+        some, grid = projector.geometry.rows(0, _ROWS), projector.grid
+        centre = (Grid.matching(some).centre[0], *grid.centre[1:])
+        box = replace(grid, shape=(_ROWS, *grid.shape[1:]), centre=centre)
+        projector = Projector(some, box)
     nz, ny, nx = projector.grid.shape
     x = np.ones((ny, nx, nz), np.float32)
     bound = math.inf
@@ -121,6 +127,14 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
             return math.inf  # no ray meets the box
         x = product / product.max()
     return bound
+
+
+def _rows_are_alike(projector: Projector) -> bool:
+    """Each of more than sixteen rows sees one slice of the grid, as every other row does."""
+    geometry, grid = projector.geometry, projector.grid
+    rows = Grid.matching(geometry)
+    of_rows = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
+    return of_rows and grid.shape[0] > _ROWS and geometry.rows_show_slices and not (geometry.skew or geometry.width)
 
 
 def iterative_memory(

@@ -13,7 +13,7 @@ from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Cpu
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.problem import coarser, extend, make_problem
+from recon.splatting.problem import extend, joined, make_problem
 from recon.splatting.settings import NAMES, FitSettings
 from recon.splatting.splat import project
 from tests.recon.helpers import run_steps
@@ -50,11 +50,6 @@ def test_weights_follow_their_pixels(rng: np.random.Generator) -> None:
     expected = np.ones((12, 18))
     expected[2:4, 4:6] = 0
     np.testing.assert_array_equal(problem.weights[1], expected)
-    joined = coarser(problem, 2, "l1", 0.25)
-    assert joined.geometry.detector_shape == (6, 9) and joined.weights[1][1, 2] == 0
-    np.testing.assert_allclose(
-        joined.projections[0], data[0].reshape(6, 2, 9, 2).mean(axis=(1, 3)), rtol=1e-5
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize("value", [1e7, -1e7, 1e12, 3e38, -3e38])
@@ -101,11 +96,9 @@ def test_a_fit_goes_on_beside_values_that_no_matter_explains(rng: np.random.Gene
     ends = []
     for value in (np.nan, 1e25):
         data[2, 5, 6] = value
-        settings = FitSettings(policy=None, tv_size=6, coarse=2, coarse_until=0.5)
+        settings = FitSettings(policy=None, tv_size=6)
         problem = fit.problem_of(data, VIEWS, GRID, 0.2, settings)
-        rough = coarser(problem, 2, "l1", 0.25)
-        state = run_steps(fit.init(start, 0), rough, settings, 4)
-        ends.append(run_steps(state, problem, settings, 4).parameters)
+        ends.append(run_steps(fit.init(start, 0), problem, settings, 8).parameters)
     for name in NAMES:
         assert np.isfinite(ends[1][name]).all()
         np.testing.assert_array_equal(ends[0][name], ends[1][name])
@@ -118,16 +111,15 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
     weights = rng.uniform(0.1, 2, data.shape).astype(np.float32)
     weights[rng.random(data.shape) < share] = 0
     weights[:, 0, 0] = 1  # no view is blind
-    joined = coarser(make_problem(data, VIEWS, GRID, 1.0, Cpu(), weights=weights), factor, "l1", 0.25)
+    found, kept, views = joined(data, weights, VIEWS, factor)
     rows, cols = 12 // factor, 18 // factor
-    assert joined.projections.shape == (3, rows, cols)
+    assert found.shape == kept.shape == (3, rows, cols) == (3, *views.detector_shape)
     for view, row, col in np.ndindex(3, rows, cols):
         cell = np.s_[view, row * factor : (row + 1) * factor, col * factor : (col + 1) * factor]
         p, w = data[cell].astype(np.float64), weights[cell].astype(np.float64)
-        kept = joined.weights[view]
-        assert (1.0 if kept is None else kept[row, col]) == pytest.approx(w.mean(), rel=1e-5)
-        if w.any():
-            assert joined.projections[view, row, col] == pytest.approx((w * p).sum() / w.sum(), rel=1e-5)
+        assert kept[view, row, col] == pytest.approx(w.mean(), rel=1e-5)
+        expected = (w * p).sum() / w.sum() if w.any() else 0
+        assert found[view, row, col] == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize("beam", ["parallel", "cone"])
@@ -143,9 +135,8 @@ def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) 
     means = np.array([[1.0, -2.0, 3.0], [-2.0, 1.0, -4.0], [3.0, 2.0, 1.0]])
     model = Gaussians.from_physical(means, np.full((3, 3), 0.5 * width), np.full(3, 0.2))
     fine = project(model, views, truncation=cut).numpy()
-    rough = coarser(make_problem(fine, views, Grid.matching(views), 0.2, Cpu()), factor, "l1", 0.25)
-    seen = project(model, rough.geometry, truncation=cut).numpy()
-    off = np.abs(seen - rough.projections).max() / fine.max()
+    binned, _, rough = joined(fine, None, views, factor)
+    off = np.abs(project(model, rough, truncation=cut).numpy() - binned).max() / fine.max()
     # A mean over a pixel differs from the value in its middle by factor² / 24 times the second derivatives, of which
     # there are two, each at most 1 / width². Half a pixel off would be 0.6 * 0.5 / width, for factor 2 five times that.
     assert off < factor**2 / 12 / width**2 * 1.1
@@ -153,9 +144,8 @@ def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) 
 
 def test_a_detector_too_small_to_be_binned_is_told_by_name() -> None:
     one = Geometry.parallel(VIEWS.angles, (1, 18), pixel_pitch=0.5)
-    problem = make_problem(np.ones((3, 1, 18), np.float32), one, Grid.matching(one), 1.0, Cpu())
-    with pytest.raises(ValueError, match=r"coarse=2 joins 2 x 2 pixels, and the detector has 1 x 18: .* 1 or less"):
-        coarser(problem, 2, "l1", 0.25)
+    with pytest.raises(ValueError, match=r"binning=2 joins 2 x 2 pixels, and the detector has 1 x 18: .* 1 or less"):
+        joined(np.ones((3, 1, 18), np.float32), None, one, 2)
 
 
 def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(rng: np.random.Generator) -> None:
@@ -172,10 +162,9 @@ def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(r
 
 def test_binned_pixels_of_equal_weight_are_means(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
-    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
-    joined = coarser(problem, 3, "l1", 0.25)
-    np.testing.assert_allclose(joined.projections, data.reshape(3, 4, 3, 6, 3).mean(axis=(2, 4)), rtol=1e-5)
-    assert joined.weights == (None, None, None)
+    found, weights, _ = joined(data, None, VIEWS, 3)
+    np.testing.assert_allclose(found, data.reshape(3, 4, 3, 6, 3).mean(axis=(2, 4)), rtol=1e-5)
+    assert weights is None
 
 
 def test_a_view_with_only_wild_values_is_refused_with_the_range(rng: np.random.Generator) -> None:

@@ -157,6 +157,15 @@ def test_the_step_bound_is_the_largest_eigenvalue_from_above() -> None:
         assert exact * (1 - 1e-5) <= bound < 1.1 * exact
 
 
+def test_sixteen_rows_tell_the_step_of_all() -> None:
+    """Rows of a parallel beam are alike, wherever their slices lie."""
+    angles, bounds = np.linspace(0, np.pi, 7, endpoint=False), []
+    for rows, axis_row in ((16, None), (17, 3.0), (40, None)):
+        geometry = Geometry.parallel(angles, (rows, 24), pixel_pitch=0.5, axis_row=axis_row)
+        bounds.append(largest_eigenvalue(Projector(geometry, Grid.matching(geometry)), None))
+    assert bounds[1:] == pytest.approx([bounds[0]] * 2, rel=1e-6)
+
+
 MIRRORS: tuple[tuple[int, ...], ...] = ((), (1,), (2,), (1, 2))  # axes of [z, y, x] that are reversed
 
 
