@@ -21,7 +21,7 @@ from recon.reconstruction import reconstruct
 from recon.splatting.finish import SWEEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import binning_for, count_for
+from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.r2 import R2
 from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
@@ -208,7 +208,7 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
         field, cone = Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone
         first = count_for(field, cone)
         count = first if given is None else given * height / extent.slices
-        joined = method.fit.binning or binning_for(field, cone, max(count, first), (height, extent.cols))
+        joined = method.fit.joined_pixels or joined_for(field, cone, max(count, first), (height, extent.cols))
         seconds += max(less + slope * (_work(math.prod(field.shape) / joined**3, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     planned, fewest = method.planned_steps or 0, method.least_steps or 0

@@ -76,7 +76,7 @@ def count_for(field: Grid, cone: bool) -> int:
     return int(np.clip(_count_of(field, cone), *_COUNTS))
 
 
-def binning_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
+def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
     """The factor by which pixels [row, col] are joined for a fit of so many Gaussians.
 
     Fewer Gaussians than one for 60 voxels are wider, by the cube root of what is missing. They show nothing that joined

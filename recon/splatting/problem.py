@@ -141,13 +141,15 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
     if factor > min(geometry.detector_shape):
         rows, cols = geometry.detector_shape
         raise ValueError(
-            f"binning={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set it to "
+            f"joined_pixels={factor} joins {factor} x {factor} pixels, and the detector has {rows} x {cols}: set it to "
             f"{min(rows, cols)} or less (1: the fit sees single pixels)"
         )
     return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
 
 
-def joined(projections: F32, weights: F32 | None, geometry: Geometry, factor: int) -> tuple[F32, F32 | None, Geometry]:
+def join_pixels(
+    projections: F32, weights: F32 | None, geometry: Geometry, factor: int
+) -> tuple[F32, F32 | None, Geometry]:
     """Views [view, row, col], their weights and geometry with factor x factor pixels joined.
 
     A joined pixel is the weighted mean of its pixels and has their mean weight, so that unmeasured ones do not count.

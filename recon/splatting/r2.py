@@ -146,7 +146,7 @@ class R2:
         rays = self.fit.rays
         if rays.exact_above < math.inf:
             rays = replace(rays, exact_above=0.0)  # so that the toy has exact rays, too
-        fit = replace(self.fit, policy=policy, rays=rays, binning=min(self.fit.binning or 1, 2))
+        fit = replace(self.fit, policy=policy, rays=rays, joined_pixels=min(self.fit.joined_pixels or 1, 2))
         return replace(self, steps=_TOY_STEPS, seconds=None, gaussians=_TOY_GAUSSIANS, early_stop=False, fit=fit)
 
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:

@@ -49,8 +49,8 @@ class FitSettings:
         truncation: where Gaussians end; a compact kernel ends by itself.
         smallest: least standard deviation, in pixels: point sampling sees nothing thinner.
         views_per_step: gradients of so many views are averaged.
-        binning: pixels of the views are joined by this factor for the fit, not for its finish. None joins as many as
-            Gaussians are wide, see `initialise.binning_for`: of large volumes alone.
+        joined_pixels: pixels of the views are joined by this factor for the fit, not for its finish. None joins as
+            many as Gaussians are wide, see `initialise.joined_for`: of large volumes alone.
         rays: the integral of a Gaussian along a ray; matters for cones.
         kernel: radial profile of the Gaussians, also by its name; a fit that starts from a model keeps the model's.
     """
@@ -67,13 +67,13 @@ class FitSettings:
     truncation: Truncation = field(default_factory=Truncation)
     smallest: float = 0.3
     views_per_step: int = 2
-    binning: int | None = None
+    joined_pixels: int | None = None
     rays: RayModel = field(default_factory=RayModel)
     kernel: Kernel = KERNEL
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kernel", Kernel(self.kernel))
-        for name in ("views_per_step", "binning", "tv_size"):
+        for name in ("views_per_step", "joined_pixels", "tv_size"):
             value = getattr(self, name)
             if value is None and name != "views_per_step":
                 continue

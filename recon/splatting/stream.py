@@ -54,11 +54,12 @@ class StreamingFit:
         template: geometry of all future views, with their shift, roll and tilt; its angles are ignored.
         grid: of the snapshots; None matches the detector. The fit itself covers all that the views see.
         gaussians: how many at the first placement; None derives it from the detector (see `default_count`).
-        settings: of the fit; `binning` is for fits whose views are all there.
+        settings: of the fit; `joined_pixels` is for fits whose views are all there.
         first_views, first_span: the fit starts when so many views, so many radians apart (modulo π), are there.
 
     Raises:
-        ValueError: for no Gaussians, settings with `binning`, or a template whose views differ in shift, roll or tilt.
+        ValueError: for no Gaussians, settings with `joined_pixels`, or a template whose views differ in shift, roll
+            or tilt.
     """
 
     def __init__(
@@ -79,10 +80,10 @@ class StreamingFit:
             raise ValueError(f"a model needs at least one Gaussian, got {gaussians}")
         self._count = gaussians
         self._settings = settings or WHILE_VIEWS_COME
-        if (self._settings.binning or 1) > 1:
+        if (self._settings.joined_pixels or 1) > 1:
             raise ValueError(
-                f"binning={self._settings.binning} joins pixels, which a fit that follows a scan does not do: bin the "
-                "scan, or leave `binning` out"
+                f"joined_pixels={self._settings.joined_pixels} is for a fit of a finished scan; this one follows a scan: "
+                "bin the scan, or leave it out"
             )
         self._first_views, self._first_span = first_views, first_span
         self._now, self._start = now, now()

@@ -153,7 +153,7 @@ def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [FitSettings(loss="l2"), FitSettings(loss="poisson"), FitSettings(binning=2),
+    [FitSettings(loss="l2"), FitSettings(loss="poisson"), FitSettings(joined_pixels=2),
      FitSettings(views_per_step=3)],
 )  # fmt: skip
 def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, settings: FitSettings) -> None:

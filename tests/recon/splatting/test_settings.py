@@ -12,13 +12,13 @@ from recon.base.kernel import Kernel
 from recon.base.ray_model import Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
-from recon.splatting.problem import joined
+from recon.splatting.problem import join_pixels
 from recon.splatting.settings import FitSettings, tv_size, tv_weight
 
 
 def test_settings_out_of_range_are_refused() -> None:
     for bad in (
-        {"views_per_step": 0}, {"binning": 0}, {"binning": 2.5}, {"tv_size": 0}, {"tv_weight": -1.0},
+        {"views_per_step": 0}, {"joined_pixels": 0}, {"joined_pixels": 2.5}, {"tv_size": 0}, {"tv_weight": -1.0},
         {"tv_weight": float("inf")}, {"ssim_weight": float("nan")}, {"pace": float("nan")}, {"pace": -1.0},
         {"decay": -1.0}, {"smallest": 0.0}, {"rates": (1e-3, 1e-3, 1e-3)},
         {"kernel": "box"},
@@ -49,7 +49,7 @@ def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generato
     settings, count = FitSettings(), flat.size // 24
     problem = fit.problem_of(data.astype(np.float32), views, grid, 0.7, settings)
     assert tv_weight(settings, problem, count) == pytest.approx(weight, rel=0.1)
-    binned, _, joined_views = joined(data.astype(np.float32), None, views, 2)
+    binned, _, joined_views = join_pixels(data.astype(np.float32), None, views, 2)
     rough = fit.problem_of(binned, joined_views, grid, 0.7, settings)
     assert tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
     assert tv_weight(FitSettings(tv_weight=0.0), problem, count) == 0

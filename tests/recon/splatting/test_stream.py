@@ -17,7 +17,7 @@ from recon.splatting import stream
 from recon.splatting.anytime import WHILE_VIEWS_COME
 from recon.splatting.density_control import DensityPolicy
 from recon.splatting.gaussians import Gaussians
-from recon.splatting.initialise import binning_for, count_for
+from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.splatting.stream import StreamingFit
@@ -113,8 +113,8 @@ def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phant
     found = model.gaussians
     assert found is not None and found.kernel is Kernel.GAUSSIAN
     assert psnr(phantom.attenuation(GRID), model.snapshot().data) > 20
-    with pytest.raises(ValueError, match="or leave `binning` out"):
-        recon.R2(fit=FitSettings(binning=2)).stream(VIEWS, 0, StepClock())
+    with pytest.raises(ValueError, match="bin the scan, or leave it out"):
+        recon.R2(fit=FitSettings(joined_pixels=2)).stream(VIEWS, 0, StepClock())
 
 
 def test_it_waits_for_views_that_are_apart(data: np.ndarray) -> None:
@@ -294,8 +294,8 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
 
 
 def test_a_setting_that_would_do_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="binning=2 joins pixels, which a fit that follows"):
-        StreamingFit(VIEWS, GRID, settings=FitSettings(binning=2))
+    with pytest.raises(ValueError, match="joined_pixels=2 is for a fit of a finished scan"):
+        StreamingFit(VIEWS, GRID, settings=FitSettings(joined_pixels=2))
 
 
 @pytest.mark.parametrize("marred", [3, 30])  # among the first views, and after the model has been placed
@@ -345,10 +345,10 @@ def test_pixels_are_joined_as_gaussians_are_wider() -> None:
     """Eight times too few Gaussians for the volume are twice as wide; a cone's, which cover surfaces, four times."""
     field, detector = Grid((160, 448, 448)), (160, 448)  # at most 420 000 Gaussians by the rule
     usual = np.pi / 4 * 160 * 448**2 / 60
-    assert [binning_for(field, False, round(usual / n), detector) for n in (1, 7, 9, 26, 28)] == [1, 1, 2, 2, 3]
+    assert [joined_for(field, False, round(usual / n), detector) for n in (1, 7, 9, 26, 28)] == [1, 1, 2, 2, 3]
     surface = (160 * 448**2) ** (2 / 3)
-    assert [binning_for(field, True, round(surface / n), detector) for n in (1, 3, 5, 10)] == [1, 1, 2, 3]
-    assert binning_for(field, False, 10, (1, 448)) == 1 and binning_for(field, False, 10, (8, 448)) == 2
+    assert [joined_for(field, True, round(surface / n), detector) for n in (1, 3, 5, 10)] == [1, 1, 2, 3]
+    assert joined_for(field, False, 10, (1, 448)) == 1 and joined_for(field, False, 10, (8, 448)) == 2
 
 
 def test_a_model_moves_with_its_axis_to_where_the_views_have_it(data: np.ndarray, phantom: Phantom) -> None:
