@@ -82,7 +82,7 @@ class StreamingFit:
         self._settings = settings or WHILE_VIEWS_COME
         if (self._settings.joined_pixels or 1) > 1:
             raise ValueError(
-                f"joined_pixels={self._settings.joined_pixels} is for a fit of a finished scan; this one follows a scan: "
+                f"joined_pixels={self._settings.joined_pixels} is for a fit of a finished scan; this one follows one: "
                 "bin the scan, or leave it out"
             )
         self._first_views, self._first_span = first_views, first_span
