@@ -79,8 +79,8 @@ def count_for(field: Grid, cone: bool) -> int:
 def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
     """The factor by which pixels [row, col] are joined for a fit of so many Gaussians.
 
-    Fewer Gaussians than one for 60 voxels are wider, by the cube root of what is missing. They show nothing that joined
-    pixels do not. Of a cone they cover surfaces: the square root. At least four rows are left.
+    Where there are fewer Gaussians than one for 60 voxels, each is wider, by the cube root of the ratio. Those of a
+    cone cover surfaces, and are wider by its square root. Pixels as wide show all of them. At least four rows remain.
     """
     wider = (_count_of(field, cone) / count) ** (1 / 2 if cone else 1 / 3)
     return max(1, min(int(wider), detector[0] // _LEAST_JOINED, detector[1] // _LEAST_JOINED))

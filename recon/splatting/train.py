@@ -128,11 +128,11 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     start, pixel_grid = method.gaussians, Grid.for_fit(geometry, problem.grid)
     usual = default_count(views, pixel_grid.voxel_size)
     count = start.n if isinstance(start, Gaussians) else usual if start is None else start
-    side = settings.joined_pixels or joined_for(
+    joined = settings.joined_pixels or joined_for(
         pixel_grid, geometry.is_cone, max(count, usual), geometry.detector_shape
     )  # fmt: skip
     measured, trusted = data[used], None if weights is None else weights[used]
-    p, known, seen = join_pixels(measured, trusted, views, side)
+    p, known, seen = join_pixels(measured, trusted, views, joined)
     field_grid = Grid.for_fit(seen, problem.grid, wider=wider)
     end = math.inf if method.seconds is None else begin + method.seconds
     if control.resume is None:
@@ -152,7 +152,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     unseen = None
     if kept_back.size:
         others = None if weights is None else weights[kept_back]
-        q, others, apart = join_pixels(data[kept_back], others, geometry.select(kept_back), side)
+        q, others, apart = join_pixels(data[kept_back], others, geometry.select(kept_back), joined)
         unseen = fit.problem_of(q, apart, field_grid, unit, settings, backend, others)
     tracker = _HeldOutTracker.over(unseen, settings, state.step, control.resume or {})
 
@@ -163,7 +163,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     schedule = Schedule(method.planned_steps, seconds, by_content)
     schedule = Schedule.resumed(schedule, control.resume or {})
     # The trial costs more than all steps on joined pixels.
-    tries_finish = by_content and method.finish is None and side == 1
+    tries_finish = by_content and method.finish is None and joined == 1
     tries_finish = tries_finish and not (wider or method.early_stop or seen.is_cone)
     fitted = replace(problem, projections=measured, geometry=told.select(used), use=DataUse(trusted))
     history: list[Progress] = []
@@ -243,7 +243,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Me
     record = {
         **asdict(settings), "kernel": state.kernel, "steps": state.step, "seed": problem.seed, "start": method.start,
         "gaussians_at_start": n_start, "gaussians": state.n, "held_out": held_out, "device": problem.device,
-        "finish": sweeps, "joined_pixels": side, "tv_weight": tv_weight(settings, fitting, state.limit),
+        "finish": sweeps, "joined_pixels": joined, "tv_weight": tv_weight(settings, fitting, state.limit),
         "tv_size": tv_size(settings, field_grid),
     }  # fmt: skip
     checkpoint = arrays_of(last, backend) | tracker.arrays() | schedule.arrays()

@@ -19,7 +19,7 @@ from recon.voxels.noise_balance import NoiseBalance
 from recon.voxels.ordered_fista import Subsets, bregman, ordered_fista
 from recon.voxels.projector import Projector
 from recon.voxels.sweeps import whitened
-from recon.voxels.voxel_problem import VoxelProblem
+from recon.voxels.voxel_problem import VoxelProblem, slices_are_rows
 
 PREFERRED = "preferred"
 """Name of the decision on the weight that views held out prefer."""
@@ -269,11 +269,8 @@ def residuals_of_rounds(
     A round that takes them farther away, or leaves a residual that is not `within` these bounds, is the last. Empty
     where slices are not those of rows.
     """
-    geometry, grid = problem.projector.geometry, problem.projector.grid
-    rows = Grid.matching(geometry)
-    same = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
     errors: list[float] = []
-    if not (same and geometry.rows_show_slices):
+    if not slices_are_rows(problem.projector):
         return errors
     trial = _Trial.of(problem, start)
     x = trial.start.copy()

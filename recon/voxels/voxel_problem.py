@@ -106,10 +106,12 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
 
     For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
     So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side.
-    Where each row sees a slice of its own, and alike, sixteen of them tell it.
+    Where each row sees one slice, and all rows are alike, it is computed on sixteen rows.
     """
-    if weight is None and _rows_are_alike(projector):
-        some, grid = projector.geometry.rows(0, _ROWS), projector.grid
+    geometry, slices = projector.geometry, projector.grid.shape[0]
+    alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
+    if alike and slices > _ROWS:
+        some, grid = geometry.rows(0, _ROWS), projector.grid
         centre = (Grid.matching(some).centre[0], *grid.centre[1:])
         box = replace(grid, shape=(_ROWS, *grid.shape[1:]), centre=centre)
         projector = Projector(some, box)
@@ -129,12 +131,12 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     return bound
 
 
-def _rows_are_alike(projector: Projector) -> bool:
-    """Each of more than sixteen rows sees one slice of the grid, as every other row does."""
+def slices_are_rows(projector: Projector) -> bool:
+    """Each slice of the grid is what one row of the views sees."""
     geometry, grid = projector.geometry, projector.grid
     rows = Grid.matching(geometry)
-    of_rows = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
-    return of_rows and grid.shape[0] > _ROWS and geometry.rows_show_slices and not (geometry.skew or geometry.width)
+    same = (grid.shape[0], grid.spacing[0], grid.centre[0]) == (rows.shape[0], rows.spacing[0], rows.centre[0])
+    return same and geometry.rows_show_slices
 
 
 def iterative_memory(
