@@ -140,8 +140,8 @@ def primal(
 def dual_field(shape: tuple[int, int, int]) -> DualField:
     """Zeros [a, b, c] for the differences along each axis: at i, that from i to i + 1.
 
-    Each begins some cache lines later than a multiple of its size. Else the fields of 1024 x 1024 x 64 voxels, and
-    rows within them, lie a power of two apart, share one set of the cache, and take three times as long.
+    Each begins some cache lines later than a multiple of its size. Fields a power of two apart share one set of the
+    cache: a step of 1024 x 1024 x 64 voxels took three times as long.
     """
     size = math.prod(shape)
     room = np.zeros(3 * (size + _APART), np.float32)
