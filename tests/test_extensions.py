@@ -14,6 +14,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.extension_dummies import EXTENSIONS
 
 ROOT = Path(__file__).parents[1]
@@ -35,6 +37,7 @@ print(json.dumps(failed))
 """
 
 
+@pytest.mark.slow
 def test_an_extension_is_its_own_files_and_one_line_of_each_registry(tmp_path: Path) -> None:
     for package in PACKAGES:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.nb?", "*.pyc.*"))

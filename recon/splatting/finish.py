@@ -24,8 +24,10 @@ from recon.splatting.initialise import goes_on_beyond, leaves_the_field
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.held_out_weight import (
+    Preferred,
     bregman_weight,
     choose_weight,
+    preferred_residual,
     preferred_sweeps,
     preferred_weight,
     residuals_of_rounds,
@@ -130,13 +132,15 @@ class _FromModel:
     trial: FinishTrial | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        known = None if self.trial is None else math.ldexp(self.trial.weight, -_power(problem))
+        known, ended = None, 0
+        if self.trial is not None:
+            known = Preferred(math.ldexp(self.trial.weight, -_power(problem)), self.trial.residual)
+            ended = self.trial.sweeps
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled, known=known)
         if self.by_content and not (self.watch.ended or isinstance(weight, NoiseBalance)):
-            mu, ended = weight, self.trial.sweeps if self.trial else 0
+            mu, residual = weight, preferred_residual(problem.decide)
             self.iterations = problem.decide("sweeps", lambda: ended or preferred_sweeps(problem, x, mu, SWEEPS))
             once = self.iterations > SWEEPS or self.watch.ended
-            residual = None if self.trial is None else self.trial.residual
             heavy = None if once else problem.decide("heavy", lambda: bregman_weight(problem, mu, residual))
             if heavy is not None:
                 self.iterations = 2 * SWEEPS

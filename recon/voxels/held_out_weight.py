@@ -140,12 +140,12 @@ def choose_weight(
     modelled: bool,
     unmodelled: float | None = None,
     of_cones: bool = False,
-    known: float | None = None,
+    known: Preferred | None = None,
 ) -> NoiseBalance | float:
     """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`.
 
-    `of_cones`: views of a cone are held out, too. `known`: the weight that they prefer, found before. What
-    `preferred_weight` finds is a decision of its own, PREFERRED, which holds for other methods on the same views.
+    `of_cones`: views of a cone are held out, too. `known`: what `preferred_weight` found before. What it finds is a
+    decision of its own, PREFERRED, which holds for other methods on the same views; see `preferred_residual`.
     """
 
     @cache
@@ -157,16 +157,22 @@ def choose_weight(
         if of_cones and problem.projector.geometry.is_cone:
             found = heaviest_weight(problem, balance().first)
         elif unmodelled is None:
-            found = problem.decide(PREFERRED, lambda: known or _preferred(problem, balance().first))
+            preferred = problem.decide(PREFERRED, lambda: _plain(known or preferred_weight(problem, balance().first)))
+            found = None if preferred is None else preferred[0]
         return [balance().first, balance().noise] if found is None else [found]
 
     first, *noise = problem.decide("weight", chosen)
     return NoiseBalance(first, noise[0], unmodelled is not None) if noise else first
 
 
-def _preferred(problem: VoxelProblem, first: float) -> float | None:
-    found = preferred_weight(problem, first)
-    return None if found is None else found.weight
+def _plain(preferred: Preferred | None) -> list[float] | None:
+    return None if preferred is None else list(preferred)
+
+
+def preferred_residual(decide: Decisions) -> float | None:
+    """Residual of views held out, with the weight that `choose_weight` took last; None: they preferred none."""
+    preferred = (decide.made.get(PREFERRED) or [None])[-1]
+    return None if preferred is None else float(preferred[1])
 
 
 def preferred_weight(problem: VoxelProblem, first: float) -> Preferred | None:

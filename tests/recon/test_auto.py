@@ -74,19 +74,19 @@ def test_another_slab_takes_the_method_that_the_first_one_chose(data: F32) -> No
 
 def test_the_weight_that_one_trial_finds_is_that_of_all_trials(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two methods are tried, and one of them reconstructs the whole, whose weight is sought anew: two searches."""
-    found = list[float]()
+    found = list[Preferred]()
 
     def counted(problem: VoxelProblem, first: float) -> Preferred | None:
         preferred = preferred_weight(problem, first)
         assert preferred is not None
-        found.append(preferred.weight)
+        found.append(preferred)
         return preferred
 
     monkeypatch.setattr(held_out_weight, "preferred_weight", counted)
     decide, auto = Decisions(), Auto((FistaTv(iterations=4), FistaTv(iterations=5)))
     recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=decide))
     assert len(found) == 2
-    assert decide.made[PREFERRED] == found[1:] and decide.made["weight"] == [found[1:]]
+    assert decide.made[PREFERRED] == [list(found[1])] and decide.made["weight"] == [[found[1].weight]]
     recon.reconstruct(data, VIEWS, auto, control=recon.RunControl(decide=Decisions(0, decide.made)))  # another slab
     assert len(found) == 2
 
@@ -95,8 +95,9 @@ def test_a_weight_by_the_noise_is_not_passed_on() -> None:
     """It follows from sums over a volume, and views of a cone have no other."""
     assert shared_decisions({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]], PREFERRED: [None], "sweeps": [8]}) == {}
     assert shared_decisions({"units": [(1, 1, 1)], "weight": [[0.1, 0.2]]}) == {}
-    made: dict[str, list[Any]] = {"units": [(1, 1, 1), (2, 2, 2)], PREFERRED: [0.1], "sweeps": [8], "restart": [True]}
-    assert shared_decisions(made) == {"units": [(1, 1, 1)], PREFERRED: [0.1]}
+    found, units = [[0.1, 2.0]], [(1, 1, 1), (2, 2, 2)]
+    made: dict[str, list[Any]] = {"units": units, PREFERRED: found, "sweeps": [8], "restart": [True]}
+    assert shared_decisions(made) == {"units": units[:1], PREFERRED: found}
 
 
 def test_a_blurred_volume_is_not_preferred_to_a_sharp_one(data: F32, truth: F32) -> None:

@@ -51,7 +51,14 @@ def error(volume: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("cone", [False, True])
-@pytest.mark.parametrize("name", [name for name in methods.names() if name not in LIKE_OTHERS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name == "naf"))
+        for name in methods.names()
+        if name not in LIKE_OTHERS
+    ],
+)
 def test_poses_that_are_known_better_the_volume(
     name: str, cone: bool, rng: np.random.Generator, request: pytest.FixtureRequest
 ) -> None:

@@ -189,6 +189,7 @@ def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.ini
     assert psnr(truth, result.volume.data) > baseline + 1
 
 
+@pytest.mark.slow
 def test_tilted_views_are_fitted_as_they_are(phantom: Phantom, noisy: np.ndarray) -> None:
     start = recon.reconstruct(noisy, VIEWS, R2(steps=200, gaussians=2000)).gaussians
     assert start is not None

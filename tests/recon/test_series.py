@@ -55,6 +55,7 @@ def test_shares_are_those_of_linear_interpolation() -> None:
     assert np.array_equal(hats([1.0, 2.0, 3.5, 6.0, 9.0], knots), expected)
 
 
+@pytest.mark.slow
 def test_the_residual_is_that_of_the_series_in_the_views() -> None:
     views = views_of(60, noise=0.05)
     found = fit_series(views, 3, motion=True, tv_weight=0.15)
@@ -133,6 +134,7 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
     assert first.volumes.dtype == np.float32
 
 
+@pytest.mark.slow
 def test_views_held_out_tell_a_sample_that_moves_from_one_that_changes_in_place() -> None:
     fading = views_of(60, noise=0.05)
     projector = Projector(fading.geometry, Grid.matching(fading.geometry))
@@ -146,6 +148,7 @@ def test_views_held_out_tell_a_sample_that_moves_from_one_that_changes_in_place(
         assert (found.motion is not None) == (with_motion < without) == moving
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("motion", "stages"), [(None, 2), (False, 1), (True, 2)])
 def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: int) -> None:
     """Weights, then whether it moves (here not), or the motion itself."""

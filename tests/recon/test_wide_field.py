@@ -40,6 +40,7 @@ def test_the_box_is_what_the_full_turn_sees_whatever_views_are_taken() -> None:
     assert recon.Grid.matching(middle).shape == (2, COLS, COLS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [

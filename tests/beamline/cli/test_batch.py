@@ -159,6 +159,7 @@ def test_the_worker_gives_the_exit_codes_of_the_command(tmp_path: Path) -> None:
     assert recon_worker.run(["config", "init"]) == 0
 
 
+@pytest.mark.slow
 def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_kept_and_named(folder: Path) -> None:
     Path("recipe.yaml").write_text("method: fbp\nmax-residual: 1e-6\n")
     (row,) = run_batch(BatchOptions([Path("scan.h5")], Path("recipe.yaml"), Path("out")), lambda _: None, SystemClock())

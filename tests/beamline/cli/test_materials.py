@@ -137,7 +137,7 @@ def test_a_line_of_blanks_in_the_table_is_no_line(tmp_path: Path) -> None:
     assert list(read_spectra(tmp_path / "table.csv").at(8.35)) == pytest.approx([1.5])
 
 
-@pytest.mark.parametrize(("larger", "code"), [(1.04, 0), (1.2, 2)])
+@pytest.mark.parametrize(("larger", "code"), [pytest.param(1.04, 0, marks=pytest.mark.slow), (1.2, 2)])
 def test_a_scan_of_larger_pixels_is_interpolated_to_those_of_the_first(
     scans: list[Path], tmp_path: Path, larger: float, code: int
 ) -> None:
@@ -237,6 +237,7 @@ def test_a_source_within_the_field_is_refused(scans: list[Path], tmp_path: Path)
     assert not list(tmp_path.glob("out*"))
 
 
+@pytest.mark.slow
 def test_a_sample_that_moved_between_the_scans_is_registered(tmp_path: Path) -> None:
     """By two pixels along x and one along y in the third scan."""
     made = []

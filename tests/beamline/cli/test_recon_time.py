@@ -170,6 +170,7 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     assert not left(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_stop_during_the_fit_writes_the_volumes_so_far(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

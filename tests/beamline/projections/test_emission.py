@@ -172,6 +172,7 @@ def test_views_added_are_the_counts_of_both(pet: Path) -> None:
     assert alone.survival is not None and (alone.survival == 2).all() and alone.background is None
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(240)
 def test_a_trade_off_reconstructs_counts(pet: Path, tmp_path: Path) -> None:
     """By the commands, beside the truth: osem of the trade-off is osem of `recon`."""
@@ -186,6 +187,7 @@ def test_a_trade_off_reconstructs_counts(pet: Path, tmp_path: Path) -> None:
         assert base["metrics"][name] == pytest.approx(figures[name], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_row_of_a_study_adds_the_counts_of_its_windows(pet: Path, tmp_path: Path) -> None:
     with open_scan(pet) as source:
         prepared = prepare_projections(source, Selection(), pytest.fail)

@@ -256,6 +256,7 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
         read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
 
 
+@pytest.mark.slow
 def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> None:
     roll, tilt = np.radians(TURNS.T)
     angles, shift = 2 * np.radians(DEGREES), 6 * np.linspace(-1, 1, N)

@@ -379,6 +379,7 @@ def run_plain(options: ReconOptions, tmp_path: Path) -> dict[str, object]:
     return dict(events[-1].data)
 
 
+@pytest.mark.slow
 def test_a_real_budget_of_processor_seconds(prepared: PreparedProjections) -> None:
     """Four seconds, and a tenth of grace; other work on the machine does not count. That the time is used up, the
     first test shows."""

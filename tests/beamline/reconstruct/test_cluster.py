@@ -62,6 +62,7 @@ def test_the_work_of_a_lost_worker_is_done_again(two: Cluster, tmp_path: Path) -
     np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, views, Sirt(iterations=3)).volume.data)
 
 
+@pytest.mark.slow
 def test_the_volume_is_that_without_a_cluster_to_the_bit(
     two: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
 ) -> None:

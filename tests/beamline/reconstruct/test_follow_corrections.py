@@ -247,6 +247,7 @@ def test_nothing_is_corrected_twice_where_all_references_came_first(
     assert len(corrected) == 30 and len(set(corrected)) == 30
 
 
+@pytest.mark.slow
 def test_the_newest_view_does_not_wait_for_the_next_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock, fed, arrived = ScanClock(), dict[int, float](), dict[int, float]()
     add, append = StreamingFit.add_views, NXtomoWriter.append

@@ -113,6 +113,7 @@ def _write_and_wait(path: Path, written: ProcessEvent) -> None:
     multiprocessing.get_context("spawn").Event().wait()
 
 
+@pytest.mark.slow
 def test_a_writer_that_is_killed_leaves_views_as_good_as_those_of_a_scan_that_was_stopped(tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
     written = spawn.Event()

@@ -73,6 +73,7 @@ def test_flags_and_line_integrals_as_in_memory(tmp_path: Path, monkeypatch: pyte
     np.testing.assert_array_equal(a["view_weights"], b["view_weights"])
 
 
+@pytest.mark.slow
 def test_no_more_memory_is_taken_than_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All that numpy allocates; views and volume alone are three times as much."""
     monkeypatch.chdir(tmp_path)

@@ -120,7 +120,7 @@ def test_each_energy_has_a_scan_and_all_of_them_give_the_materials(config: Path,
             assert inside == pytest.approx(float(grain == name), abs=0.15)
 
 
-@pytest.mark.parametrize("at", [3, 22 + 2, 22 + 14])
+@pytest.mark.parametrize("at", [22 + 2, *(pytest.param(at, marks=pytest.mark.slow) for at in (3, 22 + 14))])
 def test_a_series_that_was_stopped_goes_on(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
@@ -233,6 +233,7 @@ def test_documents_of_a_series_are_refused(config: Path, tmp_path: Path) -> None
     assert ended.exit_code == 2 and "leave it out with scan.energies" in ended.stderr
 
 
+@pytest.mark.slow
 def test_a_series_is_a_spectrum(config: Path, tmp_path: Path) -> None:
     """The mean of a region over the views of each energy has the edge of the grains."""
     energies = [round(8.33 + 0.002 * n, 4) for n in range(13)]

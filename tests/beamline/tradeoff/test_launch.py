@@ -67,6 +67,7 @@ def test_kernels_are_compiled_once_for_each_method_start_loss_and_profile(
     assert job["data"] == str(tmp_path / "data.npz")  # whose geometry decides which kernels are used
 
 
+@pytest.mark.slow
 def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     """Its memory is its own: this process, which has more, does not show in it."""
     views = Geometry.parallel(SCAN.angles, SCAN.shape)

@@ -56,7 +56,10 @@ def assert_closed(mesh: Mesh) -> None:
 
 @pytest.mark.parametrize(
     ("inside", "distance", "volume"),
-    [(in_sphere, from_sphere, 4 / 3 * np.pi * 0.3**3), (in_cube, from_cube, 0.44**3)],
+    [
+        pytest.param(in_sphere, from_sphere, 4 / 3 * np.pi * 0.3**3, marks=pytest.mark.slow),
+        (in_cube, from_cube, 0.44**3),
+    ],
 )
 def test_a_sphere_and_a_turned_cube_within_a_tenth_of_a_voxel(inside: object, distance: object, volume: float) -> None:
     data = 3 * shares(inside)

@@ -118,6 +118,7 @@ def test_cpu_projection_and_gradients_equal_the_reference(
         assert float(off) < 2e-5 * float(gradient.abs().max()), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beam", [STRAIGHT, LEANING, CONE], ids=["straight", "leaning", "cone"])
 def test_a_width_is_the_mean_over_pixels_and_angles(beam: Geometry, random_gaussians: Make) -> None:
     # Rays without a width, many within each pixel and within the exposure. What is left of their difference are moments

@@ -35,6 +35,7 @@ def test_lines_are_chords_of_the_cylinders() -> None:
     assert not made.background.any() and (made.efficiency == 1).all()
 
 
+@pytest.mark.slow
 def test_counts_have_the_mean_and_the_variance_that_is_told() -> None:
     phantom, scanner = NemaPhantom(), Scanner(trues=2e5)
     drawn = [events(phantom, DETECTOR, ANGLES, scanner, seed) for seed in range(200)]
