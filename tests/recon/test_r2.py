@@ -70,6 +70,7 @@ def test_views_held_out_are_measured_and_not_fitted(noisy: np.ndarray) -> None:
     assert other.history[-1].held_out > 3 * kept.history[-1].held_out > 0
 
 
+@pytest.mark.slow
 def test_a_fit_may_end_where_views_held_out_stop_getting_better(noisy: np.ndarray) -> None:
     loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)
     use = DataUse(held_out=tuple(range(0, 24, 4)))
@@ -108,6 +109,7 @@ def test_checkpoints_are_handed_out_as_the_fit_goes_on(noisy: np.ndarray) -> Non
     np.testing.assert_array_equal(rest.volume.data, whole.volume.data)
 
 
+@pytest.mark.slow
 def test_early_stopping_goes_on_where_a_fit_was_left(noisy: np.ndarray) -> None:
     # The best model so far was the first one; a fit that was interrupted later must still give it back.
     loud = noisy + np.random.default_rng(0).normal(0, 0.3, noisy.shape).astype(np.float32)

@@ -72,6 +72,7 @@ def test_shifts_between_energies_are_found_and_the_charge_with_them() -> None:
     assert errors[1] < 0.5 * errors[0] and errors[1] < 1.3 * errors[2]
 
 
+@pytest.mark.slow
 def test_the_image_of_other_optics_is_that_of_the_reference() -> None:
     """The sample stands elsewhere, too; the image is shifted by up to 2 pixels and magnified by up to 3 %."""
     fine, images, magnified = grains(), np.array([0, 1.5, -1, 0.5, 2]), np.array([0, 0.02, -0.015, 0.01, -0.03])

@@ -78,15 +78,8 @@ def _late(kind: str, warm: str) -> list[str]:
     return done.stdout.removeprefix("late:").split()
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param("parallel", marks=pytest.mark.slow),
-        pytest.param("parallel, some views lean, all are shifted, weights", marks=pytest.mark.slow),
-        pytest.param("cone", marks=pytest.mark.slow),
-        _EXACT,
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["parallel", "parallel, some views lean, all are shifted, weights", "cone", _EXACT])
 def test_a_fit_after_warm_up_compiles_nothing(kind: str) -> None:
     assert _late(kind, _OF_THE_FIT) == []
 

@@ -40,6 +40,7 @@ def read(path: Path, name: str) -> np.ndarray:
         return np.asarray(file[f"entry/reconstruction/parameters/{name}"][()])
 
 
+@pytest.mark.slow
 def test_poses_of_a_volume_come_back_as_a_table_that_gives_the_same_volume(tmp_path: Path, real_pictures: None) -> None:
     path = scan(tmp_path, posed())
     code, said = run("recon", path, "--poses", every(tmp_path), *FEW, "--bin", "2", "-o", tmp_path / "a.h5")

@@ -34,6 +34,7 @@ def said(result: Result) -> Any:
     return json.loads(result.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_edges_of_a_scene_move_up_with_the_charge(tmp_path: Path, real_pictures: None) -> None:
     """By 2 eV for nickel from fresh to charged, as the scene has it; the picture and the table have all states."""
     done = beamline(

@@ -125,6 +125,7 @@ SOD, SDD = 1.0, 3.0
 CONE = BALL | {"beam": {"photons_per_s": 1.0e5, "sod": SOD, "sdd": SDD}, "axis_offset_px": 1.5}
 
 
+@pytest.mark.slow
 def test_the_file_of_a_cone_gives_back_the_sample_where_it_stands(tmp_path: Path) -> None:
     wanted = ("optics.axis_col=21", "scan.angles={scheme: fixed, views: 60, span_deg: 360}")
     result = run_scan(_config(CONE, *wanted), tmp_path)

@@ -109,6 +109,7 @@ def test_fbp_is_the_object_in_inverse_millimetres(tmp_path: Path) -> None:
     assert [e.event for e in events if e.event != "progress"] == ["recon_started", "done"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("real_pictures")
 def test_r2_grows_from_the_same_views_and_is_compared_with_fbp(tmp_path: Path) -> None:
     events: list[Event] = []

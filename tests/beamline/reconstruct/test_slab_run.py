@@ -129,6 +129,7 @@ def test_what_a_killed_call_left_beside_its_output_is_in_nobodys_way(folder: Pat
     assert left(folder) == {"scan.h5", "out.h5"} and beamline("validate", "out.h5").exit_code == 0
 
 
+@pytest.mark.slow
 def test_other_data_or_options_are_refused_and_nothing_is_touched(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

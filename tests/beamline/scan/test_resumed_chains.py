@@ -242,6 +242,7 @@ def _beamline(*words: str | Path) -> tuple[int, str]:
     return said.exit_code, said.output
 
 
+@pytest.mark.slow
 def test_every_command_refuses_a_joined_file_that_lacks_a_part(stale: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.h5"
     for words in (

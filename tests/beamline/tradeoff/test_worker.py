@@ -229,6 +229,7 @@ def test_as_a_process_it_speaks_lines_of_json(tmp_path: Path, data: Data, capsys
     assert last["event"] == "failed" and "no matter" in last["message"]
 
 
+@pytest.mark.slow
 def test_it_ends_when_whoever_wanted_its_result_is_gone() -> None:
     program = "import time; from beamline.tradeoff.worker import end_with; end_with(0); print('up', flush=True); "
     command = [sys.executable, "-c", program + "time.sleep(100)"]

@@ -225,6 +225,7 @@ def test_order_and_whole_turns_of_the_angles_do_not_matter(order: list[int], tur
     np.testing.assert_allclose(project(g, odd), project(g, VIEWS)[order], atol=2e-6)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_angles_in_any_order_and_range(clean: F32, truth: F32) -> None:
     rng = np.random.default_rng(4)
     order = rng.permutation(32)

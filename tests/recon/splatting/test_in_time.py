@@ -50,6 +50,7 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
     assert found == [(8, 350.0, True), (None, 745.0, True)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_the_seconds_bound_start_steps_finish_and_volume(data: np.ndarray) -> None:
     """In processor seconds: the time beyond them is at most that of a sweep, or of what measures it."""

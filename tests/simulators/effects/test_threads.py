@@ -69,6 +69,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch, m
     np.testing.assert_array_equal(frames[0], frames[2])
 
 
+@pytest.mark.slow
 def test_frames_may_be_made_in_several_threads_at_once() -> None:
     """Numba's simplest layer of threads, the only one on some machines, ends the process where two enter it."""
     numba = {"NUMBA_THREADING_LAYER": "workqueue", "NUMBA_NUM_THREADS": "2"}
