@@ -28,16 +28,11 @@ class TotalVariationProx:
     """
 
     def __init__(self, shape: tuple[int, int, int], weights: tv_cpu.Weights, nonnegative: bool, steps: int) -> None:
-        # Of one slice the kernels see [y, z, x]: the last axis is the vector's. They turn along y alone.
-        order = (0, 2, 1) if shape[2] == 1 else (0, 1, 2)
-        self._shape = (shape[order[0]], shape[order[1]], shape[order[2]])
-        self._weights = (weights[order[0]], weights[order[1]], weights[order[2]])
-        self._dual, self._scratch = tv_cpu.dual_field(self._shape), tv_cpu.dual_scratch(self._shape)
+        self._weights, self._dual, self._scratch = weights, tv_cpu.dual_field(shape), tv_cpu.dual_scratch(shape)
         self._nonnegative, self._steps, self._turn = nonnegative, steps, 0
 
     def __call__(self, x: F32, threshold: float) -> None:
         """Replace x [y, x, z] by the proximal point; `threshold` in the unit of x, 0 or more."""
-        x = x.reshape(self._shape)
         if threshold > 0:
             given, back = (threshold, self._weights, self._nonnegative, self._scratch), _BACK[self._turn]
             for _ in range(self._steps):

@@ -20,94 +20,123 @@ from recon.kernels.cpu.activation import F32, OPTIONS
 _f = np.float32
 _NO_FLOOR = -3.0e38
 _APART = 17 * 16  # values: 17 lines of the cache
+_PIECE = 512  # voxels of one loop, about
 Weights = tuple[float, float, float]
 DualField = tuple[F32, F32, F32]
 
 
 class DualScratch(NamedTuple):
-    """One plane [run, b, c + 1], and two [run, 2, b, c + 1], for each run of planes that one thread makes."""
+    """One plane [run, b c + 1], and two [run, 2, b c + 1], for each run of planes that one thread makes."""
 
     plane: F32
     planes: F32
 
 
-@njit(fastmath=True, error_model="numpy", cache=True)
-def _primal_plane(x, pa, pb, pc, i, threshold, w0, w1, w2, floor, zero, out):
-    """Plane i of max(x - threshold Dᵀ p, floor) into out [b, c + 1]; the last column is repeated."""
-    nb, nc = x.shape[1], x.shape[2]
-    for j in range(nb):
-        here, row = x[i, j], out[j]
-        p0, p1, p2 = pa[i, j], pb[i, j], pc[i, j]
-        before0 = pa[i - 1, j] if i > 0 else zero
-        before1 = pb[i, j - 1] if j > 0 else zero
-        row[0] = max(here[0] - threshold * (w0 * (before0[0] - p0[0]) + w1 * (before1[0] - p1[0]) - w2 * p2[0]), floor)
-        for k in range(1, nc):
-            pull = w0 * (before0[k] - p0[k]) + w1 * (before1[k] - p1[k]) + w2 * (p2[k - 1] - p2[k])
-            row[k] = max(here[k] - threshold * pull, floor)
-        row[nc] = row[nc - 1]
+# The kernels see planes [b c], in pieces of some rows: of rows of sixteen voxels, what goes before a loop takes longer
+# than the loop. They rely on fields that are zero where there is no difference: p2 at the end of each row.
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
-def _dual_plane(pa, pb, pc, v, pair, near, far, here, back1, s0, s1, s2):
+def _primal_plane(x, pa, pb, pc, i, nc, threshold, w0, w1, w2, floor, zero, out):
+    """Plane i of max(x - threshold Dᵀ p, floor) into out [b c]."""
+    size = x.shape[1]
+    here, p0, p1, p2 = x[i], pa[i], pb[i], pc[i]
+    before0 = pa[i - 1] if i > 0 else zero
+    out[0] = max(here[0] - threshold * (w0 * (before0[0] - p0[0]) - w1 * p1[0] - w2 * p2[0]), floor)
+    step = max(1, _PIECE // nc) * nc
+    end = 1
+    while end < size:
+        start, end = end, nc if end < nc else min(end + step, size)
+        h, q0, q1, q2, row = here[start:end], p0[start:end], p1[start:end], p2[start:end], out[start:end]
+        b0, b2 = before0[start:end], p2[start - 1 : end - 1]
+        b1 = zero[start:end] if start < nc else p1[start - nc : end - nc]
+        for k in range(h.size):
+            pull = w0 * (b0[k] - q0[k]) + w1 * (b1[k] - q1[k]) + w2 * (b2[k] - q2[k])
+            row[k] = max(h[k] - threshold * pull, floor)
+
+
+@njit(inline="always")
+def _dual_piece(p0, p1, p2, near0, far0, near1, far1, here, after, s0, s1, steps):
+    """The differences of one piece of a plane; `steps` is 0 for the last of each row."""
+    for k in range(p0.size):
+        q0 = p0[k] + s0 * (far0[k] - near0[k])
+        q1 = p1[k] + s1 * (far1[k] - near1[k])
+        q2 = p2[k] + steps[k] * (after[k] - here[k])
+        shrink = _f(1) / max(_f(1), np.sqrt(q0 * q0 + q1 * q1 + q2 * q2))
+        p0[k], p1[k], p2[k] = q0 * shrink, q1 * shrink, q2 * shrink
+
+
+@njit(fastmath=True, error_model="numpy", cache=True)
+def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, steps):
     """The differences that belong to the voxels of plane v: from u `near` to `far` at `pair`, and within `here`."""
-    nb, nc = pb.shape[1], pb.shape[2]
-    for j in range(nb):
-        start = j - back1 if j >= back1 else nb - 1  # from the last row there is no difference: 0, and stays so
-        row, near0, far0, near1, far1 = here[j], near[j], far[j], here[start], here[min(start + 1, nb - 1)]
-        p0, p1, p2 = pa[pair, j], pb[v, start], pc[v, j]
-        for k in range(nc):
-            q0 = p0[k] + s0 * (far0[k] - near0[k])
-            q1 = p1[k] + s1 * (far1[k] - near1[k])
-            q2 = p2[k] + s2 * (row[k + 1] - row[k])
-            shrink = _f(1) / max(_f(1), np.sqrt(q0 * q0 + q1 * q1 + q2 * q2))
-            p0[k], p1[k], p2[k] = q0 * shrink, q1 * shrink, q2 * shrink
+    size = pa.shape[1]
+    p0, p1, p2, back = pa[pair], pb[v], pc[v], back1 * nc
+    last = size - nc  # from the last row there is no difference: 0, and stays so
+    alone = 0 if back1 else last  # the row whose difference that is
+    some, edge = slice(alone, alone + nc), slice(last, size)
+    after = slice(alone + 1, alone + nc + 1)
+    _dual_piece(
+        p0[some], p1[edge], p2[some], near[some], far[some], here[edge], here[edge], here[some], here[after], s0, s1,
+        steps,
+    )  # fmt: skip
+    for start in range(back, last + back, steps.size):
+        end = min(start + steps.size, last + back)
+        some, after, one = slice(start, end), slice(start + 1, end + 1), slice(start - back, end - back)
+        next_one = slice(start - back + nc, end - back + nc)
+        _dual_piece(
+            p0[some], p1[one], p2[some], near[some], far[some], here[one], here[next_one], here[some], here[after],
+            s0, s1, steps,
+        )  # fmt: skip
 
 
 @njit(**OPTIONS)
 def _dual_step(
-    x: F32, pa: F32, pb: F32, pc: F32, threshold: float, pace: float, weights: Weights, floor: float,
+    x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, pace: float, weights: Weights, floor: float,
     back0: int, back1: int, edges: F32, planes: F32,
 ) -> None:  # fmt: skip
-    na, _, nc = x.shape
+    na, size = x.shape
     runs = edges.shape[0]
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
-    zero = np.zeros(nc, np.float32)
+    s0, s1 = _f(pace) * w0, _f(pace) * w1
+    steps = np.full(max(1, _PIECE // nc) * nc, _f(pace) * w2)
+    steps[nc - 1 :: nc] = _f(0)
+    zero = np.zeros(size, np.float32)
     # The first plane of each run, before another thread changes the dual fields that it depends on.
     for run in prange(runs):
-        _primal_plane(x, pa, pb, pc, run * na // runs, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
+        _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):
         first, last = run * na // runs, (run + 1) * na // runs
-        s0, s1, s2 = _f(pace) * w0, _f(pace) * w1, _f(pace) * w2
         if back0 and run == 0:  # before the first plane there is no difference
             start = edges[0]
-            _dual_plane(pa, pb, pc, 0, na - 1, start, start, start, back1, s0, s1, s2)
+            _dual_plane(pa, pb, pc, 0, na - 1, nc, start, start, start, back1, s0, s1, steps)
         for i in range(first, last):
             here = edges[run] if i == first else planes[run, i % 2]
             if i + 1 < last:
                 after = planes[run, (i + 1) % 2]
-                _primal_plane(x, pa, pb, pc, i + 1, _f(threshold), w0, w1, w2, _f(floor), zero, after)
+                _primal_plane(x, pa, pb, pc, i + 1, nc, _f(threshold), w0, w1, w2, _f(floor), zero, after)
             else:
                 after = edges[run + 1] if run + 1 < runs else here
             if not back0:
-                _dual_plane(pa, pb, pc, i, i, here, after, here, back1, s0, s1, s2)
+                _dual_plane(pa, pb, pc, i, i, nc, here, after, here, back1, s0, s1, steps)
             elif i + 1 < na:
-                _dual_plane(pa, pb, pc, i + 1, i, here, after, after, back1, s0, s1, s2)
+                _dual_plane(pa, pb, pc, i + 1, i, nc, here, after, after, back1, s0, s1, steps)
 
 
 @njit(**OPTIONS)
 def _primal(
-    x: F32, pa: F32, pb: F32, pc: F32, threshold: float, weights: Weights, floor: float, planes: F32, out: F32
+    x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, weights: Weights, floor: float, planes: F32, out: F32
 ) -> None:
-    na, nb, nc = x.shape
+    na, size = x.shape
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
-    zero = np.zeros(nc, np.float32)
+    zero = np.zeros(size, np.float32)
     runs = planes.shape[0]
     for run in prange(runs):
+        plane = planes[run, 0]
         for i in range(run * na // runs, (run + 1) * na // runs):
-            _primal_plane(x, pa, pb, pc, i, _f(threshold), w0, w1, w2, _f(floor), zero, planes[run, 0])
-            for j in range(nb):
-                for k in range(nc):
-                    out[i, j, k] = planes[run, 0, j, k]
+            _primal_plane(x, pa, pb, pc, i, nc, _f(threshold), w0, w1, w2, _f(floor), zero, plane)
+            target = out[i]
+            for k in range(size):
+                target[k] = plane[k]
 
 
 def dual_step(
@@ -127,14 +156,19 @@ def dual_step(
     """
     pace = 1.5 / (4 * sum(w * w for w in weights)) / threshold
     floor = 0.0 if nonnegative else _NO_FLOOR
-    _dual_step(x, *p, threshold, pace, weights, floor, *back, *scratch)
+    _dual_step(*_in_planes(x, *p), x.shape[2], threshold, pace, weights, floor, *back, *scratch)
 
 
 def primal(
     x: F32, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch, out: F32
 ) -> None:
     """out = P(x - threshold Dᵀ p); `out` may be `x`."""
-    _primal(x, *p, threshold, weights, 0.0 if nonnegative else _NO_FLOOR, scratch.planes, out)
+    floor, (to,) = 0.0 if nonnegative else _NO_FLOOR, _in_planes(out)
+    _primal(*_in_planes(x, *p), x.shape[2], threshold, weights, floor, scratch.planes, to)
+
+
+def _in_planes(*arrays: F32) -> list[F32]:
+    return [array.reshape(len(array), -1) for array in arrays]
 
 
 def dual_field(shape: tuple[int, int, int]) -> DualField:
@@ -156,7 +190,7 @@ def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:
     the speed.
     """
     runs, (_, b, c) = _runs(shape), shape
-    return DualScratch(np.empty((runs, b, c + 1), np.float32), np.empty((runs, 2, b, c + 1), np.float32))
+    return DualScratch(np.zeros((runs, b * c + 1), np.float32), np.zeros((runs, 2, b * c + 1), np.float32))
 
 
 def _runs(shape: tuple[int, int, int]) -> int:

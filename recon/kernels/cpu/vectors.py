@@ -92,9 +92,11 @@ def _turn_of_steps(before: F32, start: F32, end: F32, sums: NDArray[np.float64])
         total = np.float64(0)
         stop = (part + 1) * end.size // parts
         for first in range(part * end.size // parts, stop, _RUN):
+            some = slice(first, min(first + _RUN, stop))  # of slices the compiler makes vectors
+            a, b, c = before[some], start[some], end[some]
             run = _f(0)
-            for i in range(first, min(first + _RUN, stop)):
-                run += (start[i] - end[i]) * (end[i] - before[i])
+            for i in range(c.size):
+                run += (b[i] - c[i]) * (c[i] - a[i])
             total += run
         sums[part] = total
 

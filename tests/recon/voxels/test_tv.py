@@ -91,11 +91,11 @@ def test_no_side_is_preferred(rng: np.random.Generator) -> None:
     assert np.abs(found[0] - found[1]).max() > 1e-3
 
 
-def test_a_single_slice_is_one_of_two_equal_slices(rng: np.random.Generator) -> None:
-    """Of one slice the kernels see the axes in another order. It turns along y alone, which shows it both diagonals."""
+@pytest.mark.parametrize("turns", range(4))
+def test_a_single_slice_is_one_of_two_equal_slices(turns: int, rng: np.random.Generator) -> None:
     x = rng.normal(size=(20, 33, 1)).astype(np.float32)
     found = []
-    for slices, turns in ((1, 1), (2, 1), (1, 2), (2, 4)):
+    for slices in (1, 2):
         prox = TotalVariationProx((20, 33, slices), (1.0, 1.0, 0.7), True, steps=3)
         y = np.repeat(x, slices, axis=2)
         prox(y, 0.2)
@@ -103,5 +103,4 @@ def test_a_single_slice_is_one_of_two_equal_slices(rng: np.random.Generator) -> 
             prox.turn()
         prox(y, 0.2)
         found.append(y[:, :, 0])
-    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
-    np.testing.assert_allclose(found[2], found[3], atol=1e-6)
+    np.testing.assert_allclose(*found, atol=1e-6)

@@ -15,9 +15,10 @@ from tests.recon.voxels.tv_reference import differences, total_variation, transp
 
 WEIGHTS = (1.0, 0.8, 1.3)
 shapes = st.tuples(st.integers(1, 9), st.integers(1, 6), st.integers(1, 6))
+in_pieces = st.sampled_from([(2, 3, 530), (3, 40, 16), (2, 15, 41), (2, 600, 1)])  # of planes, each in several loops
 
 
-@given(shapes, st.booleans(), st.sampled_from(((0, 0), (1, 0), (0, 1), (1, 1))), st.integers(0, 2**31))
+@given(shapes | in_pieces, st.booleans(), st.sampled_from(((0, 0), (1, 0), (0, 1), (1, 1))), st.integers(0, 2**31))
 @settings(max_examples=60)
 def test_dual_steps_are_the_reference_s(
     shape: tuple[int, int, int], nonnegative: bool, back: tuple[int, int], seed: int
