@@ -66,12 +66,13 @@ def _replace_by_residual(data: F32, model: F32, weight: F32, scale: F32, sums: N
         total = np.float64(0)
         end = (part + 1) * data.size // parts
         for start in range(part * data.size // parts, end, _RUN):
-            stop = min(start + _RUN, end)
-            run = _f(0)
-            for i in range(start, stop):
-                difference = data[i] - model[i]
-                run += (weight[i] if weight.size else _f(1)) * difference * difference
-                model[i] = difference * (scale[i] if scale.size else _f(1))
+            some = slice(start, min(start + _RUN, end))  # of slices the compiler makes vectors
+            p, q, run = data[some], model[some], _f(0)
+            w, s = weight[some] if weight.size else p, scale[some] if scale.size else p
+            for i in range(p.size):
+                difference = p[i] - q[i]
+                run += (w[i] if weight.size else _f(1)) * difference * difference
+                q[i] = difference * (s[i] if scale.size else _f(1))
             total += run
         sums[part] = total
 
@@ -92,7 +93,7 @@ def _turn_of_steps(before: F32, start: F32, end: F32, sums: NDArray[np.float64])
         total = np.float64(0)
         stop = (part + 1) * end.size // parts
         for first in range(part * end.size // parts, stop, _RUN):
-            some = slice(first, min(first + _RUN, stop))  # of slices the compiler makes vectors
+            some = slice(first, min(first + _RUN, stop))
             a, b, c = before[some], start[some], end[some]
             run = _f(0)
             for i in range(c.size):
