@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recon.base.arrays import F32, F64
+from recon.base.choices import SHORT_STEPS
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, RunControl, candidates_of
@@ -203,15 +204,19 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     (few, less), (many, more) = tried[0], tried[-1]
     slope = max(more - less, 0.0) / (many - few) if many > few else less / few
     given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
-    seconds = 0.0
+    cone = extent.geometry.is_cone
+    seconds, tried_early = 0.0, not cone
     for height in extent.heights:
-        field, cone = Grid((height, extent.cols, extent.cols)), extent.geometry.is_cone
+        field = Grid((height, extent.cols, extent.cols))
         first = count_for(field, cone)
         count = first if given is None else given * height / extent.slices
         joined = method.fit.joined_pixels or joined_for(field, cone, max(count, first), (height, extent.cols))
+        tried_early &= joined == 1
         seconds += max(less + slope * (_work(math.prod(field.shape) / joined**3, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     planned, fewest = method.planned_steps or 0, method.least_steps or 0
+    if not tried_early:  # no trial of the finish ends such a fit at step 100
+        fewest = min(planned, max(fewest, SHORT_STEPS))
     most = method.seconds if method.seconds is not None else planned * seconds * grown
     least = min(most, fewest * seconds * (grown if fewest == planned else 1))  # it ends before Gaussians are added
     beside = _of_direct(Fbp(), extent, now)
