@@ -21,6 +21,7 @@ _f = np.float32
 _NO_FLOOR = -3.0e38
 _APART = 17 * 16  # values: 17 lines of the cache
 _PIECE = 512  # voxels of one loop, about
+_MANY = 64  # planes of a thread
 Weights = tuple[float, float, float]
 DualField = tuple[F32, F32, F32]
 
@@ -102,8 +103,12 @@ def _dual_step(
     steps[nc - 1 :: nc] = _f(0)
     zero = np.zeros(size, np.float32)
     # The first plane of each run, before another thread changes the dual fields that it depends on.
-    for run in prange(runs):
-        _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
+    if na < _MANY * runs:
+        for run in prange(runs):
+            _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
+    else:  # threads take longer to start than these few planes
+        for run in range(runs):
+            _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):
         first, last = run * na // runs, (run + 1) * na // runs
         if back0 and run == 0:  # before the first plane there is no difference
