@@ -49,6 +49,7 @@ _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 
 # 16 sweeps with a lighter weight gain 0.5 to 1.4 dB there. On a teapot (1.29) they lose 2.5. On a shell the sweeps
 # leave 1.4 to 2.9 times as much as the fit: 16 gain 0.7 or lose 2.1 dB.
 _UNFINISHED, _LIGHTER = 1.45, 0.8
+_AGAIN = 0.5  # of the weight that views held out prefer, for views without what voxels cannot explain (docs/notes)
 _CLEARLY = 0.9  # a parallel beam: residuals .94 to .98 of the first's lose 3 dB (spheres), .5 less than 0.1 dB (slabs)
 # Residual of views held out after 50 steps, over that of total variation from FBP. It is 0.99 to 1.00 after 24 sweeps
 # where 100 steps lose nothing, 0.65 to 0.97 where they do. After 8 sweeps of the former it is at most 1.15.
@@ -123,20 +124,31 @@ class _TryFinish:
 @dataclass
 class _FromModel:
     """The refinement as an iterative method of `recon.voxels.iterative.solve`. With `by_content` it makes as many more
-    sweeps as views held out prefer; it makes no more where `watch` ends the trials."""
+    sweeps as views held out prefer; it makes no more where `watch` ends the trials.
+
+    Attributes:
+        weight: of total variation, in the units of the data: given, or what views held out preferred. None: neither.
+    """
 
     iterations: int
     by_content: bool
     watch: _Watch
     unmodelled: float | None = None
     trial: FinishTrial | None = None
+    weight: float | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        if self.weight is not None:
+            given = math.ldexp(self.weight, -_power(problem))
+            subsets = Subsets.of(problem, SUBSETS)
+            return ordered_fista(problem, x, given, subsets, sweeps=self.iterations, tv_steps=TV_STEPS)
         known, ended = None, 0
         if self.trial is not None:
             known = Preferred(math.ldexp(self.trial.weight, -_power(problem)), self.trial.residual)
             ended = self.trial.sweeps
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled, known=known)
+        if not isinstance(weight, NoiseBalance):
+            self.weight = math.ldexp(weight, _power(problem))
         if self.by_content and not (self.watch.ended or isinstance(weight, NoiseBalance)):
             mu, residual = weight, preferred_residual(problem.decide)
             self.iterations = problem.decide("sweeps", lambda: ended or preferred_sweeps(problem, x, mu, SWEEPS))
@@ -238,8 +250,10 @@ def finish(
 
     watch = _Watch(control, problem.geometry.n_views)
 
-    def refined(views: F32, unmodelled: float | None = None, first: int = SWEEPS) -> Finished:
-        method = _FromModel(first if sweeps is None else sweeps, sweeps is None, watch, unmodelled, trial)
+    def refined(
+        views: F32, unmodelled: float | None = None, first: int = SWEEPS, weight: float | None = None
+    ) -> tuple[Finished, float | None]:
+        method = _FromModel(first if sweeps is None else sweeps, sweeps is None, watch, unmodelled, trial, weight)
         refined = solve(
             method,
             projector,
@@ -251,14 +265,14 @@ def finish(
             on_trial=watch.trial,
             decide=decide,
         )
-        return Finished(refined, method.iterations)
+        return Finished(refined, method.iterations), method.weight
 
     fitted = _deviation(data - model, known)
     model -= projector.forward(start.data)
     if decide("above", lambda: goes_on_beyond(data, problem.geometry)):
-        return refined(data - model, 0.0)
+        return refined(data - model, 0.0)[0]
     noise, unlike = noise_level(whitened(data, known)), _deviation(model, known)
-    found = refined(data)
+    found, weight = refined(data)
     if found.sweeps == 0:
         return Finished(volume, 0)
     if decide("alike", lambda: unlike <= _DIFFERENT * noise):
@@ -275,11 +289,13 @@ def finish(
     data -= model
     unfinished = bent and not smooth and decide("unfinished", lambda: fitted > max(_UNFINISHED * noise, left))
     known_before = 0.0 if smooth else unlike / noise * (_LIGHTER if unfinished else 1)
-    other = refined(data, known_before, 2 * SWEEPS if unfinished else SWEEPS)
+    lighter = None if bent or weight is None else _AGAIN * weight
+    other, _ = refined(data, known_before, 2 * SWEEPS if unfinished else SWEEPS, lighter)
     if watch.asked() and not bent:  # cut short
         return found
     after = _deviation(data - projector.forward(other.volume.data), known)
-    return other if decide("other", lambda: after <= (_ALIKE if bent else _CLEARLY) * left) else found
+    most = _ALIKE if bent else _CLEARLY if lighter is None else 1.0
+    return other if decide("other", lambda: after <= most * left) else found
 
 
 def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> tuple[F32, F32 | None, F32] | None:

@@ -23,7 +23,9 @@ from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.methods.fista_tv import FistaTv
+from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
+from recon.voxels.voxel_problem import VoxelProblem
 
 F32 = NDArray[np.float32]
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (8, 40))
@@ -88,6 +90,20 @@ def test_a_stop_during_the_trials_of_a_weight_keeps_the_fit() -> None:
     assert found.sweeps == 0
     np.testing.assert_array_equal(found.volume.data, fitted.data)
     assert [(p.step, p.steps, p.unit) for p in told] == [(n, 0, "sweeps of trials") for n in (1, 2, 3)]
+
+
+def test_a_second_attempt_takes_half_the_weight_that_views_held_out_prefer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first one leaves what voxels cannot explain; both are sweeps of this number."""
+    g, weights = _blob(8.0), []
+
+    def run(problem: VoxelProblem, x: F32, weight: float, *subsets: Subsets, **numbers: int) -> F32:
+        weights.append(weight)
+        return ordered_fista(problem, x, weight, *subsets, **numbers)
+
+    monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: 0.25)
+    monkeypatch.setattr("recon.splatting.finish.ordered_fista", run)
+    finish(_of(g), g, _problem(project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())), 3)
+    assert weights == [0.25, 0.125]
 
 
 def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
