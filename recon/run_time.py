@@ -27,7 +27,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import growth
 from recon.voxels.direct import Fbp
 from recon.voxels.fbp import fbp_nanoseconds
-from recon.voxels.held_out_weight import CHOICE_SWEEPS
+from recon.voxels.held_out_weight import CHOICE_SWEEPS, LEAST_VIEWS
 from recon.voxels.iterative import IterativeMethod
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.projector import Projector
@@ -205,17 +205,17 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
     slope = max(more - less, 0.0) / (many - few) if many > few else less / few
     given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
     cone = extent.geometry.is_cone
-    seconds, tried_early = 0.0, not cone
+    seconds, may_end_early = 0.0, not cone and extent.views >= LEAST_VIEWS
     for height in extent.heights:
         field = Grid((height, extent.cols, extent.cols))
         first = count_for(field, cone)
         count = first if given is None else given * height / extent.slices
         joined = method.fit.joined_pixels or joined_for(field, cone, max(count, first), (height, extent.cols))
-        tried_early &= joined == 1
+        may_end_early &= joined == 1
         seconds += max(less + slope * (_work(math.prod(field.shape) / joined**3, count) - few), 0.0)
     grown = (1 + growth(method.fit)) / 2  # small fits end before the first Gaussians are added
     planned, fewest = method.planned_steps or 0, method.least_steps or 0
-    if not tried_early:  # no trial of the finish ends such a fit at step 100
+    if not may_end_early:  # no trial of the finish ends such a fit at step 100
         fewest = min(planned, max(fewest, SHORT_STEPS))
     most = method.seconds if method.seconds is not None else planned * seconds * grown
     least = min(most, fewest * seconds * (grown if fewest == planned else 1))  # it ends before Gaussians are added

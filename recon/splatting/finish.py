@@ -49,7 +49,7 @@ _ALIKE = 1.1  # residuals: a thorax of 75 cone views is left with 1.31 and 1.32 
 # 16 sweeps with a lighter weight gain 0.5 to 1.4 dB there. On a teapot (1.29) they lose 2.5. On a shell the sweeps
 # leave 1.4 to 2.9 times as much as the fit: 16 gain 0.7 or lose 2.1 dB.
 _UNFINISHED, _LIGHTER = 1.45, 0.8
-_AGAIN = 0.5  # of the weight that views held out prefer, for views without what voxels cannot explain (docs/notes)
+_SECOND_SHARE = 0.5  # of the weight that views held out prefer, in the second attempt (docs/notes/exploration.md)
 _CLEARLY = 0.9  # a parallel beam: residuals .94 to .98 of the first's lose 3 dB (spheres), .5 less than 0.1 dB (slabs)
 # Residual of views held out after 50 steps, over that of total variation from FBP. It is 0.99 to 1.00 after 24 sweeps
 # where 100 steps lose nothing, 0.65 to 0.97 where they do. After 8 sweeps of the former it is at most 1.15.
@@ -88,7 +88,7 @@ class FinishTrial(NamedTuple):
     Attributes:
         sweeps: of a finish that makes up for further steps of the fit; 0: these gain more.
         weight: of total variation that views held out prefer, in the units of the data.
-        residual: of these views after total variation with this weight, from FBP.
+        residual: of these views after total variation with this weight, from FBP, in the unit of the data.
     """
 
     sweeps: int
@@ -117,7 +117,8 @@ class _TryFinish:
             as_well = bool(left) and low <= left[-1] <= high
             rounds = 1 + next(n for n, one in enumerate(left) if one * _NEAR_BEST <= min(left)) if as_well else 0
             weight = math.ldexp(preferred.weight, _power(problem))
-            self.found = FinishTrial(rounds * SWEEPS, weight, preferred.residual)
+            residual = math.ldexp(preferred.residual, problem.decide.made[UNITS][-1][1])
+            self.found = FinishTrial(rounds * SWEEPS, weight, residual)
         return x
 
 
@@ -127,7 +128,7 @@ class _FromModel:
     sweeps as views held out prefer; it makes no more where `watch` ends the trials.
 
     Attributes:
-        weight: of total variation, in the units of the data: given, or what views held out preferred. None: neither.
+        given: weight of total variation, in the units of the data; None: it is chosen.
     """
 
     iterations: int
@@ -135,23 +136,19 @@ class _FromModel:
     watch: _Watch
     unmodelled: float | None = None
     trial: FinishTrial | None = None
-    weight: float | None = None
+    given: float | None = None
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        if self.weight is not None:
-            given = math.ldexp(self.weight, -_power(problem))
-            subsets = Subsets.of(problem, SUBSETS)
-            return ordered_fista(problem, x, given, subsets, sweeps=self.iterations, tv_steps=TV_STEPS)
-        known, ended = None, 0
+        known, tried = None, 0
         if self.trial is not None:
-            known = Preferred(math.ldexp(self.trial.weight, -_power(problem)), self.trial.residual)
-            ended = self.trial.sweeps
-        weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled, known=known)
-        if not isinstance(weight, NoiseBalance):
-            self.weight = math.ldexp(weight, _power(problem))
-        if self.by_content and not (self.watch.ended or isinstance(weight, NoiseBalance)):
+            left = math.ldexp(self.trial.residual, -problem.decide.made[UNITS][-1][1])
+            known = Preferred(math.ldexp(self.trial.weight, -_power(problem)), left)
+            tried = self.trial.sweeps
+        given = None if self.given is None else math.ldexp(self.given, -_power(problem))
+        weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled, known=known, given=given)
+        if self.by_content and self.unmodelled is None and not (self.watch.ended or isinstance(weight, NoiseBalance)):
             mu, residual = weight, preferred_residual(problem.decide)
-            self.iterations = problem.decide("sweeps", lambda: ended or preferred_sweeps(problem, x, mu, SWEEPS))
+            self.iterations = problem.decide("sweeps", lambda: tried or preferred_sweeps(problem, x, mu, SWEEPS))
             once = self.iterations > SWEEPS or self.watch.ended
             heavy = None if once else problem.decide("heavy", lambda: bregman_weight(problem, mu, residual))
             if heavy is not None:
@@ -210,7 +207,8 @@ def finish(
     0.6 of the noise. The sweeps may leave more than the fit, or 1.05 times the noise. Where both hold, the sweeps are
     tried anew on p - G + A x. Here p are the measured views, G those of the Gaussians, A x the projection of the voxels
     at the start. What voxels cannot explain then counts as noise. The second volume is taken if it leaves a tenth less
-    of its views. Of a cone, and of matter beyond the field, it may leave a tenth more.
+    of its views. Of a cone, and of matter beyond the field, it may leave a tenth more. Where views held out preferred a
+    weight, the second attempt takes half of it, and need only leave no more.
 
     Where the rays of a cone cross matter above or below the field, only p - G + A x is tried. Measured views would put
     that matter into the end slices: -22 dB there, -7 dB in the middle of a thorax.
@@ -251,9 +249,9 @@ def finish(
     watch = _Watch(control, problem.geometry.n_views)
 
     def refined(
-        views: F32, unmodelled: float | None = None, first: int = SWEEPS, weight: float | None = None
-    ) -> tuple[Finished, float | None]:
-        method = _FromModel(first if sweeps is None else sweeps, sweeps is None, watch, unmodelled, trial, weight)
+        views: F32, unmodelled: float | None = None, first: int = SWEEPS, given: float | None = None
+    ) -> Finished:
+        method = _FromModel(first if sweeps is None else sweeps, sweeps is None, watch, unmodelled, trial, given)
         refined = solve(
             method,
             projector,
@@ -265,14 +263,14 @@ def finish(
             on_trial=watch.trial,
             decide=decide,
         )
-        return Finished(refined, method.iterations), method.weight
+        return Finished(refined, method.iterations)
 
     fitted = _deviation(data - model, known)
     model -= projector.forward(start.data)
     if decide("above", lambda: goes_on_beyond(data, problem.geometry)):
-        return refined(data - model, 0.0)[0]
+        return refined(data - model, 0.0)
     noise, unlike = noise_level(whitened(data, known)), _deviation(model, known)
-    found, weight = refined(data)
+    found = refined(data)
     if found.sweeps == 0:
         return Finished(volume, 0)
     if decide("alike", lambda: unlike <= _DIFFERENT * noise):
@@ -289,12 +287,13 @@ def finish(
     data -= model
     unfinished = bent and not smooth and decide("unfinished", lambda: fitted > max(_UNFINISHED * noise, left))
     known_before = 0.0 if smooth else unlike / noise * (_LIGHTER if unfinished else 1)
-    lighter = None if bent or weight is None else _AGAIN * weight
-    other, _ = refined(data, known_before, 2 * SWEEPS if unfinished else SWEEPS, lighter)
+    weight = None if bent else _preferred_in_data(decide, known is not None)
+    second_weight = None if weight is None else _SECOND_SHARE * weight
+    other = refined(data, known_before, 2 * SWEEPS if unfinished else SWEEPS, second_weight)
     if watch.asked() and not bent:  # cut short
         return found
     after = _deviation(data - projector.forward(other.volume.data), known)
-    most = _ALIKE if bent else _CLEARLY if lighter is None else 1.0
+    most = _ALIKE if bent else _CLEARLY if second_weight is None else 1.0
     return other if decide("other", lambda: after <= most * left) else found
 
 
@@ -310,8 +309,18 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
 
 def _power(problem: VoxelProblem) -> int:
     """n, where a weight of total variation in the units of the data is 2**n times that in those of the problem."""
-    length, integral, rays = problem.decide.made[UNITS][-1]
-    return int(length + integral + (0 if problem.weight is None else rays))
+    return _power_of(problem.decide, problem.weight is not None)
+
+
+def _power_of(decide: Decisions, weighted: bool) -> int:
+    length, integral, rays = decide.made[UNITS][-1]
+    return int(length + integral + (rays if weighted else 0))
+
+
+def _preferred_in_data(decide: Decisions, weighted: bool) -> float | None:
+    """The weight that `choose_weight` took last, in the units of the data; None: it is one by the noise."""
+    first, *noise = decide.made["weight"][-1]
+    return None if noise else math.ldexp(first, _power_of(decide, weighted))
 
 
 def _deviation(left: F32, weights: F32 | None) -> float:

@@ -142,11 +142,13 @@ def choose_weight(
     unmodelled: float | None = None,
     of_cones: bool = False,
     known: Preferred | None = None,
+    given: float | None = None,
 ) -> NoiseBalance | float:
     """The weight by the noise, or the one by views held out; arguments as `NoiseBalance.of`.
 
     `of_cones`: views of a cone are held out, too. `known`: what `preferred_weight` found before. What it finds is a
     decision of its own, PREFERRED, which holds for other methods on the same views; see `preferred_residual`.
+    `given`: the weight, where no slab has chosen another.
     """
 
     @cache
@@ -154,11 +156,13 @@ def choose_weight(
         return NoiseBalance.of(problem, start, modelled, unmodelled)
 
     def chosen() -> list[float]:
+        if given is not None:
+            return [given]
         found = None
         if of_cones and problem.projector.geometry.is_cone:
             found = heaviest_weight(problem, balance().first)
         elif unmodelled is None:
-            preferred = problem.decide(PREFERRED, lambda: _plain(known or preferred_weight(problem, balance().first)))
+            preferred = problem.decide(PREFERRED, lambda: _as_list(known or preferred_weight(problem, balance().first)))
             found = None if preferred is None else preferred[0]
         return [balance().first, balance().noise] if found is None else [found]
 
@@ -166,12 +170,12 @@ def choose_weight(
     return NoiseBalance(first, noise[0], unmodelled is not None) if noise else first
 
 
-def _plain(preferred: Preferred | None) -> list[float] | None:
+def _as_list(preferred: Preferred | None) -> list[float] | None:
     return None if preferred is None else list(preferred)
 
 
 def preferred_residual(decide: Decisions) -> float | None:
-    """Residual of views held out, with the weight that `choose_weight` took last; None: they preferred none."""
+    """Residual of views held out, with the weight that `choose_weight` took last; None: it sought none."""
     preferred = (decide.made.get(PREFERRED) or [None])[-1]
     return None if preferred is None else float(preferred[1])
 
@@ -182,8 +186,8 @@ def preferred_weight(problem: VoxelProblem, first: float) -> Preferred | None:
     Volumes of 16 rows are reconstructed from seven of eight views with twice the weight, with the weight, and on to the
     better side: the heavier one where both are level, because too light a weight changes nothing. They end when the
     root mean square of what they leave of the other views rises. The vertex of the parabola through the best and its
-    neighbours is taken. A volume that is too smooth misses edges of unseen views. One that follows the noise misses
-    them by its noise. μ is that of all views: noise and prior do not depend on their number.
+    neighbours is taken, within what was tried. A volume that is too smooth misses edges of unseen views. One that
+    follows the noise misses them by its noise. μ is that of all views: noise and prior do not depend on their number.
     Trials begin from FBP: a fit knows the views held out, and any weight takes it away from them.
 
     None where nothing can be held out: a cone, fewer than 16 views, or data without noise; and where

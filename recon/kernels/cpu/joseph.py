@@ -30,7 +30,7 @@ AT, STEP, RISE, CLIMB, PATH, LEAN = range(6)
 
 _BLOCK = 64  # slices of one job, at most
 _GROUP = 16  # views that share one pass over the volume
-_EVEN = 4  # jobs a thread, from which on an odd one costs little
+_ENOUGH = 4  # blocks a thread, from which on one that is left over costs little
 TILE = 32  # voxels along each edge of a tile: 74 to 296 KB with its margin
 EDGE = TILE + 2
 _FLAT = 1e-9  # lines a plane: such a ray stays on its line
@@ -226,7 +226,7 @@ def _adjoint(projections: F32, rays: F64, steep: Flags, block: int, first: int, 
 def shares(views: int, nz: int) -> tuple[int, int]:
     """Views and slices of one job, so that all threads have work and one pass over the volume serves many views."""
     threads, blocks = get_num_threads(), -(-nz // _BLOCK)
-    if blocks % threads == 0 or blocks >= _EVEN * threads:  # blocks of slices are work for all
+    if blocks % threads == 0 or blocks >= _ENOUGH * threads:  # blocks of slices are work for all
         return -(-views // -(-views // _GROUP)), _BLOCK
     rounds = -(-views // (_GROUP * threads))
     group = -(-views // (rounds * threads))

@@ -21,25 +21,32 @@ _f = np.float32
 _NO_FLOOR = -3.0e38
 _APART = 17 * 16  # values: 17 lines of the cache
 _PIECE = 512  # voxels of one loop, about
-_MANY = 64  # planes of a thread
+_FEW = 2**16  # voxels that one thread makes while others would start
 Weights = tuple[float, float, float]
 DualField = tuple[F32, F32, F32]
 
 
 class DualScratch(NamedTuple):
-    """One plane [run, b c + 1], and two [run, 2, b c + 1], for each run of planes that one thread makes."""
+    """Planes of the primal point, for each run of planes that one thread makes.
+
+    Attributes:
+        plane: [run, b c + 1], the first one. The value beyond the last voxel is read, times 0, and must be finite.
+        planes: [run, 2, b c + 1], this one and the next.
+        zero: [b c], the differences before the first plane.
+    """
 
     plane: F32
     planes: F32
+    zero: F32
 
 
 # The kernels see planes [b c], in pieces of some rows: of rows of sixteen voxels, what goes before a loop takes longer
-# than the loop. They rely on fields that are zero where there is no difference: p2 at the end of each row.
+# than the loop. Fields must be zero where there is no difference: in the last plane of pa, row of pb and column of pc.
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
 def _primal_plane(x, pa, pb, pc, i, nc, threshold, w0, w1, w2, floor, zero, out):
-    """Plane i of max(x - threshold Dᵀ p, floor) into out [b c]."""
+    """Plane i of max(x - threshold Dᵀ p, floor) into the first b c values of `out`."""
     size = x.shape[1]
     here, p0, p1, p2 = x[i], pa[i], pb[i], pc[i]
     before0 = pa[i - 1] if i > 0 else zero
@@ -57,18 +64,18 @@ def _primal_plane(x, pa, pb, pc, i, nc, threshold, w0, w1, w2, floor, zero, out)
 
 
 @njit(inline="always")
-def _dual_piece(p0, p1, p2, near0, far0, near1, far1, here, after, s0, s1, steps):
-    """The differences of one piece of a plane; `steps` is 0 for the last of each row."""
+def _dual_piece(p0, p1, p2, near0, far0, near1, far1, here, after, s0, s1, s2):
+    """The differences of one piece of a plane; s2 [k] is 0 for the last of each row."""
     for k in range(p0.size):
         q0 = p0[k] + s0 * (far0[k] - near0[k])
         q1 = p1[k] + s1 * (far1[k] - near1[k])
-        q2 = p2[k] + steps[k] * (after[k] - here[k])
+        q2 = p2[k] + s2[k] * (after[k] - here[k])
         shrink = _f(1) / max(_f(1), np.sqrt(q0 * q0 + q1 * q1 + q2 * q2))
         p0[k], p1[k], p2[k] = q0 * shrink, q1 * shrink, q2 * shrink
 
 
 @njit(fastmath=True, error_model="numpy", cache=True)
-def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, steps):
+def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, s2):
     """The differences that belong to the voxels of plane v: from u `near` to `far` at `pair`, and within `here`."""
     size = pa.shape[1]
     p0, p1, p2, back = pa[pair], pb[v], pc[v], back1 * nc
@@ -78,42 +85,41 @@ def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, steps):
     after = slice(alone + 1, alone + nc + 1)
     _dual_piece(
         p0[some], p1[edge], p2[some], near[some], far[some], here[edge], here[edge], here[some], here[after], s0, s1,
-        steps,
+        s2,
     )  # fmt: skip
-    for start in range(back, last + back, steps.size):
-        end = min(start + steps.size, last + back)
+    for start in range(back, last + back, s2.size):
+        end = min(start + s2.size, last + back)
         some, after, one = slice(start, end), slice(start + 1, end + 1), slice(start - back, end - back)
         next_one = slice(start - back + nc, end - back + nc)
         _dual_piece(
             p0[some], p1[one], p2[some], near[some], far[some], here[one], here[next_one], here[some], here[after],
-            s0, s1, steps,
+            s0, s1, s2,
         )  # fmt: skip
 
 
 @njit(**OPTIONS)
 def _dual_step(
     x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, pace: float, weights: Weights, floor: float,
-    back0: int, back1: int, edges: F32, planes: F32,
+    back0: int, back1: int, edges: F32, planes: F32, zero: F32,
 ) -> None:  # fmt: skip
     na, size = x.shape
     runs = edges.shape[0]
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
     s0, s1 = _f(pace) * w0, _f(pace) * w1
-    steps = np.full(max(1, _PIECE // nc) * nc, _f(pace) * w2)
-    steps[nc - 1 :: nc] = _f(0)
-    zero = np.zeros(size, np.float32)
+    s2 = np.full(max(1, _PIECE // nc) * nc, _f(pace) * w2)
+    s2[nc - 1 :: nc] = _f(0)
     # The first plane of each run, before another thread changes the dual fields that it depends on.
-    if na < _MANY * runs:
+    if runs * size > _FEW:
         for run in prange(runs):
             _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
-    else:  # threads take longer to start than these few planes
+    else:
         for run in range(runs):
             _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):
         first, last = run * na // runs, (run + 1) * na // runs
         if back0 and run == 0:  # before the first plane there is no difference
             start = edges[0]
-            _dual_plane(pa, pb, pc, 0, na - 1, nc, start, start, start, back1, s0, s1, steps)
+            _dual_plane(pa, pb, pc, 0, na - 1, nc, start, start, start, back1, s0, s1, s2)
         for i in range(first, last):
             here = edges[run] if i == first else planes[run, i % 2]
             if i + 1 < last:
@@ -122,18 +128,18 @@ def _dual_step(
             else:
                 after = edges[run + 1] if run + 1 < runs else here
             if not back0:
-                _dual_plane(pa, pb, pc, i, i, nc, here, after, here, back1, s0, s1, steps)
+                _dual_plane(pa, pb, pc, i, i, nc, here, after, here, back1, s0, s1, s2)
             elif i + 1 < na:
-                _dual_plane(pa, pb, pc, i + 1, i, nc, here, after, after, back1, s0, s1, steps)
+                _dual_plane(pa, pb, pc, i + 1, i, nc, here, after, after, back1, s0, s1, s2)
 
 
 @njit(**OPTIONS)
 def _primal(
-    x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, weights: Weights, floor: float, planes: F32, out: F32
-) -> None:
+    x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, weights: Weights, floor: float,
+    planes: F32, zero: F32, out: F32,
+) -> None:  # fmt: skip
     na, size = x.shape
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
-    zero = np.zeros(size, np.float32)
     runs = planes.shape[0]
     for run in prange(runs):
         plane = planes[run, 0]
@@ -168,8 +174,9 @@ def primal(
     x: F32, p: DualField, threshold: float, weights: Weights, nonnegative: bool, scratch: DualScratch, out: F32
 ) -> None:
     """out = P(x - threshold Dᵀ p); `out` may be `x`."""
+    assert out.flags.c_contiguous
     floor, (to,) = 0.0 if nonnegative else _NO_FLOOR, _in_planes(out)
-    _primal(*_in_planes(x, *p), x.shape[2], threshold, weights, floor, scratch.planes, to)
+    _primal(*_in_planes(x, *p), x.shape[2], threshold, weights, floor, scratch.planes, scratch.zero, to)
 
 
 def _in_planes(*arrays: F32) -> list[F32]:
@@ -195,7 +202,8 @@ def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:
     the speed.
     """
     runs, (_, b, c) = _runs(shape), shape
-    return DualScratch(np.zeros((runs, b * c + 1), np.float32), np.zeros((runs, 2, b * c + 1), np.float32))
+    shapes = (runs, b * c + 1), (runs, 2, b * c + 1), (b * c,)
+    return DualScratch(*(np.zeros(shape, np.float32) for shape in shapes))
 
 
 def _runs(shape: tuple[int, int, int]) -> int:

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Progress, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
@@ -22,6 +23,7 @@ from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
+from recon.voxels.held_out_weight import Preferred
 from recon.voxels.methods.fista_tv import FistaTv
 from recon.voxels.ordered_fista import Subsets, ordered_fista
 from recon.voxels.projector import Projector
@@ -100,10 +102,12 @@ def test_a_second_attempt_takes_half_the_weight_that_views_held_out_prefer(monke
         weights.append(weight)
         return ordered_fista(problem, x, weight, *subsets, **numbers)
 
-    monkeypatch.setattr("recon.splatting.finish.choose_weight", lambda *_, **__: 0.25)
+    monkeypatch.setattr("recon.voxels.held_out_weight.preferred_weight", lambda *_: Preferred(0.25, 1.0))
     monkeypatch.setattr("recon.splatting.finish.ordered_fista", run)
-    finish(_of(g), g, _problem(project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())), 3)
+    decide, data = Decisions(), project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())
+    finish(_of(g), g, _problem(data), 3, control=RunControl(decide=decide))
     assert weights == [0.25, 0.125]
+    assert decide.made["weight"] == [[0.25], [0.125]]  # which other slabs and error bars follow
 
 
 def test_a_stop_between_the_attempts_keeps_the_first_one_of_a_parallel_beam() -> None:
