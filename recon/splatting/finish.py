@@ -116,9 +116,7 @@ class _TryFinish:
             left = residuals_of_rounds(problem, x, preferred.weight, SWEEPS, (low, high))
             as_well = bool(left) and low <= left[-1] <= high
             rounds = 1 + next(n for n, one in enumerate(left) if one * _NEAR_BEST <= min(left)) if as_well else 0
-            weight = math.ldexp(preferred.weight, _power(problem))
-            residual = math.ldexp(preferred.residual, problem.decide.made[UNITS][-1][1])
-            self.found = FinishTrial(rounds * SWEEPS, weight, residual)
+            self.found = FinishTrial(rounds * SWEEPS, *_converted(preferred, problem, 1))
         return x
 
 
@@ -141,8 +139,7 @@ class _FromModel:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         known, tried = None, 0
         if self.trial is not None:
-            left = math.ldexp(self.trial.residual, -problem.decide.made[UNITS][-1][1])
-            known = Preferred(math.ldexp(self.trial.weight, -_power(problem)), left)
+            known = _converted(Preferred(self.trial.weight, self.trial.residual), problem, -1)
             tried = self.trial.sweeps
         given = None if self.given is None else math.ldexp(self.given, -_power(problem))
         weight = choose_weight(problem, x, modelled=True, unmodelled=self.unmodelled, known=known, given=given)
@@ -310,6 +307,12 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
 def _power(problem: VoxelProblem) -> int:
     """n, where a weight of total variation in the units of the data is 2**n times that in those of the problem."""
     return _power_of(problem.decide, problem.weight is not None)
+
+
+def _converted(found: Preferred, problem: VoxelProblem, sign: int) -> Preferred:
+    """From the units of the problem to those of the data (1), or back (-1)."""
+    integral = problem.decide.made[UNITS][-1][1]
+    return Preferred(math.ldexp(found.weight, sign * _power(problem)), math.ldexp(found.residual, sign * integral))
 
 
 def _power_of(decide: Decisions, weighted: bool) -> int:

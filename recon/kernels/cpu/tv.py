@@ -21,7 +21,6 @@ _f = np.float32
 _NO_FLOOR = -3.0e38
 _APART = 17 * 16  # values: 17 lines of the cache
 _PIECE = 512  # voxels of one loop, about
-_FEW = 2**16  # voxels that one thread makes while others would start
 Weights = tuple[float, float, float]
 DualField = tuple[F32, F32, F32]
 
@@ -77,24 +76,19 @@ def _dual_piece(p0, p1, p2, near0, far0, near1, far1, here, after, s0, s1, s2):
 @njit(fastmath=True, error_model="numpy", cache=True)
 def _dual_plane(pa, pb, pc, v, pair, nc, near, far, here, back1, s0, s1, s2):
     """The differences that belong to the voxels of plane v: from u `near` to `far` at `pair`, and within `here`."""
-    size = pa.shape[1]
-    p0, p1, p2, back = pa[pair], pb[v], pc[v], back1 * nc
-    last = size - nc  # from the last row there is no difference: 0, and stays so
-    alone = 0 if back1 else last  # the row whose difference that is
-    some, edge = slice(alone, alone + nc), slice(last, size)
-    after = slice(alone + 1, alone + nc + 1)
-    _dual_piece(
-        p0[some], p1[edge], p2[some], near[some], far[some], here[edge], here[edge], here[some], here[after], s0, s1,
-        s2,
-    )  # fmt: skip
-    for start in range(back, last + back, s2.size):
-        end = min(start + s2.size, last + back)
-        some, after, one = slice(start, end), slice(start + 1, end + 1), slice(start - back, end - back)
-        next_one = slice(start - back + nc, end - back + nc)
+    p0, p1, p2, last, back = pa[pair], pb[v], pc[v], pa.shape[1] - nc, back1 * nc
+    # The difference from the last row is 0, and stays so. It belongs to the last row or, with back1, to the first.
+    first = 0 if back1 else last
+    row, after, low = slice(first, first + nc), slice(first + 1, first + nc + 1), slice(last, last + nc)
+    u = here[low]
+    _dual_piece(p0[row], p1[low], p2[row], near[row], far[row], u, u, here[row], here[after], s0, s1, s2)
+    for start in range(0, last, s2.size):  # pieces of the other differences, from rows `low` to rows `high`
+        end = min(start + s2.size, last)
+        low, high = slice(start, end), slice(start + nc, end + nc)
+        own, after = slice(start + back, end + back), slice(start + back + 1, end + back + 1)
         _dual_piece(
-            p0[some], p1[one], p2[some], near[some], far[some], here[one], here[next_one], here[some], here[after],
-            s0, s1, s2,
-        )  # fmt: skip
+            p0[own], p1[low], p2[own], near[own], far[own], here[low], here[high], here[own], here[after], s0, s1, s2
+        )
 
 
 @njit(**OPTIONS)
@@ -102,19 +96,14 @@ def _dual_step(
     x: F32, pa: F32, pb: F32, pc: F32, nc: int, threshold: float, pace: float, weights: Weights, floor: float,
     back0: int, back1: int, edges: F32, planes: F32, zero: F32,
 ) -> None:  # fmt: skip
-    na, size = x.shape
-    runs = edges.shape[0]
+    na, runs = x.shape[0], edges.shape[0]
     w0, w1, w2 = _f(weights[0]), _f(weights[1]), _f(weights[2])
     s0, s1 = _f(pace) * w0, _f(pace) * w1
     s2 = np.full(max(1, _PIECE // nc) * nc, _f(pace) * w2)
     s2[nc - 1 :: nc] = _f(0)
     # The first plane of each run, before another thread changes the dual fields that it depends on.
-    if runs * size > _FEW:
-        for run in prange(runs):
-            _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
-    else:
-        for run in range(runs):
-            _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
+    for run in prange(runs):
+        _primal_plane(x, pa, pb, pc, run * na // runs, nc, _f(threshold), w0, w1, w2, _f(floor), zero, edges[run])
     for run in prange(runs):
         first, last = run * na // runs, (run + 1) * na // runs
         if back0 and run == 0:  # before the first plane there is no difference
@@ -198,8 +187,8 @@ def dual_field(shape: tuple[int, int, int]) -> DualField:
 def dual_scratch(shape: tuple[int, int, int]) -> DualScratch:
     """Scratch for `dual_step` and `primal`.
 
-    Two arrays, each without gaps: from parts of one the compiler makes code that gathers single numbers, at a third of
-    the speed.
+    Arrays of their own, without gaps: from parts of one the compiler makes code that gathers single numbers. That takes
+    three times as long.
     """
     runs, (_, b, c) = _runs(shape), shape
     shapes = (runs, b * c + 1), (runs, 2, b * c + 1), (b * c,)
