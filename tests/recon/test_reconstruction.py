@@ -7,7 +7,7 @@ import json
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -265,3 +265,16 @@ def test_a_result_is_saved_as_a_whole_and_nothing_is_overwritten(noisy: np.ndarr
     with pytest.raises(ValueError, match="beamline export"):
         result.save(tmp_path / "v.tif")
     assert [path.name for path in tmp_path.iterdir()] == ["v.npz"]
+
+
+@pytest.mark.parametrize("method", [recon.FistaTv(), recon.R2(steps=150)])
+def test_a_helical_scan_is_a_height_a_view(method: recon.Method) -> None:
+    """A ball higher than the detector, in two turns; without its heights it is a smear."""
+    heights = np.column_stack((np.zeros(60), np.linspace(-8, 8, 60)))
+    still = recon.Geometry.cone(np.linspace(0, 4 * np.pi, 60, endpoint=False), (16, 32), 1.0, 300.0, 300.0)
+    helix, grid = replace(still, shifts=heights), recon.Grid((32, 32, 32), 1.0)
+    z, y, x = np.indices(grid.shape) - 15.5
+    truth = (np.hypot(np.hypot(x - 3, y), z) < 11).astype(np.float32)
+    views = recon.Projector(helix, grid).forward(truth)
+    found, smeared = (psnr(truth, recon.reconstruct(views, g, method, grid=grid).volume.data) for g in (helix, still))
+    assert found > 25 and found > smeared + 10
