@@ -14,6 +14,7 @@ from zlib_ng import zlib_ng
 
 from beamline.core.files import to_disk
 from beamline.storage.superblock import Superblock
+from beamline.storage.torn import made_whole
 
 _KEPT = 2**20  # bytes of a write that HDF5 may read again: it reads larger ones, of voxels, from its own cache
 _BLOCK = 2**24  # bytes that are read back at once
@@ -77,7 +78,10 @@ class UnderHdf5:
 
 
 class GrowingFile(UnderHdf5):
-    """A file that a program of ours is writing, as if it were closed: a refresh by HDF5 finds its present state."""
+    """A file that a program of ours is writing, or did until it died, as if it were closed.
+
+    A refresh by HDF5 finds its present state. Torn blocks are read as whole ones.
+    """
 
     def __init__(self, path: Path, head: Superblock) -> None:
         super().__init__(path, "r", _ENDLESS)
@@ -87,6 +91,7 @@ class GrowingFile(UnderHdf5):
         super()._read(at, out)
         head = self._head[at : at + len(out)]
         out[: len(head)] = head
+        made_whole(at, out)
 
 
 class DiskFile(UnderHdf5):

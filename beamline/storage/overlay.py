@@ -9,6 +9,7 @@ from typing import Any
 
 from beamline.storage.disk_file import UnderHdf5
 from beamline.storage.journal import FileChange, FileChanges
+from beamline.storage.torn import made_whole
 
 _PAGE = 4096  # bytes: a change within one of these reaches the disk in one piece, as far as any does
 
@@ -74,6 +75,15 @@ class Overlay(UnderHdf5):
         out = bytearray(_PAGE)
         self._from_disk(page * _PAGE, memoryview(out))
         return out
+
+
+class WholeBlocks(Overlay):
+    """An overlay that makes torn blocks whole."""
+
+    def _read(self, at: int, out: memoryview) -> None:
+        super()._read(at, out)
+        if (mended := made_whole(at, out)) is not None:
+            self.put(*mended)
 
 
 def _pages(begin: int, end: int) -> range:

@@ -23,16 +23,15 @@ from beamline.core.text import count, size, spans
 from beamline.monitor.digest import has_checksum
 from beamline.storage import hdf5, journal
 from beamline.storage.journal import FileChanges
-from beamline.storage.overlay import Overlay
+from beamline.storage.overlay import Overlay, WholeBlocks
 from beamline.storage.parts import require_joined, views_in, views_planned
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import SIZE, Superblock, superblock
-from beamline.storage.writer_lock import WriterLock, held
+from beamline.storage.writer_lock import QUIET, WriterLock, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import has_exchange_view, with_exchange_view
 from beamline.storage.writers.rows import altered_rows
 
-QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
 COMPARED = 2**31  # bytes of the last frames: more than a machine that loses power has not brought to the disk yet
 
 
@@ -174,7 +173,7 @@ def _require_ours(path: Path, file: h5py.File) -> None:
 def _mended(path: Path, head: Superblock) -> tuple[Recovered, FileChanges]:
     """The recovered file, and the changes that make it."""
     end = max(head.end, head.size) if head.open_for_writing else head.end
-    overlay = Overlay(path, length=end)
+    overlay = WholeBlocks(path, length=end)
     overlay.put(0, head.closed(end).head)
     try:
         with h5py.File(overlay, "r") as file:

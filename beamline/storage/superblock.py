@@ -42,7 +42,7 @@ class Superblock:
     @property
     def intact(self) -> bool:
         """Whether its checksum is right."""
-        return self.head[_CHECKSUM] == _checksum(self.head[: _CHECKSUM.start])
+        return self.head[_CHECKSUM] == lookup3(self.head[: _CHECKSUM.start])
 
     @property
     def end(self) -> int:
@@ -54,7 +54,7 @@ class Superblock:
         head = bytearray(self.head)
         head[_FLAGS] = 0
         head[_END] = end.to_bytes(8, "little")
-        head[_CHECKSUM] = _checksum(bytes(head[: _CHECKSUM.start]))
+        head[_CHECKSUM] = lookup3(bytes(head[: _CHECKSUM.start]))
         return replace(self, head=bytes(head))
 
 
@@ -67,8 +67,8 @@ def superblock(path: Path) -> Superblock | None:
     return Superblock(head, path.stat().st_size)
 
 
-def _checksum(data: bytes) -> bytes:
-    """lookup3 (Jenkins 2006, `hashlittle` from 0), which HDF5 has for metadata; of a whole number of words."""
+def lookup3(data: bytes) -> bytes:
+    """The checksum of HDF5's metadata (Jenkins 2006, `hashlittle` from 0)."""
     words = [int.from_bytes(data[i : i + 4], "little") for i in range(0, len(data), 4)]
     state = [0xDEADBEEF + len(data) & _WORD] * 3
     while words:

@@ -10,6 +10,8 @@ import sys
 import weakref
 from pathlib import Path
 
+QUIET = 10.0  # s without a change, after which no program is taken to write the file, where locks do not say it
+
 if sys.platform == "win32":
     import msvcrt
 

@@ -17,8 +17,8 @@ from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
+from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, decode
 from tests.beamline.ran import small

@@ -33,9 +33,8 @@ from beamline.storage.ingest import ingest
 from beamline.storage.parts import JOINED, joined_file_of
 from beamline.storage.readers.open import open_scan
 from beamline.storage.readers.overlay import OverlaidSource
-from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
-from beamline.storage.writer_lock import WriterLock
+from beamline.storage.writer_lock import QUIET, WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import FrameKind

@@ -25,8 +25,8 @@ from beamline.storage.describe import describe
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.parts import JOINED, is_joined
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recover import QUIET
 from beamline.storage.rules.validate import validate
+from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from beamline.storage.writers.rows import Rows

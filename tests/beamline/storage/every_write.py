@@ -29,8 +29,9 @@ from beamline.storage import hdf5
 from beamline.storage.describe import describe
 from beamline.storage.parts import views_in
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.recover import QUIET, recover
+from beamline.storage.recover import recover
 from beamline.storage.rules.validate import validate
+from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.clock import SystemClock

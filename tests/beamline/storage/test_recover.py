@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -18,11 +18,13 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
+from beamline.storage.overlay import Overlay
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recover import QUIET, recover
+from beamline.storage.recover import recover
 from beamline.storage.rules.validate import validate
-from beamline.storage.superblock import superblock
-from beamline.storage.writer_lock import held
+from beamline.storage.superblock import lookup3, superblock
+from beamline.storage.torn import block_size
+from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
@@ -178,11 +180,47 @@ def test_a_damaged_file_is_refused_and_stays_as_it_is(
     assert path.read_bytes() == before
 
 
+def _torn(old: bytes, new: bytes) -> Iterator[bytes]:
+    """Files whose writer was killed within the write of a block across the end of a page of memory."""
+    for end in range(4096, len(old), 4096):
+        begin = old.rfind(b"OHDR", end - 400, end)
+        if end < begin + block_size(memoryview(old[begin:])) and old[begin:end] != new[begin:end]:
+            yield old[:begin] + new[begin:end] + old[end:]
+
+
+def test_a_block_that_a_kill_left_half_written_is_made_whole(
+    tmp_path: Path, clock: StandingClock, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, died, seen = tmp_path / "s.h5", tmp_path / "died.h5", 0
+    writer = NXtomoWriter(path, INFO, SHAPE, clock=clock)
+    for k, frame in enumerate(frames[:12]):
+        before = path.read_bytes()
+        writer.append(frame, digest(frame.counts))
+        for torn in _torn(before, path.read_bytes()) if k else ():
+            died.write_bytes(torn)
+            with monkeypatch.context() as patched, pytest.raises(DataError, match="checksum"):
+                patched.setattr("beamline.storage.recover.WholeBlocks", Overlay)
+                recover(_aged(died))
+            with open_scan(died) as source:  # while HDF5 itself would wait for ever for a writer to end the block
+                assert source.image_key.size == k
+            done = recover(died)
+            assert (done.frames, done.damaged, done.altered) == (k, (), ())
+            with open_scan(died) as source:
+                assert all((source.read([i])[0] == frames[i].counts).all() for i in range(k))
+            seen += 1
+    assert seen >= 10
+
+
 def test_another_programs_file_is_refused(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "other.h5", "w", libver=layout.LIBVER) as file:
         file["data"] = np.zeros(3)
     with pytest.raises(DataError, match="no scan of this program"):
         recover(tmp_path / "other.h5")
+
+
+def test_the_checksum_is_the_published_one() -> None:
+    """Jenkins 2006, lookup3.c, driver5."""
+    assert lookup3(b"Four score and seven years ago") == (0x17770551).to_bytes(4, "little")
 
 
 def test_the_head_is_read_and_written_as_hdf5_does(tmp_path: Path) -> None:

@@ -23,7 +23,8 @@ from beamline.projections.selection import Selection
 from beamline.storage.ingest import ingest
 from beamline.storage.parts import join
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recover import QUIET, recover
+from beamline.storage.recover import recover
+from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
