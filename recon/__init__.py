@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from recon.reconstruction import Reconstruction, reconstruct
     from recon.registration import register_energies
     from recon.series import TimedViews, TimedVolumes, fit_series
+    from recon.share_fit import fit_share
     from recon.spectral import Materials, fit_materials
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.published import R2Published
@@ -97,6 +98,7 @@ __all__ = [
     "find_axis",
     "fit_materials",
     "fit_series",
+    "fit_share",
     "mlem",
     "project",
     "reconstruct",
@@ -120,6 +122,7 @@ _LAZY = {
     **dict.fromkeys(("TimedVolumes", "TimedViews", "fit_series"), "recon.series"),
     "EnergyViews": "recon.energy_fit",
     **dict.fromkeys(("Materials", "fit_materials"), "recon.spectral"),
+    "fit_share": "recon.share_fit",
     "FitSettings": "recon.splatting.settings",
     "Gaussians": "recon.splatting.gaussians",
     **dict.fromkeys(("Emission", "attenuation_factors", "mlem", "weighted_lines"), "recon.voxels.emission"),

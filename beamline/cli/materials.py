@@ -42,11 +42,17 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     is_flag=True,
     help="Find where the sample stood in each scan, and its magnification; correct them.",
 )
+@click.option(
+    "--states",
+    metavar="NAME,NAME",
+    default="",
+    help="Two materials that are states of one, as a fresh and a charged oxide: the share of the second is smooth.",
+)
 @selection_options
 @heading(OUTPUT)
 @json_option
 def materials(
-    files: tuple[Path, ...], spectra: Path, output: Path, register: bool, as_json: bool, **values: Any
+    files: tuple[Path, ...], spectra: Path, output: Path, register: bool, states: str, as_json: bool, **values: Any
 ) -> None:
     """Fit the volume fraction of each material to scans of one sample at several energies, all at once.
 
@@ -57,7 +63,7 @@ def materials(
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
-    from beamline.reconstruct.energy_series import read_spectra, reconstruct_materials
+    from beamline.reconstruct.energy_series import MaterialOptions, read_spectra, reconstruct_materials
     from beamline.scan.energies import is_series, scans_in
 
     table = read_spectra(spectra)
@@ -68,7 +74,8 @@ def materials(
         refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
         made = reconstruct_materials(
             [chosen(path, 0, values) for path in files], table, output, sink, clock,
-            lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False), register,
+            lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False),
+            MaterialOptions(register, tuple(name.strip() for name in states.split(",")) if states else ()),
         )  # fmt: skip
         data = {"outputs": made.outputs, "residual": made.residual, "stopped": made.early, "displacements": made.moves}
         sink(Done(data, time=clock.now()))

@@ -34,6 +34,8 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.energy_fit import EnergyViews
 from recon.registration import register_energies
+from recon.share_fit import STEPS as SHARE_STEPS
+from recon.share_fit import fit_share
 from recon.spectral import Materials, fit_materials
 from recon.voxels.displacement import Displacement, measured_unmagnified, unmagnified
 
@@ -105,6 +107,31 @@ def read_spectra(path: Path) -> Spectra:
 _TABLE = "a first line 'energy_kev,NAME,NAME,...', then a line of keV and 1/mm for each energy"
 
 
+@dataclass(frozen=True)
+class MaterialOptions:
+    """What `reconstruct_materials` does beside the fit.
+
+    Attributes:
+        register: find where the sample stood in each scan, and how the image is shifted and magnified; correct it.
+        states: names of two materials that are states of one, so that the share of the second is smooth within matter;
+            empty: there are none.
+    """
+
+    register: bool = False
+    states: tuple[str, ...] = ()
+
+    def indices(self, spectra: Spectra) -> tuple[int, int] | None:
+        """The states among the materials of a table; None without states. ConfigError for others."""
+        if not self.states:
+            return None
+        if len(set(self.states)) != 2 or len(self.states) != 2 or not set(self.states) <= set(spectra.names):
+            raise ConfigError(
+                f"--states {','.join(self.states)}: expected two of the materials {', '.join(spectra.names)} of "
+                f"{spectra.path}. Nothing was written."
+            )
+        return spectra.names.index(self.states[0]), spectra.names.index(self.states[1])
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialRun:
     """What `reconstruct_materials` made.
@@ -130,16 +157,13 @@ def reconstruct_materials(
     clock: Clock,
     counting: Callable[[str], Callable[[int, int], None]],
     stop: StopOnSignal,
-    register: bool = False,
+    options: MaterialOptions = MaterialOptions(),
 ) -> MaterialRun:
     """Fit the volume fraction of each material to all scans, and write OUTPUT's stem + _NAME.h5 for each of them.
 
     The rotation axis of the first scan is used for the others, unless it is told. Views of another pixel size, as a
     lens gives it at another energy, are interpolated to that of the first scan. Ctrl-C ends the fit with the volumes so
     far.
-
-    Args:
-        register: find where the sample stood in each scan, and how the image is shifted and magnified; correct it.
 
     Raises:
         ConfigError: scans that do not fit together, energies that are missing or do not tell the materials apart, or
@@ -150,6 +174,7 @@ def reconstruct_materials(
     outputs = {name: output.with_name(f"{output.stem}_{name}{_SUFFIX}") for name in spectra.names}
     for path in outputs.values():
         refuse_existing(path)
+    states = options.indices(spectra)
     parts: list[PreparedProjections] = []
     middles: list[float] = []
     attenuation, axis_col, progress = [], None, counting("scans")
@@ -165,7 +190,7 @@ def reconstruct_materials(
                     f"{scan.path} does not state its energy (keV, instrument/beam/incident_energy of NXtomo), which "
                     "chooses the line of the spectra. Nothing was written."
                 )
-            if register and cone_of(scan, selection) is not None:
+            if options.register and cone_of(scan, selection) is not None:
                 raise ConfigError(
                     f"--register: {scan.path} is of a cone, whose rays a shift of the sample turns. Leave it out. "
                     "Nothing was written."
@@ -181,7 +206,7 @@ def reconstruct_materials(
     _refuse_unlike(parts)
     views = _joined([_of_pixels(part, parts[0], row) for part, row in zip(parts, middles, strict=True)], attenuation)
     moves: tuple[Displacement, ...] = ()
-    if register:
+    if options.register:
         try:
             views, moves = register_energies(views, counting("registration"))
         except ValueError as error:
@@ -200,13 +225,36 @@ def reconstruct_materials(
         with stop() as stopping:
             made = fit_materials(views, grid, sweeps=_SWEEPS, go_on=go_on, stop=stopping)
             early = early or stopping()
+            if states is not None and not early:
+                made, early = _with_share(views, made, states, counting("share"), stopping)
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
     facts: dict[str, Any] = {"ended_early": True} if early else {}
+    if states is not None:
+        facts |= {"states": ",".join(options.states)}
     if moves:
         facts |= {"displacements": np.array([astuple(move) for move in moves])}
     _write(made, parts[0], scans, outputs, facts, clock.now())
     return MaterialRun(outputs, made.residual, early, moves)
+
+
+def _with_share(
+    views: EnergyViews,
+    made: Materials,
+    states: tuple[int, int],
+    told: Callable[[int, int], None],
+    stopping: Callable[[], bool],
+) -> tuple[Materials, bool]:
+    """`fit_share`, and whether it was stopped."""
+    early = False
+
+    def go_on(left: int) -> bool:
+        nonlocal early
+        told(SHARE_STEPS - left, SHARE_STEPS)
+        early = stopping()
+        return not early
+
+    return fit_share(views, made, states, go_on), early
 
 
 def _of_pixels(part: PreparedProjections, first: PreparedProjections, middle: float) -> PreparedProjections:

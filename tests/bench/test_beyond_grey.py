@@ -103,6 +103,10 @@ def test_energies(kind: str) -> None:
         return np.einsum("me,ezyx->mzyx", np.linalg.pinv(sections), np.stack(found))[1].astype(np.float32)
 
     measured(f"energies of the {kind}, together", truth[1], lambda: recon.fit_materials(views).densities[1])
+    measured(
+        f"energies of the {kind}, states of one material", truth[1],
+        lambda: recon.fit_share(views, recon.fit_materials(views), (0, 1)).densities[1],
+    )  # fmt: skip
     measured(f"energies of the {kind}, apart", truth[1], apart)
 
 

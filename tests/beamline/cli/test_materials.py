@@ -93,6 +93,32 @@ def test_each_grain_is_in_the_volume_of_its_material(scans: list[Path], tmp_path
     assert "never overwritten" in again.output
 
 
+def test_states_of_one_material_keep_their_sum(scans: list[Path], tmp_path: Path) -> None:
+    found = {}
+    for name, words in (("plain", ()), ("smooth", ("--states", "fresh, charged"))):
+        done = run(
+            "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / f"{name}.h5", "--axis", "31.5", *words
+        )
+        assert done.exit_code == 0, done.output
+        for material in GRAINS:
+            with opened_volume(tmp_path / f"{name}_{material}.h5") as record:
+                found[name, material] = np.asarray(record.volume.data)
+                assert record.parameters.get("states") == ("fresh,charged" if words else None)
+    plain, smooth = (sum(found[name, material] for material in GRAINS) for name in ("plain", "smooth"))
+    np.testing.assert_allclose(plain, smooth, atol=1e-5)
+    inside = smooth > 0.9
+    share = {name: found[name, "charged"][inside] / smooth[inside] for name in ("plain", "smooth")}
+    assert (
+        np.abs(share["smooth"] - np.round(share["smooth"])).mean()
+        < 0.5 * np.abs(share["plain"] - np.round(share["plain"])).mean()
+    )
+    refused = run(
+        "materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "no.h5", "--states", "fresh,other"
+    )
+    assert refused.exit_code == 2 and "expected two of the materials fresh, charged" in refused.output
+    assert not list(tmp_path.glob("no*"))
+
+
 def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> None:
     (tmp_path / "narrow").mkdir()
     narrow = spectra(tmp_path / "narrow", (8.34, 8.36))
