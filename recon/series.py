@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,18 +18,20 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import JUDGE_SWEEPS, MOTION_SWEEPS, learnt_motion, unseen_residuals
-from recon.spectral import ALIKE_LONGER, weights_by_views
+from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
+from recon.spectral import ALIKE_LONGER, weight_of, weights_by_views
 from recon.spectral import TRIAL_SWEEPS as _WEIGHT_SWEEPS
-from recon.voxels.held_out_weight import ONE_IN
+from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
 from recon.voxels.motion import Motion, moved
-from recon.voxels.projector import volume_lines, volume_slices
+from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 _MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
 _MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
-_MOVES = 0.95  # of what volumes leave of views held out: a motion that leaves less is there
+_MOVES = 0.95  # of what volumes leave of views held out: a motion that leaves less is there, or factors that do
+_ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
-TRIAL_SWEEPS = ALIKE_LONGER * _WEIGHT_SWEEPS + JUDGE_SWEEPS + MOTION_SWEEPS
+TRIAL_SWEEPS = ALIKE_LONGER * _WEIGHT_SWEEPS + JUDGE_SWEEPS + MOTION_SWEEPS + TRIAL_STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +77,8 @@ class TimedVolumes:
         motion: from where each place takes its value; None: nothing moves.
         unseen_residuals: what coarse volumes without and with motion leave of views held out, as `residual`; None where
             the motion was not chosen by them.
+        smooth: of `recon.proportions`: each volume is the mean of all, times factors smooth within matter. None:
+            each is fitted by itself.
     """
 
     times: F64
@@ -83,6 +87,7 @@ class TimedVolumes:
     residual: float
     motion: Motion | None = None
     unseen_residuals: tuple[float, float] | None = None
+    smooth: float | None = None
 
     def at(self, time: float) -> F32:
         """The volume [z, y, x] at a time; before the first and after the last knot that of the knot."""
@@ -118,8 +123,11 @@ def fit_series(
     h_k are hats: the volume is linear in time between knots. W displaces it, smooth in space and time, and is 1 in the
     middle of the scan (`recon.voxels.motion`). This is the problem of `fit_materials`, with knots for materials and the
     hats for their cross sections: z_j are the orthonormal components of all x_k, the first what they have in common.
-    Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, and of the motion each count
-    down to 0; they are `TRIAL_SWEEPS` at most in all.
+    Where nothing moves, and views held out are predicted better so, the volumes become factors of their mean that are
+    smooth within matter: bodies that take up or lose something, each at its time.
+    Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, of the motion and of factors
+    each count down to 0. They are `TRIAL_SWEEPS` and `sweeps` at most in all. After the sweeps, the steps of the
+    factors count down.
 
     Args:
         knots: volumes, 2 or more.
@@ -159,9 +167,73 @@ def fit_series(
     if motion:
         learnt = learnt_motion(coarse, coarse_past, coarse_weights, go_on, stop)
         learnt = learnt and learnt.on(learnt.shape, past)
+    smooth = None if learnt is not None else _smooth_factors(energies, grid, weights, sweeps, seed, go_on, stop)
     fit = EnergyFit(energies, grid, np.random.default_rng(seed), learnt, stop)
-    volumes, residual = fitted(fit, weights, sweeps, go_on)
-    return TimedVolumes(times, volumes, grid, residual, learnt, left)
+    going = True
+
+    def heard(sweep: int, residual: float) -> bool:
+        nonlocal going
+        going = go_on(sweep, residual)
+        return going
+
+    volumes, residual = fitted(fit, weights, sweeps, heard)
+    if smooth is None or not going or stop():
+        return TimedVolumes(times, volumes, grid, residual, learnt, left)
+    problem = _of_factors(energies, volumes, grid, stop)
+    steps = Countdown(lambda after: go_on(-after, residual), SOLUTION_STEPS)
+    factors = problem.solved(smooth, problem.ones(), steps)
+    changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
+    return TimedVolumes(times, changed, grid, fit.residual_of(changed), learnt, left, smooth)
+
+
+def _of_factors(views: EnergyViews, volumes: F32, grid: Grid, stop: Callable[[], bool]) -> Proportions:
+    """Factors of the mean of the volumes; rays with little light behind the mean weigh less."""
+    projector, matter = Projector(views.geometry, grid), volume_lines(volumes.mean(0))
+    weight = weight_of(np.exp(-projector.forward_lines(matter)))
+    if views.weight is not None:
+        weight *= projection_lines(views.weight) > 0
+    data = projection_lines(views.projections)
+    return Proportions(projector, views.energy, views.cross_sections, matter, data, weight, stop)
+
+
+def _smooth_factors(
+    views: EnergyViews,
+    grid: Grid,
+    weights: F64,
+    sweeps: int,
+    seed: int,
+    go_on: Callable[[int, float], bool],
+    stop: Callable[[], bool],
+) -> float | None:
+    """How smooth factors of the mean are best; None: volumes by themselves predict views held out as well.
+
+    Of some rows, from seven of eight views.
+    """
+    rows, n_rows = slice(None), views.geometry.detector_shape[0]
+    if views.geometry.rows_show_slices:
+        rows = busiest_rows(views.projections, _ROWS)
+        grid = slab_of(views.geometry, grid, *rows.indices(n_rows)[:2])[1]
+    held_out = views.parted(ONE_IN) == ONE_IN // 2
+    fit = EnergyFit(views.select(np.flatnonzero(~held_out), rows), grid, np.random.default_rng(seed), stop=stop)
+    going = True
+
+    def heard(sweep: int, residual: float) -> bool:
+        nonlocal going
+        going = go_on(sweep - sweeps - TRIAL_STEPS, residual)
+        return going
+
+    free, residual = fitted(fit, weights, sweeps, heard)
+    if not going or stop():
+        return None
+    problem = _of_factors(views.select(np.arange(held_out.size), rows), free, grid, stop)
+    seen, judge = problem.select(np.flatnonzero(~held_out)), problem.select(np.flatnonzero(held_out))
+    steps = Countdown(lambda after: go_on(-after, residual), TRIAL_STEPS)
+    smooth, left = smoothness(seen, judge, seen.ones(), steps)
+    steps.end()
+    if not steps.going or stop():
+        return None
+    alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free]))
+    return smooth if left < _MOVES * alone else None
 
 
 def _of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:

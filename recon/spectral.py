@@ -94,6 +94,11 @@ def fit_materials(
     return Materials(densities, grid, weights, residual)
 
 
+def weight_of(light: F32) -> F32:
+    """Weights of rays that so much of the light passes, up to 1."""
+    return np.clip(light / _LITTLE, _LEAST, 1)
+
+
 def _weighed(views: EnergyViews) -> EnergyViews:
     """Rays with less than a tenth of the light weigh less, by the mean depth around them, down to a tenth.
 
@@ -105,7 +110,7 @@ def _weighed(views: EnergyViews) -> EnergyViews:
     for view, image in enumerate(views.projections):
         near = gaussian_filter(there[view], _NEAR)
         light[view] = np.exp(-gaussian_filter(there[view] * image, _NEAR) / np.maximum(near, 1e-3))
-    weight = np.clip(light / _LITTLE, _LEAST, 1)
+    weight = weight_of(light)
     if views.weight is not None:
         weight *= np.minimum(1, views.weight / (_LITTLE * (float(views.weight.max()) or 1)))
     return replace(views, weight=weight.astype(np.float32))

@@ -254,7 +254,7 @@ def _with_share(
         early = stopping()
         return not early
 
-    return fit_share(views, made, states, go_on), early
+    return fit_share(views, made, states, go_on, stopping), early or stopping()
 
 
 def _of_pixels(part: PreparedProjections, first: PreparedProjections, middle: float) -> PreparedProjections:

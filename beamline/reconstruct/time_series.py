@@ -86,7 +86,7 @@ class SeriesNeeds:
             f"{'volumes':<10}{self.shape[0]} of {shape} voxels, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}",
             f"{'disk':<10}{size(self.output)} for the result",
-            f"{'time':<10}not estimated; {_SWEEPS} sweeps, and {TRIAL_SWEEPS} at most before them",
+            f"{'time':<10}not estimated; {_SWEEPS} sweeps, and {TRIAL_SWEEPS + _SWEEPS} at most before them",
         ]
 
 
@@ -193,6 +193,8 @@ def reconstruct_series(
     phases.enter("writing")
     series = VolumesInTime(made.times - times.min(), np.stack([made.at(at) for at in made.times]))
     shape, settings = series.data.shape, {"volumes": wanted.volumes, "moves": made.motion is not None, "chosen": chosen}
+    if made.smooth is not None:
+        settings["smooth"] = made.smooth
     outcome = ReconOutcome(
         Volume(series.data[0], made.grid), "series", clock.now() - began, (),
         settings | {"view_seconds": times - times.min()} | ({"ended_early": True} if early else {}), options.filter,

@@ -12,6 +12,7 @@ import recon
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.proportions import SOLUTION_STEPS
 from recon.series import TimedViews, TimedVolumes, _of_moments, fit_series, hats
 from recon.voxels.projector import Projector
 
@@ -116,7 +117,8 @@ def test_one_fit_beats_sub_scans_and_one_volume_of_all_views() -> None:
         apart = of_sub_scans(views, parts)
         others.append(mean_psnr({t: apart.at(t) for t in times}))
     found = fit_series(views, 4, motion=False, tv_weight=0.35)
-    assert mean_psnr({t: found.at(t) for t in times}) > max(others)
+    assert found.smooth is not None  # each disc changes by a factor of its own
+    assert mean_psnr({t: found.at(t) for t in times}) > max(others) + 1
 
 
 def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> None:
@@ -130,7 +132,7 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
     assert np.array_equal(
         first.volumes, fit_series(views, 3, motion=False, tv_weight=0.05, go_on=lambda sweep, _: sweep < 3).volumes
     )
-    assert heard == [1, 2, 3]
+    assert heard[-3:] == [1, 2, 3]
     assert first.volumes.dtype == np.float32
 
 
@@ -149,9 +151,9 @@ def test_views_held_out_tell_a_sample_that_moves_from_one_that_changes_in_place(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("motion", "stages"), [(None, 2), (False, 1), (True, 2)])
+@pytest.mark.parametrize(("motion", "stages"), [(None, 3), (False, 2), (True, 2)])
 def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: int) -> None:
-    """Weights, then whether it moves (here not), or the motion itself."""
+    """Weights, whether it moves (here not), or the motion itself; then factors of the mean, if it does not move."""
     heard = list[int]()
 
     def go_on(sweep: int, residual: float) -> bool:
@@ -159,13 +161,15 @@ def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: in
         return True
 
     fit_series(views_of(48, noise=0.05), 3, motion=motion, sweeps=2, go_on=go_on)
-    assert heard[-2:] == [1, 2]
-    trials = np.array(heard[:-2])
+    end = heard.index(2)
+    assert heard[end - 1 : end + 1] == [1, 2]
+    assert heard[end + 1 :] in ([], [*range(1 - SOLUTION_STEPS, 1)])
+    trials = np.array(heard[: end - 1])
     parts = np.split(trials, np.flatnonzero(np.diff(trials) < 1) + 1)
     assert len(parts) == stages
     for part in parts:
         assert part[-1] == 0 and len(part) <= 1 - part[0]
-    for fixed in parts[1:]:
+    for fixed in parts[1:2] if motion is not False else ():
         np.testing.assert_array_equal(fixed, np.arange(1 - len(fixed), 1))
 
 

@@ -1,0 +1,182 @@
+"""Proportions: densities that differ from a known one by factors which are smooth within matter, by least squares.
+
+    min over s of ½ Σ_v w_v |A_v f Σ_k c[e(v), k] s_k - q_v|²
+                  + λ/2 Σ_k (Σ_ij f_i f_j (s_ki - s_kj)² + τ Σ_i f_i² (s_ki - s_k+1,i)²)
+
+f is a known density, A_v a view, c the share of each s_k in views of a kind e, such as an energy or a moment, and i, j
+are neighbours. Nothing is smoothed across places without matter, so bodies that do not touch keep their own factors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64
+from recon.voxels.projector import Projector
+
+_HEAVIEST, _LIGHTER, _TRIALS = 32.0, 3.0, 9  # first λ over the mean curvature of the views; its ratio to the next
+_IN_TIME = 0.03  # τ
+SOLUTION_STEPS, _TRIAL_STEPS = 60, 20  # of conjugate gradients
+TRIAL_STEPS = _TRIALS * _TRIAL_STEPS
+"""Steps of all trials, at most."""
+
+
+class _StoppedError(Exception):
+    """`stop` interrupted a step."""
+
+
+@dataclass
+class Countdown:
+    """Tells a listener how many steps may follow, and remembers that it ended them."""
+
+    go_on: Callable[[int], bool]
+    left: int
+    stop: Callable[[], bool] = lambda: False
+    going: bool = True
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        self.going = self.going and self.go_on(max(0, self.left))
+        return self.going
+
+    def end(self) -> None:
+        """No more may follow."""
+        if self.going and self.left > 0:
+            self.left, self.going = 0, self.go_on(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Proportions:
+    """The problem above. Volumes are [y, x, z], factors [k, y, x, z], views lines [view, col, row].
+
+    Attributes:
+        projector: of all views.
+        kind: e, [view].
+        shares: c [kind, k].
+        matter: f.
+        data: q.
+        weight: w.
+        stop: asked many times in each step. True ends it with the factors before the step.
+    """
+
+    projector: Projector
+    kind: NDArray[np.intp]
+    shares: F64
+    matter: F32
+    data: F32
+    weight: F32
+    stop: Callable[[], bool] = lambda: False
+
+    def select(self, views: NDArray[np.intp]) -> Proportions:
+        """Some of the views."""
+        return replace(
+            self, projector=self.projector.subset(views), kind=self.kind[views], data=self.data[views],
+            weight=self.weight[views],
+        )  # fmt: skip
+
+    @cached_property
+    def _kinds(self) -> list[tuple[Projector, NDArray[np.intp], F64]]:
+        """Projector, views and shares of each kind."""
+        owns = [(kind, np.flatnonzero(self.kind == kind)) for kind in np.unique(self.kind)]
+        return [(self.projector.subset(own), own, self.shares[kind]) for kind, own in owns]
+
+    def _each_kind(self) -> Iterator[tuple[Projector, NDArray[np.intp], F64]]:
+        for kind in self._kinds:
+            if self.stop():
+                raise _StoppedError
+            yield kind
+
+    def shown(self, factors: F32) -> F32:
+        """A f Σ c s."""
+        out = np.empty_like(self.data)
+        for projector, own, shares in self._each_kind():
+            out[own] = projector.forward_lines(self.matter * np.tensordot(shares.astype(np.float32), factors, 1))
+        return out
+
+    def explained(self, lines: F32) -> F32:
+        """The transpose of `shown`, of weighed lines."""
+        out = np.zeros((self.shares.shape[1], *self.matter.shape), np.float32)
+        for projector, own, shares in self._each_kind():
+            back = self.matter * projector.adjoint_lines(self.weight[own] * lines[own])
+            for k in np.flatnonzero(shares):
+                out[k] += np.float32(shares[k]) * back
+        return out
+
+    def left(self, factors: F32) -> float:
+        """Weighed squares that factors leave of the views."""
+        residual = self.data - self.shown(factors)
+        return float(np.vdot(residual, self.weight * residual))
+
+    def rough(self, factors: F32) -> F32:
+        """Gradient of half the weighed squares of differences, without λ."""
+        out = np.zeros_like(factors)
+        flow = np.float32(_IN_TIME) * self.matter**2 * np.diff(factors, axis=0)
+        out[:-1] -= flow
+        out[1:] += flow
+        for axis in range(3):
+            low, high = ((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
+            pairs = self.matter[low] * self.matter[high]
+            for own, into in zip(factors, out, strict=True):
+                across = pairs * (own[high] - own[low])
+                into[low] -= across
+                into[high] += across
+        return out
+
+    def ones(self) -> F32:
+        """Factors of 1."""
+        return np.ones((self.shares.shape[1], *self.matter.shape), np.float32)
+
+    def solved(self, smooth: float, factors: F32, go_on: Callable[[], bool], steps: int = SOLUTION_STEPS) -> F32:
+        """Steps of conjugate gradients (Hestenes & Stiefel 1952) from first factors.
+
+        Args:
+            smooth: λ over the mean curvature of the views.
+            go_on: asked before each step. False ends it.
+        """
+        found = factors.copy()
+        with suppress(_StoppedError):
+            mean = float(np.vdot(self.explained(self.shown(self.ones())).sum(0), self.matter))
+            weight = np.float32(smooth * mean / max(len(factors) * float(np.vdot(self.matter, self.matter)), 1e-30))
+
+            def normal(of: F32) -> F32:
+                return self.explained(self.shown(of)) + weight * self.rough(of)
+
+            left = self.explained(self.data) - normal(found)
+            towards, squares = left.copy(), float(np.vdot(left, left))
+            for _ in range(steps):
+                if squares == 0 or not go_on():
+                    break
+                image = normal(towards)
+                length = np.float32(squares / float(np.vdot(towards, image)))
+                found += length * towards
+                left -= length * image
+                before, squares = squares, float(np.vdot(left, left))
+                towards = left + np.float32(squares / before) * towards
+        return found
+
+
+def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
+    """The `smooth` of `solved` with which the views of `fit` predict those of `judge` best, and what these are left.
+
+    Made lighter from a heavy one until it predicts worse twice.
+
+    Args:
+        first: factors to begin with.
+    """
+    factors, best, least, worse = first, _HEAVIEST, math.inf, 0
+    with suppress(_StoppedError):
+        for trial in range(_TRIALS):
+            smooth = _HEAVIEST / _LIGHTER**trial
+            factors = fit.solved(smooth, factors, go_on, _TRIAL_STEPS)
+            left = judge.left(factors)
+            best, least, worse = (smooth, left, 0) if left < least else (best, least, worse + 1)
+            if worse == 2:
+                break
+    return best, least
