@@ -127,7 +127,7 @@ def fit_series(
     smooth within matter: bodies that take up or lose something, each at its time.
     Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, of the motion and of factors
     each count down to 0. They are `TRIAL_SWEEPS` and `sweeps` at most in all. After the sweeps, the steps of the
-    factors count down.
+    factors count down; if they are ended, the volumes are those without.
 
     Args:
         knots: volumes, 2 or more.
@@ -182,6 +182,9 @@ def fit_series(
     problem = _of_factors(energies, volumes, grid, stop)
     steps = Countdown(lambda after: go_on(-after, residual), SOLUTION_STEPS)
     factors = problem.solved(smooth, problem.ones(), steps)
+    if not steps.going or stop():
+        return TimedVolumes(times, volumes, grid, residual, learnt, left)
+    fit.stop = lambda: False
     changed = np.stack([volume_slices(problem.matter * np.maximum(factor, 0)) for factor in factors])
     return TimedVolumes(times, changed, grid, fit.residual_of(changed), learnt, left, smooth)
 

@@ -38,9 +38,9 @@ def fit_share(
     Args:
         found: of `fit_materials`, from the same views.
         states: indices of the two materials.
-        go_on: called before each of `STEPS` steps at most, with how many may follow. False ends it with the
-            share so far.
-        stop: asked many times within a step; True ends it with the share before the step.
+        go_on: called before each of `STEPS` steps at most, with how many may follow. False ends it, with the densities
+            found before.
+        stop: asked many times within a step. True ends it likewise.
 
     Raises:
         ValueError: states that are no two materials.
@@ -54,6 +54,8 @@ def fit_share(
     problem = share_problem(views, found.densities, states, found.grid)
     share = _even(problem)
     share = np.clip(volume_slices(replace(problem, stop=stop).solved(smooth, share, steps)[0]), 0, 1)
+    if not steps.going or stop():
+        return found
     densities, total = found.densities.copy(), found.densities[list(states)].sum(0)
     densities[states[0]], densities[states[1]] = total * (1 - share), total * share
     return replace(found, densities=densities)

@@ -173,6 +173,19 @@ def test_trials_count_down_to_zero_in_each_stage(motion: bool | None, stages: in
         np.testing.assert_array_equal(fixed, np.arange(1 - len(fixed), 1))
 
 
+def test_an_end_of_the_factors_gives_the_volumes_without() -> None:
+    views, past = views_of(48, noise=0.05), list[int]()
+
+    def go_on(sweep: int, residual: float) -> bool:
+        past.append(sweep)
+        return not (sweep <= 0 and 60 in past)
+
+    kept = fit_series(views, 3, motion=False, tv_weight=0.35, go_on=go_on)
+    assert past[-1] == 1 - SOLUTION_STEPS and kept.smooth is None
+    whole = fit_series(views, 3, motion=False, tv_weight=0.35)
+    assert whole.smooth is not None and psnr(kept.volumes, whole.volumes) > 20
+
+
 @pytest.mark.parametrize("asked", [1, 40])
 def test_a_stop_within_a_sweep_gives_volumes(asked: int) -> None:
     """Also while the weight is tried."""
