@@ -230,7 +230,7 @@ def reconstruct_materials(
     except ValueError as error:
         raise ConfigError(f"{error}. Nothing was written.") from error
     facts: dict[str, Any] = {"ended_early": True} if early else {}
-    if states is not None:
+    if states is not None and not early:
         facts |= {"states": ",".join(options.states)}
     if moves:
         facts |= {"displacements": np.array([astuple(move) for move in moves])}
