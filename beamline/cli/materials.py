@@ -63,7 +63,8 @@ def materials(
 
     Ctrl-C ends the fit with the volumes so far (exit code 4).
     """
-    from beamline.reconstruct.energy_series import MaterialOptions, read_spectra, reconstruct_materials
+    from beamline.reconstruct.energy_series import MaterialOptions, reconstruct_materials
+    from beamline.reconstruct.energy_views import read_spectra
     from beamline.scan.energies import is_series, scans_in
 
     table = read_spectra(spectra)

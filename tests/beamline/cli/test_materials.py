@@ -17,7 +17,7 @@ from beamline.cli.terminal import counting
 from beamline.core.errors import DataError
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.energy_series import read_spectra
+from beamline.reconstruct.energy_views import read_spectra
 from beamline.storage.volumes.files import opened_volume
 from recon.base.ray_width import RayWidth
 from simulators.light.palette import known
@@ -205,7 +205,7 @@ def test_an_output_of_another_format_is_refused(scans: list[Path], tmp_path: Pat
 def test_too_little_memory_is_said_before_a_scan_is_corrected(
     scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("beamline.reconstruct.energy_series.free_memory", lambda: 1e6)
+    monkeypatch.setattr("beamline.reconstruct.energy_views.free_memory", lambda: 1e6)
     done = run("materials", *scans, "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5")
     assert done.exit_code == 2
     assert "Give --rows, --views or --bin" in done.output
@@ -247,7 +247,7 @@ def test_scans_whose_sample_turned_by_other_arcs_do_not_fit(
         made.append(replace(part, geometry=part.geometry.seen_with(RayWidth(arc=arc if made else 0.1))))
         return made[-1]
 
-    monkeypatch.setattr("beamline.reconstruct.energy_series.prepare_projections", prepared)
+    monkeypatch.setattr("beamline.reconstruct.energy_views.prepare_projections", prepared)
     monkeypatch.setattr("beamline.reconstruct.energy_series._SWEEPS", 1)
     words = "--spectra", spectra(tmp_path), "-o", tmp_path / "out.h5", "--axis", "31.5", "--rows", "0:1"
     done = run("materials", *scans[:2], *words)
