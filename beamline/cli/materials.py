@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from beamline.cli.option_groups import DATA, OUTPUT, Grouped, heading
-from beamline.cli.options import json_option, refuse_shared
+from beamline.cli.options import json_option, names_in, refuse_shared
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import counting, events_shown
 from beamline.core.errors import ScanStopped
@@ -65,18 +65,17 @@ def materials(
     """
     from beamline.reconstruct.energy_series import MaterialOptions, reconstruct_materials
     from beamline.reconstruct.energy_views import read_spectra
-    from beamline.scan.energies import is_series, scans_in
+    from beamline.scan.energies import scans_of
 
     table = read_spectra(spectra)
     with events_shown(as_json) as sink:
         clock = SystemClock()
-        warn = Warnings(sink, clock)
-        files = tuple(scan for path in files for scan in (scans_in(path, warn) if is_series(path) else [path]))
+        files = scans_of(files, Warnings(sink, clock))
         refuse_shared({"--output": output, **{f"SCAN {n}": path for n, path in enumerate(files, 1)}})
         made = reconstruct_materials(
             [chosen(path, 0, values) for path in files], table, output, sink, clock,
             lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False),
-            MaterialOptions(register, tuple(name.strip() for name in states.split(",")) if states else ()),
+            MaterialOptions(register, names_in(states)),
         )  # fmt: skip
         data = {"outputs": made.outputs, "residual": made.residual, "stopped": made.early, "displacements": made.moves}
         sink(Done(data, time=clock.now()))

@@ -52,6 +52,11 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
+def names_in(value: str) -> tuple[str, ...]:
+    """Names that commas separate."""
+    return tuple(name.strip() for name in value.split(",")) if value else ()
+
+
 def together(*options: Decorator) -> Decorator:
     """A decorator that adds these options, in this order."""
 

@@ -7,7 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,16 +74,17 @@ def _scalar(value: Any) -> str:
     return text if _PLAIN.fullmatch(text) else json.dumps(text)
 
 
-def repeating(ctx: click.Context, argument: Path, output: Path, without: Collection[str] = ()) -> str:
+def repeating(ctx: click.Context, argument: Path | Sequence[Path], output: Path, without: Collection[str] = ()) -> str:
     """The command line that repeats a call from any folder: with absolute paths and another output.
 
     Args:
-        argument: the file of the command.
+        argument: the file of the command, or its files.
         output: of this call; the line names another one, because nothing is overwritten.
         without: options that will not work again.
     """
     again = f"{output.stem}_again{output.suffix}"
-    words = ["beamline", str(ctx.info_name), *_leading(ctx), str(argument.resolve())]
+    files = [argument] if isinstance(argument, Path) else argument
+    words = ["beamline", str(ctx.info_name), *_leading(ctx), *(str(file.resolve()) for file in files)]
     for option, value in given(ctx).items():
         if option.name in _NOT_REPEATED or option.name in without:
             continue

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from beamline.cli.option_groups import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading
-from beamline.cli.options import POSITIVE, SEED, json_option, parsed
+from beamline.cli.options import POSITIVE, SEED, json_option, names_in, parsed
 from beamline.cli.recipe import repeating
 from beamline.cli.scan_options import light_asked, light_options
 from beamline.cli.selection_options import chosen, selection_options
@@ -32,7 +32,7 @@ def listed(value: str) -> tuple[str, ...]:
     first=("methods", "quick", "max_seconds", "truth", "views", "rows", "binning", "axis", "rings", "output"),
 )
 @heading(DATA)
-@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--truth",
     metavar="FILE[:A:B]",
@@ -41,6 +41,19 @@ def listed(value: str) -> tuple[str, ...]:
 @light_options
 @selection_options
 @heading(METHOD)
+@click.option(
+    "--time",
+    "volumes",
+    type=click.IntRange(min=2),
+    metavar="N",
+    help="The sample changes: also one fit of N volumes in time, and volumes of parts of the views.",
+)
+@click.option(
+    "--spectra",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="FILEs are at several energies: one fit of all materials in this table, and each energy by itself.",
+)
+@click.option("--states", metavar="NAME,NAME", default="", help="With --spectra: two materials that are states of one.")
 @click.option(
     "--methods",
     callback=parsed(listed),
@@ -67,10 +80,13 @@ def listed(value: str) -> tuple[str, ...]:
 )
 @json_option
 def tradeoff(
-    file: Path,
+    files: tuple[Path, ...],
     truth: str | None,
     photons_per_count: float | None,
     dose_in: str | None,
+    volumes: int | None,
+    spectra: Path | None,
+    states: str,
     methods: tuple[str, ...] | None,
     quick: bool,
     max_seconds: float | None,
@@ -81,25 +97,35 @@ def tradeoff(
 ) -> None:
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
+    With --time or --spectra: fits of all views at once, of one scan in time or of scans at several energies, beside
+    reconstructions of parts of the views.
+
     Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
     HTML page. Ctrl-C stops with the trials done so far (exit code 4; 130 and no folder if there are none).
     """
+    from beamline.core.sinks import Warnings
+    from beamline.scan.energies import scans_of
+    from beamline.tradeoff.compared import Several
     from beamline.tradeoff.opened import ComparedScan
     from beamline.tradeoff.report import text
     from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 
-    source, selection = chosen(file, seed, values)
-    folder = output or Path(f"{file.stem}_tradeoff")
-    options = TradeoffOptions(
-        scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
-        methods=methods or (),
-        depth="quick" if quick else "full",
-        max_seconds=max_seconds,
-        seed=seed,
-        command=repeating(click.get_current_context(), file, folder),
-    )
+    _refuse_unlike(files, truth, photons_per_count, volumes, spectra, states)
+    folder = output or Path(f"{files[0].stem}_tradeoff")
     with events_shown(as_json) as sink:
+        if spectra is not None:
+            files = scans_of(files, Warnings(sink, SystemClock()))
+        (source, selection), *others = (chosen(path, seed, values) for path in files)
+        options = TradeoffOptions(
+            scan=ComparedScan(source, selection, folder, truth, light_asked(photons_per_count, dose_in)),
+            methods=methods or (),
+            several=Several(volumes or 0, others, spectra, names_in(states)),
+            depth="quick" if quick else "full",
+            max_seconds=max_seconds,
+            seed=seed,
+            command=repeating(click.get_current_context(), files, folder),
+        )
         table = run_tradeoff(options, sink, SystemClock())
     if not as_json:
         click.echo(text(table))
@@ -107,3 +133,23 @@ def tradeoff(
     if table.stopped:
         counts = f"{table.n_done} of {len(table.outcomes)}"
         raise ScanStopped(f"The trade-off was stopped after {counts} trials; {folder} holds them.")
+
+
+def _refuse_unlike(
+    files: tuple[Path, ...],
+    truth: str | None,
+    photons_per_count: float | None,
+    volumes: int | None,
+    spectra: Path | None,
+    states: str,
+) -> None:
+    """Raises UsageError for options that exclude each other."""
+    if spectra is None and (len(files) > 1 or states):
+        what = "--states" if states else f"{len(files)} files"
+        raise click.UsageError(f"{what}: give --spectra, with what pure materials attenuate at each energy.")
+    if spectra is not None and volumes is not None:
+        raise click.UsageError("--time is of one scan, --spectra of scans at several energies: give one of them.")
+    if photons_per_count is not None and spectra is not None:
+        raise click.UsageError("--photons-per-count is of one scan: --spectra counts the dose in frames.")
+    if truth is not None and (spectra is not None or volumes is not None):
+        raise click.UsageError("--truth is one volume; views in time, or of several energies, show several.")

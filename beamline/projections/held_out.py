@@ -63,5 +63,6 @@ def hold_out(
         shares=None if prepared.shares is None else prepared.shares[used],
         emission=emission and emission.summed(used[:, None], geometry.select(used)),
         held_out=(projections.data[held], geometry.select(held)),
+        held_out_ids=projections.view_ids[held],
         held_out_weights=None if counted is None else counted[held],
     )

@@ -161,7 +161,7 @@ def reconstruct_series(
             source, options.selection, warn,
             check=lambda geometry: SeriesNeeds.of(options, wanted, geometry).refuse(), phases=phases,
         )  # fmt: skip
-        times = _times(source, prepared.projections.view_ids, warn)
+        times = times_of(source, prepared.projections.view_ids, warn)
     options.target.require_room(SeriesNeeds.of(options, wanted, prepared.geometry).output)
     phases.enter("reconstruction")
     early, heard = False, sweeps_told(counting, _SWEEPS)
@@ -226,7 +226,7 @@ def reconstruct_series(
     )  # fmt: skip
 
 
-def _times(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
+def times_of(source: ScanSource, view_ids: I64, warn: Callable[[str], object]) -> F64:
     """[view] s when each of these views was exposed; evenly spaced in the file's order where it states no times."""
     known = source.times
     if known is not None and np.isfinite(known[view_ids]).all():

@@ -5,7 +5,7 @@ Each scan has a run folder of the usual kind in the series' folder, so that what
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,6 +79,11 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     if not found:
         raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
     return found
+
+
+def scans_of(paths: Iterable[Path], warn: Warn) -> tuple[Path, ...]:
+    """The scans at these paths, where the folder of a series stands for its scans; see `scans_in`."""
+    return tuple(scan for path in paths for scan in (scans_in(path, warn) if is_series(path) else [path]))
 
 
 def run_energies(

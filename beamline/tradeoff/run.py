@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,22 +13,18 @@ from beamline.core.events import Done, Sink, StateEntered, TradeoffStarted, Tria
 from beamline.core.files import result_folder
 from beamline.core.machine import machine
 from beamline.core.sinks import Warnings
-from beamline.projections.held_out import hold_out
-from beamline.projections.prepared import PreparedProjections
 from beamline.report.slice_sheet import SliceSheet
-from beamline.tradeoff.data import Data
+from beamline.tradeoff.compared import Several, compared
 from beamline.tradeoff.launch import compile_kernels, run_trial
-from beamline.tradeoff.opened import ComparedScan, opened_scan, until_stopped
+from beamline.tradeoff.opened import ComparedScan, until_stopped
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Outcome, Timed, plan, seconds_left
+from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
 from beamline.tradeoff.varied import Depth
 from drivers.base.clock import Clock
-from recon.methods import by_name, names_compared
-from recon.splatting.initialise import default_count
+from recon.methods import by_name
 
-_HELD_OUT_ONE_IN = 8  # without a truth, one view in this many is held out
-_HELD_OUT_VIEWS = 16  # at most
+_SHOWN = ("method", "parts", "series", "materials")  # groups of trials whose slices the page shows
 
 
 @dataclass(frozen=True)
@@ -37,12 +32,14 @@ class TradeoffOptions:
     """The scan and the trials to compare.
 
     Attributes:
-        methods: names in `recon.methods`; none: those that `names_compared` has for such a scan.
+        methods: names in `recon.methods`; none: those that suit such a scan.
+        several: how the views show several volumes.
         max_seconds: wall time after which no trial is started and the running one is ended; None: no limit.
     """
 
     scan: ComparedScan
     methods: Sequence[str]
+    several: Several = field(default_factory=Several)
     depth: Depth = "quick"
     max_seconds: float | None = None
     seed: int = 0
@@ -62,27 +59,21 @@ def run_tradeoff(
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
     folder, started = options.scan.folder, clock.now()
-    scan = opened_scan(options.scan, Warnings(sink, clock))
-    data = split(scan.prepared, scan.truth)
-    trials = plan(
-        options.methods or names_compared(data.emission is not None),
-        data.geometry.n_views,
-        default_count(data.geometry, scan.grid.voxel_size),
-        options.depth,
-    )
+    found = compared(options.scan, options.methods, options.depth, options.several, Warnings(sink, clock))
+    data, trials = found.data, found.trials
     table = TrialTable(
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
-        by="psnr" if scan.truth is not None else "residual_held_out",
-        length_unit=scan.prepared.length_unit,
+        by="psnr" if data.truth is not None else "residual_held_out",
+        length_unit=found.length_unit,
         machine=machine(),
-        scan={**scan.facts, "views used": str(data.geometry.n_views)},
+        scan=found.facts,
         command=options.command,
-        light=scan.light,
+        light=found.light,
     )
     sink(TradeoffStarted(options.scan.source.path, len(trials), table.by, time=clock.now()))
     slices = SliceSheet()
-    if scan.truth is not None:
-        slices.add("truth", scan.truth)
+    if data.truth is not None:
+        slices.add("truth", data.truth)
     with result_folder(folder) as work:
         data.save(work / "data.npz")
         sink(StateEntered("compiling", "Compiling kernels that are not in the cache", time=clock.now()))
@@ -92,19 +83,6 @@ def run_tradeoff(
     summary = {"output": folder, "trials": len(trials), "done": table.n_done, "stopped": table.stopped}
     sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
-
-
-def split(prepared: PreparedProjections, truth: Any) -> Data:
-    """The views that trials use, and the views held out that judge all trials if there is no truth.
-
-    Raises:
-        ConfigError: too few views to hold some out.
-    """
-    if truth is None:
-        prepared = hold_out(prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
-    others = 0 if prepared.held_out is None else prepared.held_out[1].n_views
-    rays = prepared.rays_there(others)
-    return Data(prepared.projections.data, prepared.geometry, prepared.held_out, truth, rays, prepared.emission)
 
 
 def _each(
@@ -127,16 +105,21 @@ def _each(
         eta = seconds_left(timed, [other.trial for other in table.outcomes[index:]])
         n, rate = len(table.outcomes), 60 * index / max(now() - begin, 1e-9)
         sink(TrialReached("tradeoff", index, n, trial.label, eta, rate, time=clock.now()))
-        started, keep = now(), work / "volume.npy" if trial.group == "method" else None
+        started, keep = now(), work / "volume.npy" if trial.group in _SHOWN else None
         try:
             result = run_trial(trial, work, options.seed, left, keep=keep)
         except KeyboardInterrupt:
             yield table.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             raise
         if keep is not None and keep.exists():
-            slices.add(by_name(trial.method).label, np.load(keep))
+            slices.add(_title(trial), np.load(keep))
             keep.unlink()
         timed.append(Timed.of(result, now() - started))
         table = table.with_outcome(index, result)
         yield table
         sink(replace(table.event(index, result), time=clock.now()))
+
+
+def _title(trial: Trial) -> str:
+    """Of its slice: the method where it is a baseline, else what tells it from others, too."""
+    return by_name(trial.method).label if trial.group == "method" else trial.label

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from beamline.tradeoff.varied import Depth, trials_of, work_of
+from beamline.tradeoff.varied import JOINT, MOTION, Depth, trials_of, work_of
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name
 
 Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
 
 _WITH_HALVES = 3  # the half-set resolution takes two more reconstructions
+_LEAST_OF_PART = 6  # views
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 
 
@@ -23,11 +24,12 @@ class Trial:
 
     Attributes:
         group: what it varies: "method" where nothing.
-        method: its name in `recon.methods`.
+        method: its name in `recon.methods`, or in `beamline.tradeoff.varied.JOINT`.
         views: how many, spread evenly over those chosen.
         binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.
         halves: measure the half-set resolution too, which takes two more reconstructions.
+        parts: of the views, in time or by energy, each reconstructed by itself.
     """
 
     group: str
@@ -36,6 +38,7 @@ class Trial:
     binning: int = 1
     settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
     halves: bool = False
+    parts: int = 1
 
     def build(self) -> Method:
         """The method with the settings of the trial.
@@ -50,6 +53,7 @@ class Trial:
         """The settings in a few words."""
         parts = [self.method, f"{self.views} views"]
         parts += [f"bin {self.binning}"] if self.binning > 1 else []
+        parts += [f"{self.parts} parts"] if self.parts > 1 else []
         return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
 
     def as_record(self) -> dict[str, Any]:
@@ -64,6 +68,12 @@ def _in_words(name: str, value: Plain) -> str:
             return f"{value} steps"
         case "gaussians", int():
             return thousands(value)
+        case "volumes", _:
+            return f"{value} volumes"
+        case "motion", _:
+            return f"motion {value}"
+        case "share", _:
+            return "smooth share"
         case "iterations", _:
             return f"{value} iteration{'s' * (value != 1)}"
         case "fit.loss", _:
@@ -148,8 +158,34 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
     return tuple(dict.fromkeys([*first, *sorted(rest, key=work)]))
 
 
+def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: int) -> tuple[Trial, ...]:
+    """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
+    alone = _baselines(methods, n_views, gaussians)
+    numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
+    joint = [Trial("series", "series", n_views, settings={"volumes": volumes, "motion": how}) for how in MOTION]
+    return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *joint
+
+
+def plan_of_energies(
+    methods: Sequence[str], n_views: int, gaussians: int, energies: int, states: bool
+) -> tuple[Trial, ...]:
+    """Each energy by itself with each method, then one fit of all materials, and with the share of two states."""
+    alone = [replace(base, group="parts", parts=energies) for base in _baselines(methods, n_views, gaussians)]
+    joint = [Trial("materials", "materials", n_views)]
+    joint += [Trial("materials", "materials", n_views, settings={"share": True})] if states else []
+    return *alone, *joint
+
+
+def _baselines(methods: Sequence[str], n_views: int, gaussians: int) -> list[Trial]:
+    """In short runs."""
+    first = [trials_of(method, gaussians, "quick")[0] for method in methods]
+    return [Trial("method", name, n_views, settings=one.settings) for name, one in zip(methods, first, strict=True)]
+
+
 def work(trial: Trial) -> float:
     """A rough number for how long a trial takes, to be compared within one method only."""
+    if trial.method in JOINT:
+        return trial.views * JOINT[trial.method](trial.settings)
     return work_of(trial.build(), trial.views, trial.binning) * (_WITH_HALVES if trial.halves else 1)
 
 

@@ -124,9 +124,19 @@ TRIALS: Mapping[str, Callable[[int, Depth], list[TrialSettings]]] = {
     "os-sirt-tv": partial(_iterations, (5, 15), (5, 10, 20, 40)),
 }
 
+MOTION: Mapping[str, tuple[bool | None, int]] = {"none": (False, 2), "learnt": (True, 3), "chosen": (None, 5)}
+"""Of a series: the argument of `recon.fit_series`, and its work. Views held out choose in a trial of each."""
+
+JOINT: Mapping[str, Callable[[Mapping[str, Plain]], float]] = {
+    "series": lambda settings: float(settings["volumes"] or 0) * MOTION[str(settings["motion"])][1],
+    "materials": lambda settings: 1.0 + ("share" in settings),
+}
+"""Fits of all volumes in time, or of all materials, that are no method of `recon.methods`: their work a view."""
+
 COLOURS: Mapping[str, str] = {
     "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
     "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
+    "series": "tab:blue", "materials": "tab:blue",
 }  # fmt: skip
 _SPARE = ("tab:pink", "black")

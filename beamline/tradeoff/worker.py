@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +30,13 @@ from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.projections.held_out import with_held_out
 from beamline.report.record import history_arrays, residual_curve
 from beamline.tradeoff.data import Data, geometry_in, write_array
+from beamline.tradeoff.joint import VolumeAt, by_parts, jointly, toy_like
 from beamline.tradeoff.trials import Trial
+from beamline.tradeoff.varied import JOINT
 from recon.assess import metrics
 from recon.assess.fsc import fourier_shell_correlation, soft_cylinder
 from recon.assess.time_model import record
-from recon.base.arrays import F32, I64
+from recon.base.arrays import F32, F64, I64
 from recon.base.binning import bin_views
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -41,7 +44,7 @@ from recon.base.method import DataUse, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.reconstruction import Reconstruction
-from recon.voxels.projector import data_residual, project
+from recon.voxels.projector import project
 from recon.warm_up import warm_up
 
 Say = Callable[[Mapping[str, Any]], None]
@@ -69,48 +72,94 @@ def run(
     """
     views = parse_views(f"fixed:{trial.views}", data.geometry.angles, period=data.geometry.period)
     projections, geometry = data.projections[views], data.geometry.select(views)
-    n, use = data.geometry.n_views, _of_views(DataUse(data.weights, emission=data.emission), views, geometry)
-    unseen_rays = None if data.weights is None else data.weights[n:]
-    seen = use
+    use = _of_views(DataUse(data.weights, emission=data.emission), views, geometry)
+    seen, unseen_rays = use, data.rays_held_out
     if use.weights is not None and unseen_rays is not None:
         seen = replace(use, weights=np.concatenate((use.weights, unseen_rays)))
-    grid = Grid.matching(data.geometry)
-    # On a toy of the same kind, so that compilation is in no trial's time.
-    warm_up(trial.build(), data.geometry)
+    grid, result, judged = Grid.matching(data.geometry), None, None
+    ready(trial, data.geometry)
     reset_peak_memory()
-    before = cpu()
-    result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now), seen)
-    cpu_seconds = cpu() - before
+    before, began = cpu(), now()
+    if trial.parts > 1 or trial.method in JOINT:
+        volume_at = _several(trial, data, grid, seed)
+    else:
+        result = reconstruct(trial, projections, geometry, grid, data.held_out, seed, _progress(say, now), seen)
+        volume_at = partial(_always, on_grid(result.volume, grid).data)
+        judged = residual_curve(history_arrays(result.history))
+    cpu_seconds, seconds = cpu() - before, now() - began if result is None else result.seconds
     peak = peak_memory()  # before measuring, which has needs of its own
-    volume = on_grid(result.volume, grid)
-    if keep is not None:
-        write_array(keep, volume.data)
-    found = {}
-    if data.truth is not None:
-        found["psnr"] = metrics.psnr(data.truth, volume.data)
-        found["ssim3d"] = metrics.ssim3d(data.truth, volume.data)
-        if data.emission is not None:
-            found |= metrics.contrast(data.truth, volume.data)
-    left: list[float] = []
-    if data.held_out is not None:
-        found["residual_held_out"] = data_residual(volume, *data.held_out, unseen_rays)
-        unseen, views_of = data.held_out
-        squares = (project(volume, views_of) - unseen) ** 2
-        if unseen_rays is not None:
-            squares *= unseen_rays
-        left = squares.sum(axis=(1, 2), dtype=np.float64).tolist()
+    found, left = _measured(volume_at, data, grid, keep)
     if trial.halves and trial.views >= 4:
         found["resolution"] = half_set_resolution(trial, projections, geometry, grid, seed, use)
     return {
-        "seconds": result.seconds,
+        "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "peak_bytes": peak,
         "metrics": {name: float(value) for name, value in found.items()},
-        "gaussians": None if result.gaussians is None else result.gaussians.n,
+        "gaussians": None if result is None or result.gaussians is None else result.gaussians.n,
         "left": left,
-        "curve": curve_of(result),
-        "curve_of": "" if (judged := residual_curve(history_arrays(result.history))) is None else judged.views,
+        "curve": [] if result is None else curve_of(result),
+        "curve_of": "" if judged is None else judged.views,
     }
+
+
+def _measured(volume_at: VolumeAt, data: Data, grid: Grid, keep: Path | None) -> tuple[dict[str, float], list[float]]:
+    """Figures of the volume, and the squared residual of each view held out. `keep` gets what the middle view shows."""
+    n, found, left = data.geometry.n_views, dict[str, float](), list[float]()
+    middle = volume_at(float(np.sort(data.shown[:n])[n // 2]))
+    if keep is not None:
+        write_array(keep, middle)
+    if data.truth is not None:
+        found = {"psnr": metrics.psnr(data.truth, middle), "ssim3d": metrics.ssim3d(data.truth, middle)}
+        if data.emission is not None:
+            found |= metrics.contrast(data.truth, middle)
+    if data.held_out is not None:
+        unseen, geometry = data.held_out
+        root = np.float32(1) if data.rays_held_out is None else np.sqrt(data.rays_held_out)
+        off = root * (shown(volume_at, data.shown[n:], geometry, grid) - unseen)
+        if (scale := float(np.linalg.norm(root * unseen))) == 0:
+            raise ValueError("the views held out are all zero, so there is nothing to explain")
+        found["residual_held_out"] = float(np.linalg.norm(off)) / scale
+        left = (off**2).sum(axis=(1, 2), dtype=np.float64).tolist()
+    return found, left
+
+
+def _always(volume: F32, key: float) -> F32:
+    """The one volume, whenever a view was taken."""
+    return volume
+
+
+def ready(trial: Trial, geometry: Geometry) -> None:
+    """Load what the trial needs, on a toy of the same kind, so that compilation is in no trial's time.
+
+    Raises:
+        ValueError: the method does not take such views.
+    """
+    if trial.method in JOINT:
+        volumes = {"volumes": 2} if "volumes" in trial.settings else {}
+        jointly(replace(trial, settings={**trial.settings, **volumes}), toy_like(geometry, trial), 0)
+    else:
+        warm_up(trial.build(), geometry)
+
+
+def _several(trial: Trial, data: Data, grid: Grid, seed: int) -> VolumeAt:
+    if trial.method in JOINT:
+        return jointly(trial, data, seed)
+
+    def fit(projections: F32, geometry: Geometry, weights: F32 | None) -> F32:
+        use = DataUse(weights)
+        return on_grid(reconstruct(trial, projections, geometry, grid, None, seed, None, use).volume, grid).data
+
+    return by_parts(trial, data, fit)
+
+
+def shown(volume_at: VolumeAt, of_view: F64, geometry: Geometry, grid: Grid) -> F32:
+    """Line integrals [view, row, col] of the volume that each view shows, by its time or the number of its energy."""
+    found = np.empty((geometry.n_views, *geometry.detector_shape), np.float32)
+    for key in np.unique(of_view):
+        at = np.flatnonzero(of_view == key)
+        found[at] = project(Volume(volume_at(float(key)), grid), geometry.select(at))
+    return found
 
 
 def half_set_resolution(
@@ -228,7 +277,7 @@ def main(job: Path) -> int:
         geometry = geometry_in(Path(request["data"]))
         for trial in request["compile"]:
             with suppress(ValueError):  # a method that does not take these views: its own trial will say so
-                warm_up(Trial(**trial).build(), geometry)
+                ready(Trial(**trial), geometry)
         return 0
     trial = Trial(**request["trial"])
     keep = request.get("keep")
