@@ -109,10 +109,10 @@ class Proportions:
                 out[k] += np.float32(shares[k]) * back
         return out
 
-    def left(self, factors: F32) -> float:
-        """Weighed squares that factors leave of the views."""
+    def left(self, factors: F32) -> F64:
+        """Weighed squares [view] that factors leave of the views."""
         residual = self.data - self.shown(factors)
-        return float(np.vdot(residual, self.weight * residual))
+        return np.einsum("vij,vij,vij->v", self.weight, residual, residual, dtype=np.float64)
 
     def rough(self, factors: F32) -> F32:
         """Gradient of half the weighed squares of differences, without λ."""
@@ -163,20 +163,26 @@ class Proportions:
 
 
 def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
-    """The `smooth` of `solved` with which the views of `fit` predict those of `judge` best, and what these are left.
+    """The `smooth` of `solved` with which the views of `fit` predict those of `judge`, and what these are left.
 
-    Made lighter from a heavy one until it predicts worse twice.
+    Made lighter from a heavy one until it predicts worse twice. It is the heaviest that predicts as well as the best,
+    to one standard error of the difference over the views of `judge` (Breiman et al. 1984, section 3.4.3).
 
     Args:
         first: factors to begin with.
     """
-    factors, best, least, worse = first, _HEAVIEST, math.inf, 0
+    factors, tried, worse = first, list[tuple[float, F64]](), 0
+    best = np.full(judge.data.shape[0], np.inf)
     with suppress(_StoppedError):
         for trial in range(_TRIALS):
             smooth = _HEAVIEST / _LIGHTER**trial
             factors = fit.solved(smooth, factors, go_on, _TRIAL_STEPS)
-            left = judge.left(factors)
-            best, least, worse = (smooth, left, 0) if left < least else (best, least, worse + 1)
+            tried.append((smooth, judge.left(factors)))
+            best, worse = (tried[-1][1], 0) if tried[-1][1].sum() < best.sum() else (best, worse + 1)
             if worse == 2:
                 break
-    return best, least
+    for smooth, left in tried:
+        apart = left - best
+        if apart.sum() <= math.sqrt(apart.size) * apart.std(ddof=min(1, apart.size - 1)):
+            return smooth, float(left.sum())
+    return _HEAVIEST, math.inf

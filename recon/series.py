@@ -235,7 +235,7 @@ def _smooth_factors(
     steps.end()
     if not steps.going or stop():
         return None
-    alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free]))
+    alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free])).sum()
     return smooth if left < _MOVES * alone else None
 
 

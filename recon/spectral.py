@@ -25,8 +25,9 @@ _FIRST = 0.1  # the first weight, over the largest gradient at zero
 ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
 _TRIALS = 12  # of one weight for all components, each half of the last one
 _HEAVIER = 4  # trials of a heavier one for all but the first component, each twice the last one
+_FIRST_HEAVIER = 3  # likewise, then of a heavier one for the first component
 _AS_WELL = 1.01  # weights that leave so much of the least residual predict as well
-TRIAL_SWEEPS = (_TRIALS + _HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
+TRIAL_SWEEPS = (_TRIALS + _HEAVIER + _FIRST_HEAVIER) * _TRIAL_SWEEPS  # of all trials, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,9 +128,9 @@ def weights_by_views(
 ) -> F64:
     """Weights of total variation [component], by one view in eight held out.
 
-    First one weight for all components, halved until it predicts worse. The first component, which holds what energies
-    have in common, keeps the best one. The others hold differences: less structure, and the same noise. So they get the
-    heaviest weight that predicts within 1 % of the best.
+    First one weight for all components, halved until it predicts worse. Each component then gets the heaviest that
+    predicts within 1 % of the best: first those that hold differences, with less structure and the same noise, then
+    the one that holds what energies have in common.
 
     Args:
         alike: all components keep one weight.
@@ -161,19 +162,28 @@ def weights_by_views(
     weights = np.full(len(fit.z), _FIRST * fit.steepest())
     best, least, worse = weights, math.inf, 0
     for trial in range(1, 1 + _TRIALS):
-        now = left(weights, _TRIALS - trial + _HEAVIER)
+        now = left(weights, _TRIALS - trial + _HEAVIER + _FIRST_HEAVIER * (not alike))
         if not going:
             return best
         best, least, worse = (weights, now, 0) if now < least else (best, least, worse + 1)
         if worse == 2:
             break
         weights = weights / 2
-    heavier = np.r_[2.0 if alike else 1.0, np.full(len(weights) - 1, 2.0)]
-    ladder = [best * heavier**octave for octave in range(_HEAVIER)]
-    residuals: list[float] = []
-    for weights in ladder:
-        residuals.append(left(weights, _HEAVIER - 1 - len(residuals)))
+
+    def heaviest(weights: F64, factor: F64, rungs: int, after: int) -> F64 | None:
+        """Of these weights times powers of the factor, the heaviest that predict as well; None: ended."""
+        ladder = [weights * factor**octave for octave in range(rungs)]
+        residuals = [left(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if going]
         if not going:
-            return best
-    limit = _AS_WELL * min(residuals)
-    return next(at for at, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)
+            return None
+        limit = _AS_WELL * min(residuals)
+        return next(at for at, now in zip(ladder[::-1], residuals[::-1], strict=True) if now <= limit)
+
+    others = np.full(len(best), 2.0)
+    if not alike:
+        others[0] = 1
+    chosen = heaviest(best, others, _HEAVIER, 0 if alike else _FIRST_HEAVIER)
+    if chosen is None or alike:
+        return best if chosen is None else chosen
+    heavy = heaviest(chosen, np.r_[2.0, np.ones(len(best) - 1)], _FIRST_HEAVIER, 0)
+    return chosen if heavy is None else heavy

@@ -19,6 +19,7 @@ _SHOWN_DB = 12.0  # below the best; worse trials are counted, not drawn
 _MARKERS = {
     "method": "o", "steps": "^", "iterations": "^", "views": "s", "gaussians": "D", "binning": "v", "kernel": "P",
     "loss": "X", "start": "*", "rectification": "h",
+    "parts": "s", "one fit": "D",
 }  # fmt: skip
 
 
@@ -113,4 +114,5 @@ def _legend(figure: Figure, axes: Axes, shown: Sequence[tuple[Trial, float, floa
 
 _WORDS = {
     "method": "baseline", "steps": "steps, iterations", "views": "fewer views", "gaussians": "number of Gaussians",
+    "parts": "parts of the views", "one fit": "one fit of all views",
 }  # fmt: skip

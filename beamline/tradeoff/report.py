@@ -191,6 +191,8 @@ def write_figures(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
         pictures.append(("curves.png", Picture("Residual of each method during its run", caption, cost_curves(curves))))
     if labels := slices.labels():
         caption = "The same slice by each method with its usual settings, all in the grey window of the first."
+        if any(outcome.trial.group == "one fit" for outcome in table.outcomes):
+            caption += " Of several volumes, the one that the middle view shows, by its time or energy."
         pictures.append(("slices.png", Picture("Slices", caption, slices.png(labels))))
     for name, picture in pictures:
         write_whole(folder / name, picture.png, replace=True)

@@ -19,12 +19,11 @@ from beamline.tradeoff.launch import compile_kernels, run_trial
 from beamline.tradeoff.opened import ComparedScan, until_stopped
 from beamline.tradeoff.report import write_figures, write_table
 from beamline.tradeoff.table import TrialTable
-from beamline.tradeoff.trials import Outcome, Timed, Trial, seconds_left
+from beamline.tradeoff.trials import Outcome, Timed, seconds_left
 from beamline.tradeoff.varied import Depth
 from drivers.base.clock import Clock
-from recon.methods import by_name
 
-_SHOWN = ("method", "parts", "series", "materials")  # groups of trials whose slices the page shows
+_SHOWN = ("method", "parts", "one fit")  # groups of trials whose slices the page shows
 
 
 @dataclass(frozen=True)
@@ -112,14 +111,9 @@ def _each(
             yield table.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             raise
         if keep is not None and keep.exists():
-            slices.add(_title(trial), np.load(keep))
+            slices.add(trial.title, np.load(keep))
             keep.unlink()
         timed.append(Timed.of(result, now() - started))
         table = table.with_outcome(index, result)
         yield table
         sink(replace(table.event(index, result), time=clock.now()))
-
-
-def _title(trial: Trial) -> str:
-    """Of its slice: the method where it is a baseline, else what tells it from others, too."""
-    return by_name(trial.method).label if trial.group == "method" else trial.label

@@ -56,6 +56,15 @@ class Trial:
         parts += [f"{self.parts} parts"] if self.parts > 1 else []
         return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
 
+    @property
+    def title(self) -> str:
+        """Of its slice in a picture."""
+        if self.group == "method":
+            return by_name(self.method).label
+        told = self.settings if self.method in JOINT else {}
+        parts = [f"{self.parts} parts"] if self.parts > 1 else []
+        return ", ".join([self.method, *parts, *(_in_words(name, value) for name, value in told.items())])
+
     def as_record(self) -> dict[str, Any]:
         """Plain values for a table, JSON or an event."""
         record = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -162,7 +171,7 @@ def plan_in_time(methods: Sequence[str], n_views: int, gaussians: int, volumes: 
     """Each method ignoring time, then of parts of the views; one fit of so many volumes without and with motion."""
     alone = _baselines(methods, n_views, gaussians)
     numbers = sorted({n for n in (2, volumes, 2 * volumes) if n_views // n >= _LEAST_OF_PART})
-    joint = [Trial("series", "series", n_views, settings={"volumes": volumes, "motion": how}) for how in MOTION]
+    joint = [Trial("one fit", "series", n_views, settings={"volumes": volumes, "motion": how}) for how in MOTION]
     return *alone, *(replace(base, group="parts", parts=n) for n in numbers for base in alone), *joint
 
 
@@ -171,8 +180,8 @@ def plan_of_energies(
 ) -> tuple[Trial, ...]:
     """Each energy by itself with each method, then one fit of all materials, and with the share of two states."""
     alone = [replace(base, group="parts", parts=energies) for base in _baselines(methods, n_views, gaussians)]
-    joint = [Trial("materials", "materials", n_views)]
-    joint += [Trial("materials", "materials", n_views, settings={"share": True})] if states else []
+    joint = [Trial("one fit", "materials", n_views)]
+    joint += [Trial("one fit", "materials", n_views, settings={"share": True})] if states else []
     return *alone, *joint
 
 

@@ -137,6 +137,6 @@ COLOURS: Mapping[str, str] = {
     "r2": "tab:blue", "r2-published": "navy", "fbp": "0.35", "sirt": "tab:green", "sart": "tab:olive",
     "cgls": "tab:cyan", "asd-pocs": "tab:purple", "fista-tv": "tab:red", "os-sirt-tv": "tab:orange",
     "osem": "gold", "mlem": "teal", "naf": "tab:brown", "intratomo": "rosybrown", "sax-nerf": "darkviolet",
-    "series": "tab:blue", "materials": "tab:blue",
+    "series": "darkgreen", "materials": "darkgreen",
 }  # fmt: skip
 _SPARE = ("tab:pink", "black")
