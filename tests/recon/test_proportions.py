@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
@@ -81,3 +84,18 @@ def test_views_held_out_choose_smoother_factors_of_noisier_views() -> None:
 def test_an_end_keeps_the_factors_so_far() -> None:
     problem = problem_of(changing())
     np.testing.assert_array_equal(problem.solved(1.0, problem.ones(), lambda: False), problem.ones())
+
+
+def test_smoothness_is_the_heaviest_within_one_standard_error_of_the_best() -> None:
+    """Lighter trials predict each of two views better by turns, then both, then worse."""
+    left = [[9.0, 9.0], [5.0, 4.2], [4.0, 5.0], [6.0, 6.0], [7.0, 7.0]]  # the second is within chance of the third
+    trials = iter(left)
+    fit: Any = SimpleNamespace(solved=lambda smooth, factors, go_on, steps: factors)
+    judge: Any = SimpleNamespace(data=np.zeros((2, 1, 1)), left=lambda factors: np.array(next(trials)))
+    heaviest, _ = smoothness(fit, judge, cast(F32, None), lambda: True), next(trials, None)
+    second = heaviest[0]
+    assert heaviest[1] == 9.2
+    clear = iter([[9.0, 9.0], [5.4, 6.1], [4.0, 5.0], [6.0, 6.0], [7.0, 7.0]])  # here it is not
+    judge.left = lambda factors: np.array(next(clear))
+    third = smoothness(fit, judge, cast(F32, None), lambda: True)
+    assert third[1] == 9.0 and third[0] < second

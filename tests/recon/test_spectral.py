@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from recon import spectral
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
@@ -157,6 +158,19 @@ def test_the_same_seed_gives_the_same_bits_and_a_stop_the_volumes_so_far() -> No
     assert np.array_equal(first.densities, fit_materials(views, go_on=lambda sweep, residual: sweep < 3).densities)
     assert heard[-1] == (3, first.residual)
     assert [sweep for sweep, _ in heard if sweep > 0] == [1, 2, 3]
+
+
+def test_what_energies_have_in_common_gets_the_heaviest_weight_that_predicts_as_well(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth, views = balls(), views_of(balls(), 8, noise=0.05)
+    heavier = fit_materials(views)
+    monkeypatch.setattr(spectral, "_FIRST_HEAVIER", 1)
+    lighter = fit_materials(views)
+    assert heavier.weights[0] in (2 * lighter.weights[0], 4 * lighter.weights[0])
+    assert heavier.weights[1] == lighter.weights[1]
+    sums = [rms((found.densities - truth).sum(0)) for found in (heavier, lighter)]
+    assert sums[0] < 0.95 * sums[1]
 
 
 def test_each_sweep_of_a_trial_of_weights_may_end_the_fit() -> None:

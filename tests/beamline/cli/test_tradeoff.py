@@ -68,6 +68,15 @@ def test_json_is_one_event_a_line(folder: Path, quick_trials: list[Trial]) -> No
     assert {"r2", "fbp"} <= {trial.method for trial in quick_trials}
 
 
+def test_a_sample_that_changes_is_compared_by_parts_and_in_one_fit(folder: Path, quick_trials: list[Trial]) -> None:
+    result = _beamline("scan.h5", "--axis", "20.7", "--methods", "fbp", "--time", "2")
+    assert result.exit_code == 0, result.output
+    assert [t.group for t in quick_trials] == ["method", "parts", "parts", "one fit", "one fit", "one fit"]
+    assert "series, 27 views, 2 volumes, motion learnt" in result.stdout
+    record = json.loads((folder / "scan_tradeoff" / "tradeoff.json").read_text(encoding="utf-8"))
+    assert "--time 2" in record["command"] and record["trials"][2]["trial"]["parts"] == 4
+
+
 SIGNALS = [signal.SIGINT, signal.SIGTERM] + ([] if sys.platform == "win32" else [signal.SIGHUP])
 
 
@@ -112,6 +121,12 @@ def test_ctrl_c_before_the_first_result_is_exit_code_130_and_leaves_nothing(
         (["--seed", "-1"], 2, "--seed"),
         (["-o", "scan.h5"], 2, "scan.h5"),
         (["-o", "."], 5, "never overwritten"),
+        (["scan.h5"], 2, "--spectra"),
+        (["--states", "fresh,charged"], 2, "--spectra"),
+        (["--time", "2", "--spectra", "table.csv"], 2, "one of them"),
+        (["--time", "2", "--truth", "volume.npz"], 2, "several"),
+        (["--spectra", "table.csv", "--photons-per-count", "1"], 2, "frames"),
+        (["--spectra", "missing.csv"], 5, "missing.csv"),
     ],
 )
 def test_bad_input_leaves_nothing(folder: Path, options: list[str], code: int, said: str) -> None:
