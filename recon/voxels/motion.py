@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -48,10 +49,11 @@ class Motion:
         """The same motion on voxels of another size, at other times."""
         return Motion(shape, times, self.control * (shape[1] / self.shape[1]))
 
-    @property
+    @cached_property
     def _space(self) -> list[F64]:
         return [_spline(np.linspace(0, 1, n), c) for n, c in zip(self.shape, self.control.shape[2:], strict=True)]
 
+    @cached_property
     def _shares(self) -> F64:
         """s_m [time, knot]."""
         knots = len(self.control)
@@ -60,7 +62,7 @@ class Motion:
     def at(self, time: int, control: F64 | None = None) -> F32:
         """u [3, y, x, z] at a time, of other control points if given."""
         y, x, z = (part.astype(np.float32) for part in self._space)
-        some = np.tensordot(self._shares()[time], self.control if control is None else control, 1).astype(np.float32)
+        some = np.tensordot(self._shares[time], self.control if control is None else control, 1).astype(np.float32)
         wide = np.einsum("yp,dpqr->dyqr", y, some)
         wide = np.einsum("xq,dyqr->dyxr", x, wide)
         return np.ascontiguousarray(wide @ z.T)
@@ -70,7 +72,7 @@ class Motion:
         y, x, z = self._space
         some = np.einsum("xq,dyxr->dyqr", x, (field @ z.astype(np.float32)).astype(np.float64))
         some = np.einsum("yp,dyqr->dpqr", y, some)
-        return np.asarray(np.multiply.outer(self._shares()[time], some))
+        return np.asarray(np.multiply.outer(self._shares[time], some))
 
 
 def _spline(at: F64, knots: int) -> F64:
