@@ -1,4 +1,4 @@
-"""The motion of a sample while it is scanned, learnt on coarse voxels.
+"""The motion of a sample while it is scanned, learnt from coarse to fine voxels.
 
 One volume, displaced, explains all views of a sample that only moves. So volume and motion improve each other in turns,
 first on voxels so coarse that the motion is short.
@@ -18,14 +18,32 @@ from recon.voxels.held_out_weight import ONE_IN
 from recon.voxels.motion import Motion, Seen, improved
 from recon.voxels.projector import Projector, projection_lines
 
-_WIDTH = 24  # voxels across of the finer level; the coarser one has half as many
-_LEVELS = ((2, 8), (1, 6))  # voxels in those of the finer level, and turns
+_COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide
+_FINE = 96  # pixels across up to which the last level has a voxel a pixel; of more, one for two
+_TURNS = 6, 4, 2  # of the first levels; later ones have the last number
 _SWEEPS = 6  # of a turn, which go on from the last one
 _KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
 _HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
 _JUDGED, _JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
-MOTION_SWEEPS = sum(turns for _, turns in _LEVELS) * _SWEEPS  # of `learnt_motion`
-JUDGE_SWEEPS = MOTION_SWEEPS + 2 * _JUDGED_SWEEPS  # of `unseen_residuals`
+
+
+def levels(cols: int) -> list[tuple[int, int]]:
+    """Pixels in a voxel, and turns, of each level for so many pixels across."""
+    last = 1 if cols <= _FINE else 2
+    widths = [last]
+    while cols // (2 * widths[0]) >= _COARSEST:
+        widths.insert(0, 2 * widths[0])
+    return [(width, _TURNS[min(n, len(_TURNS) - 1)]) for n, width in enumerate(widths)]
+
+
+def motion_sweeps(cols: int) -> int:
+    """Of `learnt_motion`."""
+    return _SWEEPS * sum(turns for _, turns in levels(cols))
+
+
+def judge_sweeps(cols: int) -> int:
+    """Of `unseen_residuals`."""
+    return motion_sweeps(cols) + 2 * _JUDGED_SWEEPS
 
 
 def unseen_residuals(
@@ -69,11 +87,11 @@ def learnt_motion(
         go_on: called with (-n, residual) after each sweep, where n follow. False ends it.
         stop: asked many times within a sweep; True ends it.
     """
-    binning = max(1, round(views.geometry.detector_shape[1] / _WIDTH))
+    cols = views.geometry.detector_shape[1]
     alone = replace(views, cross_sections=np.ones((times.size, 1)))
-    motion, follow = None, MOTION_SWEEPS
-    for wide, turns in _LEVELS:
-        some = _binned(alone, binning * wide)
+    motion, follow = None, motion_sweeps(cols)
+    for wide, turns in levels(cols):
+        some = _binned(alone, wide)
         grid = Grid.matching(some.geometry)
         nz, ny, nx = grid.shape
         motion = (

@@ -17,7 +17,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import JUDGE_SWEEPS, MOTION_SWEEPS, learnt_motion, unseen_residuals
+from recon.learnt_motion import judge_sweeps, learnt_motion, motion_sweeps, unseen_residuals
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.spectral import ALIKE_LONGER, weight_of, weights_by_views
 from recon.spectral import TRIAL_SWEEPS as _WEIGHT_SWEEPS
@@ -31,7 +31,11 @@ _MOVES = 0.95  # of what volumes leave of views held out: a motion that leaves l
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
-TRIAL_SWEEPS = ALIKE_LONGER * _WEIGHT_SWEEPS + JUDGE_SWEEPS + MOTION_SWEEPS + TRIAL_STEPS
+
+
+def trial_sweeps(cols: int) -> int:
+    """Of all trials of `fit_series`, at most, beside as many as the fit has; of so many columns."""
+    return ALIKE_LONGER * _WEIGHT_SWEEPS + judge_sweeps(cols) + motion_sweeps(cols) + TRIAL_STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +130,7 @@ def fit_series(
     Where nothing moves, and views held out are predicted better so, the volumes become factors of their mean that are
     smooth within matter: bodies that take up or lose something, each at its time.
     Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, of the motion and of factors
-    each count down to 0. They are `TRIAL_SWEEPS` and `sweeps` at most in all. After the sweeps, the steps of the
+    each count down to 0. They are `trial_sweeps` and `sweeps` at most in all. After the sweeps, the steps of the
     factors count down; if they are ended, the volumes are those without.
 
     Args:

@@ -31,7 +31,7 @@ from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.series import TRIAL_SWEEPS, TimedViews, fit_series
+from recon.series import TimedViews, fit_series, trial_sweeps
 
 _SWEEPS = 60
 _COPIES = 7  # of all line integrals: views, lines, a part held out, moments, binned views, weights
@@ -53,10 +53,18 @@ class WantedSeries:
 
 @dataclass(frozen=True)
 class SeriesNeeds:
-    """Bytes that a series takes in memory, may take, and takes on the disk; and its shape [time, z, y, x]."""
+    """What a series takes.
+
+    Attributes:
+        shape: [time, z, y, x].
+        trials: sweeps of all trials, at most.
+        memory, allowed: bytes in memory, and those that may be used.
+        output: bytes on the disk.
+    """
 
     shape: tuple[int, int, int, int]
     views: int
+    trials: int
     memory: int
     allowed: int
     output: int
@@ -66,7 +74,10 @@ class SeriesNeeds:
         voxels = 4 * math.prod(shape := Grid.matching(geometry).shape)
         rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
         memory = (_VOLUMES * wanted.volumes + _FIELDS) * voxels + _COPIES * rays
-        return cls((wanted.volumes, *shape), geometry.n_views, memory, memory_of(options), wanted.volumes * voxels)
+        trials = trial_sweeps(geometry.detector_shape[1]) + _SWEEPS
+        return cls(
+            (wanted.volumes, *shape), geometry.n_views, trials, memory, memory_of(options), wanted.volumes * voxels
+        )
 
     def refuse(self) -> None:
         """ConfigError where it takes more memory than it may."""
@@ -86,7 +97,7 @@ class SeriesNeeds:
             f"{'volumes':<10}{self.shape[0]} of {shape} voxels, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}",
             f"{'disk':<10}{size(self.output)} for the result",
-            f"{'time':<10}not estimated; {_SWEEPS} sweeps, and {TRIAL_SWEEPS + _SWEEPS} at most before them",
+            f"{'time':<10}not estimated; {_SWEEPS} sweeps, and {self.trials} at most before them",
         ]
 
 

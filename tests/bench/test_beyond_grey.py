@@ -1,7 +1,7 @@
-"""Rows of docs/performance.md on emission, energies and surfaces: dB or distance, CPU seconds and peak memory, on
+"""Rows of docs/performance.md on emission, energies, time and surfaces: dB or distance, CPU seconds and peak memory, on
 measured and simulated volumes.
 
-pytest -m bench -s tests/bench/test_beyond_grey.py    (needs xraylib; two minutes)
+pytest -m bench -s tests/bench/test_beyond_grey.py    (needs xraylib; eight minutes)
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 import recon
@@ -27,16 +28,22 @@ from simulators.samples.sample import sample_at
 from simulators.scenes.scene import load_scene
 from tests.bench.quality_cases import OBJECTS, padded, seen_by_simulator
 from tests.bench.test_materials import grains
-from tests.bench.test_series import FOAM
+from tests.bench.test_series import FOAM, of_sub_scans, scanned
 from tests.conftest import SHARED_DATA
 
 pytestmark = pytest.mark.bench
 PITCH, ROWS, ENERGIES = 1.1e-3, 8, (8.320, 8.345, 8.3485, 8.380)
 
 
-def shell() -> F32:
-    """[z, y, x] of 16 x 128 x 128 voxels, two a pixel, largest value 1."""
-    return np.ascontiguousarray(OBJECTS["shell"](SHARED_DATA)[104:120])
+def shell(planes: int = 16) -> F32:
+    """[z, y, x] of so many x 128 x 128 voxels, two a pixel, largest value 1."""
+    return np.ascontiguousarray(OBJECTS["shell"](SHARED_DATA)[112 - planes // 2 : 112 + planes // 2])
+
+
+def teapot(planes: int = 16) -> F32:
+    """As `shell`, of every other voxel's mean."""
+    middle = padded(OBJECTS["teapot"](SHARED_DATA), 256)[128 - planes : 128 + planes]
+    return coarse(np.ascontiguousarray(middle))
 
 
 def measured(name: str, truth: F32, run: Callable[[], F32]) -> None:
@@ -57,10 +64,13 @@ def coarse(fine: F32) -> F32:
     return fine.reshape(z // 2, 2, y // 2, 2, x // 2, 2).mean((1, 3, 5), dtype=np.float32)
 
 
-@pytest.mark.parametrize("kind", ["shell", "grains"])
+MEASURED = {"shell": shell, "teapot": teapot}
+
+
+@pytest.mark.parametrize("kind", ["shell", "teapot", "grains"])
 def test_emission(kind: str) -> None:
     """10⁶ counts of the volume as an activity, 30 % of them randoms, 90 views."""
-    fine = shell() if kind == "shell" else grains()[1]
+    fine = MEASURED[kind]() if kind in MEASURED else grains()[1]
     truth = coarse(fine)
     geometry = Geometry.parallel(np.arange(90) * np.pi / 90, truth.shape[:2], pixel_pitch=1.0)
     lines = seen_by_simulator(fine, geometry, 0.5)
@@ -75,11 +85,11 @@ def test_emission(kind: str) -> None:
         measured(f"emission of the {kind}, {method.name}", truth, run)
 
 
-@pytest.mark.parametrize("kind", ["shell", "grains"])
+@pytest.mark.parametrize("kind", ["shell", "teapot", "grains"])
 def test_energies(kind: str) -> None:
     """The share of charged oxide, of two materials: fitted together, and from a volume an energy; 4 x 30 views."""
-    if kind == "shell":
-        whole = shell()
+    if kind in MEASURED:
+        whole = MEASURED[kind]()
         left = np.arange(whole.shape[2]) < whole.shape[2] // 2
         parts = np.stack([whole * left, whole * ~left])
     else:
@@ -108,6 +118,46 @@ def test_energies(kind: str) -> None:
         lambda: recon.fit_share(views, recon.fit_materials(views), (0, 1)).densities[1],
     )  # fmt: skip
     measured(f"energies of the {kind}, apart", truth[1], apart)
+
+
+MOMENTS = (np.arange(12) + 0.5) / 12
+
+
+def settled(fine: F32, time: float) -> F32:
+    """The volume, lower by 15 % at time 1: slices come from farther up, and hold as much as before."""
+    shrunk = 1 - 0.15 * time
+    places = np.meshgrid(np.arange(len(fine)) / shrunk, *(np.arange(n) for n in fine.shape[1:]), indexing="ij")
+    return np.asarray(map_coordinates(fine, places, order=1, output=np.float32), np.float32)
+
+
+def in_time(kind: str) -> tuple[recon.TimedViews, F32]:
+    """72 golden-angle views over a second, 50 000 photons; the truth at `MOMENTS`."""
+    if kind == "foam":
+        return scanned(FOAM)
+    fine, times = MEASURED[kind](48), (np.arange(72) + 0.5) / 72
+    angles = np.pi * (np.sqrt(5) - 1) / 2 * np.arange(72)
+    geometry = Geometry.parallel(angles, (24, 64), pixel_pitch=1.0)
+    lines = np.concatenate([
+        seen_by_simulator(settled(fine, float(t)), geometry.select([n]), 0.5) for n, t in enumerate(times)
+    ])  # fmt: skip
+    scale = np.float32(2 / lines.max())
+    counts = np.random.default_rng(0).poisson(5e4 * np.exp(-scale * lines)).clip(1)
+    truth = scale * np.stack([coarse(settled(fine, float(t))) for t in MOMENTS])
+    return recon.TimedViews((-np.log(counts / 5e4)).astype(np.float32), geometry, times), truth
+
+
+@pytest.mark.parametrize("kind", ["shell", "teapot", "foam"])
+def test_time(kind: str) -> None:
+    """A sample that settles: one volume, two to six parts of the views, and one fit of three volumes."""
+    views, truth = in_time(kind)
+    for parts in (1, 2, 3, 4, 6):
+        measured(f"{kind} in time, fista-tv, {parts} parts", truth, lambda parts=parts: of_sub_scans(views, parts))  # type: ignore[misc]
+
+    def one_fit() -> F32:
+        made = recon.fit_series(views, 3)
+        return np.stack([made.at(float(t)) for t in MOMENTS])
+
+    measured(f"{kind} in time, one fit", truth, one_fit)
 
 
 def foam() -> F32:
