@@ -165,8 +165,8 @@ class Proportions:
 def smoothness(fit: Proportions, judge: Proportions, first: F32, go_on: Callable[[], bool]) -> tuple[float, float]:
     """The `smooth` of `solved` with which the views of `fit` predict those of `judge`, and what these are left.
 
-    Made lighter from a heavy one until it predicts worse twice. It is the heaviest that predicts as well as the best,
-    to one standard error of the difference over the views of `judge` (Breiman et al. 1984, section 3.4.3).
+    Made lighter from a heavy one until it predicts worse twice. The heaviest that predicts as well as the best is
+    taken: to one standard error of the difference over the views of `judge` (Breiman et al. 1984, section 3.4.3).
 
     Args:
         first: factors to begin with.

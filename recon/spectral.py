@@ -129,8 +129,8 @@ def weights_by_views(
     """Weights of total variation [component], by one view in eight held out.
 
     First one weight for all components, halved until it predicts worse. Each component then gets the heaviest that
-    predicts within 1 % of the best: first those that hold differences, with less structure and the same noise, then
-    the one that holds what energies have in common.
+    predicts within 1 % of the best. Those that hold differences come first: they have less structure, and the same
+    noise. What energies have in common comes last.
 
     Args:
         alike: all components keep one weight.

@@ -97,8 +97,8 @@ def tradeoff(
 ) -> None:
     """Reconstruct the scan in FILE with many methods and settings, and compare their quality, time and memory.
 
-    With --time or --spectra: fits of all views at once, of one scan in time or of scans at several energies, beside
-    reconstructions of parts of the views.
+    With --time (one scan of a sample that changes) or --spectra (scans at several energies): one fit of all views,
+    beside reconstructions of parts of them.
 
     Quality is PSNR and SSIM against --truth. Without a truth it is the residual of views that no trial uses, and the
     resolution to which two halves of the views agree. Writes a folder with tradeoff.csv, tradeoff.json, pictures and an
