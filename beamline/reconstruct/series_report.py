@@ -9,6 +9,7 @@ from beamline.report.html import Picture, Report
 from beamline.report.slice_sheet import SliceSheet
 from beamline.storage.writers.recon_file import ReconRecord
 
+FACTORS = "factors of their mean, smooth within matter"
 _SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts are drawn, too
 
 
@@ -28,6 +29,7 @@ def series_page(record: ReconRecord, context: ReportContext, n_views: int, chose
         caption = f"{len(some)} of {n} times in one grey window: what differs has changed or moved."
         pictures.append(Picture(title, caption, sheet.png(sheet.labels())))
     moves = "motion was learnt" if record.parameters["moves"] else "nothing moves"
+    moves += f"; densities are {FACTORS}" if "smooth" in record.parameters else ""
     shape = " × ".join(map(str, volumes.shape[1:]))
     said = {k: str(v) for k, v in record.parameters.items() if not isinstance(v, np.ndarray) and k != "command"}
     return Report(

@@ -22,7 +22,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.parameters import parameters_of
 from beamline.reconstruct.progress import sweeps_told
-from beamline.reconstruct.series_report import series_page
+from beamline.reconstruct.series_report import FACTORS, series_page
 from beamline.reconstruct.slabs import memory_of
 from beamline.report.html import write_report
 from beamline.storage.readers.base import ScanSource
@@ -116,6 +116,7 @@ class SeriesDone:
     Attributes:
         seconds: of the volumes, from the first view on.
         moves: the sample moves.
+        factors: each volume is the mean of all, times factors smooth within matter.
         chosen: how that was chosen; empty where it was given.
         ended_early: the volumes are those reached when it was stopped.
     """
@@ -127,6 +128,7 @@ class SeriesDone:
     axis_col: float
     residual: float
     moves: bool
+    factors: bool
     chosen: str
     ended_early: bool
 
@@ -138,6 +140,7 @@ class SeriesDone:
             *([f"{'report':<10}{self.report}"] if self.report else []),
             f"{'volumes':<10}{n} of {' x '.join(map(str, shape))}, {self.seconds[0]:.4g} to {self.seconds[-1]:.4g} s",
             f"{'motion':<10}{'learnt' if self.moves else 'none'}{'; ' * bool(self.chosen)}{self.chosen}",
+            *([f"{'densities':<10}{FACTORS}"] if self.factors else []),
             f"{'axis_col':<10}{self.axis_col:.2f}",
             f"{'residual':<10}{self.residual:.4g}",
         ]
@@ -233,7 +236,7 @@ def reconstruct_series(
     phases.end()
     return SeriesDone(
         output, options.target.report, shape, tuple(series.seconds.tolist()), prepared.axis_col, made.residual,
-        made.motion is not None, chosen, early,
+        made.motion is not None, made.smooth is not None, chosen, early,
     )  # fmt: skip
 
 

@@ -39,6 +39,9 @@ def series(scan: Path) -> Path:
     done = beamline("recon", str(scan), "--time", "2", "--no-moves", "--axis", "19.5", "-o", str(path))
     assert done.exit_code == 0, done.output
     assert f"{'volumes':<10}2 of 2 x 40 x 40, 0 to 3.5 s" in done.output
+    with h5py.File(path) as file:
+        factors = "smooth" in file["entry/reconstruction/parameters"]
+    assert ("factors of their mean" in done.output) is factors
     return path
 
 
