@@ -21,10 +21,10 @@ from recon.voxels.projector import Projector, projection_lines
 _COARSEST = 12  # voxels across of the first level, at least; each other one has voxels half as wide
 _FINE = 96  # pixels across up to which the last level has a voxel a pixel; of more, one for two
 _TURNS = 6, 4, 2  # of the first levels; later ones have the last number
-_SWEEPS = 6  # of a turn, which go on from the last one
+SWEEPS_OF_TURN = 6  # of a turn, which go on from the last one
 _KNOTS, _CONTROLS = 3, 3  # of the motion: in time, and along each axis
 _HEAVIER = 2.0  # weight of total variation: one volume for all times has less detail
-_JUDGED, _JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
+JUDGED, JUDGED_SWEEPS = 48, 24  # voxels across of volumes that judge a motion, and their sweeps
 
 
 def levels(cols: int) -> list[tuple[int, int]]:
@@ -38,12 +38,7 @@ def levels(cols: int) -> list[tuple[int, int]]:
 
 def motion_sweeps(cols: int) -> int:
     """Of `learnt_motion`."""
-    return _SWEEPS * sum(turns for _, turns in levels(cols))
-
-
-def judge_sweeps(cols: int) -> int:
-    """Of `unseen_residuals`."""
-    return motion_sweeps(cols) + 2 * _JUDGED_SWEEPS
+    return SWEEPS_OF_TURN * sum(turns for _, turns in levels(cols))
 
 
 def unseen_residuals(
@@ -54,9 +49,9 @@ def unseen_residuals(
     Of coarse voxels, each from seven of eight views. Arguments as of `learnt_motion`.
     """
     held_out = views.parted(ONE_IN) == ONE_IN // 2
-    binning = max(1, round(views.geometry.detector_shape[1] / _JUDGED))
+    binning = max(1, round(views.geometry.detector_shape[1] / JUDGED))
     seen, unseen = (views.select(np.flatnonzero(chosen), slice(None)) for chosen in (~held_out, held_out))
-    follow = 2 * _JUDGED_SWEEPS
+    follow = 2 * JUDGED_SWEEPS
     motion = learnt_motion(seen, times, weights, lambda sweep, residual: go_on(sweep - follow, residual), stop)
     if motion is None:
         return None
@@ -65,7 +60,7 @@ def unseen_residuals(
     nz, ny, nx = grid.shape
     for now in (None, motion.on((ny, nx, nz), times)):
         fit = EnergyFit(seen, grid, np.random.default_rng(0), now, stop)
-        for residual in fit.sweeps(weights, _JUDGED_SWEEPS):
+        for residual in fit.sweeps(weights, JUDGED_SWEEPS):
             follow -= 1
             if not go_on(-follow, residual):
                 return None
@@ -99,7 +94,7 @@ def learnt_motion(
         )
         fit, seen = EnergyFit(some, grid, np.random.default_rng(0), motion, stop), _seen(some, grid)
         for _ in range(turns):
-            for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), _SWEEPS):
+            for residual in fit.sweeps(np.full(1, _HEAVIER * weights.max()), SWEEPS_OF_TURN):
                 follow -= 1
                 if not go_on(-follow, residual):
                     return None

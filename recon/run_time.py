@@ -148,7 +148,7 @@ def _took(
     method: Method, extent: Extent, now: Clock, size: Size, iterations: int, decide: Decisions
 ) -> tuple[float, Decided, int]:
     """Seconds of so many iterations, their decisions, and the sweeps of trials among them."""
-    geometry, data = _sample(extent, *size)
+    geometry, data = sample(extent, *size)
     one, asked = with_settings(method, {"iterations": iterations}), 0
 
     def count() -> bool:
@@ -163,7 +163,7 @@ def _took(
 
 def _of_direct(method: Method, extent: Extent, now: Clock) -> float:
     views, (cols, rows) = min(extent.views, _FBP_VIEWS), _within(extent, _FBP_COLS, _FEW_ROWS)
-    geometry, data = _sample(extent, views, cols, rows)
+    geometry, data = sample(extent, views, cols, rows)
     times = []
     for _ in range(3):
         begin = now()
@@ -182,7 +182,7 @@ def _cone_nanoseconds(views: int, cols: int, slices: int) -> float:
 def _of_field(method: FieldMethod, extent: Extent, now: Clock) -> float:
     """A step costs as many samples as its rays have, and slices of the volume two fifths of that a voxel."""
     cols, rows = _within(extent, _FIT_COLS, _FEW_ROWS)
-    geometry, data = _sample(extent, _FIT_VIEWS, cols, rows)
+    geometry, data = sample(extent, _FIT_VIEWS, cols, rows)
     tried = with_settings(method, {"seconds": None, "early_stop": False})
 
     def took(steps: int) -> float:
@@ -229,7 +229,7 @@ def _of_fit(method: FitMethod, extent: Extent, now: Clock) -> RunTime:
 def _step_of_fit(extent: Extent, now: Clock, cols: int, rows: int) -> tuple[float, float]:
     """The work of a step of a small fit, and its seconds."""
     cols, rows = _within(extent, cols, rows)
-    geometry, data = _sample(extent, min(extent.views, _FITTED_VIEWS), cols, rows)
+    geometry, data = sample(extent, min(extent.views, _FITTED_VIEWS), cols, rows)
     count = count_for(Grid((rows, cols, cols)), geometry.is_cone)
 
     def took(steps: int) -> float:
@@ -258,7 +258,7 @@ def _within(extent: Extent, cols: int, rows: int) -> tuple[int, int]:
     return min(extent.cols, round(cols * math.sqrt(rows / height))), height
 
 
-def _sample(extent: Extent, views: int, cols: int, rows: int) -> tuple[Geometry, F32]:
+def sample(extent: Extent, views: int, cols: int, rows: int) -> tuple[Geometry, F32]:
     """Views of a disc with a hole, with some noise, through the beam of the scan."""
     geometry = _fewer(extent.geometry, views, cols, rows)
     grid = Grid.matching(geometry)

@@ -17,25 +17,19 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
-from recon.learnt_motion import judge_sweeps, learnt_motion, motion_sweeps, unseen_residuals
+from recon.learnt_motion import learnt_motion, unseen_residuals
 from recon.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
-from recon.spectral import ALIKE_LONGER, weight_of, weights_by_views
-from recon.spectral import TRIAL_SWEEPS as _WEIGHT_SWEEPS
+from recon.spectral import weight_of, weights_by_views
 from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
 from recon.voxels.motion import Motion, moved
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
-_MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
+MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
 _MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
 _MOVES = 0.95  # of what volumes leave of views held out: a motion that leaves less is there, or factors that do
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
-
-
-def trial_sweeps(cols: int) -> int:
-    """Of all trials of `fit_series`, at most, beside as many as the fit has; of so many columns."""
-    return ALIKE_LONGER * _WEIGHT_SWEEPS + judge_sweeps(cols) + motion_sweeps(cols) + TRIAL_STEPS
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +124,7 @@ def fit_series(
     Where nothing moves, and views held out are predicted better so, the volumes become factors of their mean that are
     smooth within matter: bodies that take up or lose something, each at its time.
     Steps, memory, `go_on` and `stop` are as there. Trials of weights, of whether it moves, of the motion and of factors
-    each count down to 0. They are `trial_sweeps` and `sweeps` at most in all. After the sweeps, the steps of the
+    each count down to 0. After the sweeps, the steps of the
     factors count down; if they are ended, the volumes are those without.
 
     Args:
@@ -144,10 +138,7 @@ def fit_series(
         ValueError: fewer than twelve views a volume, or fewer than six that are nearer to it than to any other.
     """
     n = views.geometry.n_views
-    if not 2 <= knots <= n // _LEAST_VIEWS:
-        raise ValueError(
-            f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
-        )
+    refuse_few(knots, n)
     times = np.linspace(*views.span, knots)
     near = (hats(views.times, times) > 0.5).sum(0)
     if near.min() < _LEAST_NEAR:
@@ -156,14 +147,14 @@ def fit_series(
             f"volume {k + 1} of {knots}, at time {times[k]:g}, has {near[k]} views within {np.diff(times)[0] / 2:g}, "
             f"expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views before and after a gap apart"
         )
-    energies, past = _of_moments(views, times, _MOMENTS * (knots - 1))
+    energies, past = of_moments(views, times, MOMENTS * (knots - 1))
     grid = Grid.matching(views.geometry)
     if tv_weight is None:
         weights = weights_by_views(energies, grid, seed, go_on, stop, alike=True)
     else:
         weights = np.full(knots, tv_weight / math.sqrt(past.size))
     learnt, left = None, None
-    coarse, coarse_past = _of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
+    coarse, coarse_past = of_moments(views, times, min(_MOTION_MOMENTS * (knots - 1), n // ONE_IN))
     coarse_weights = weights * math.sqrt(past.size / coarse_past.size)
     if motion is None:
         left = unseen_residuals(coarse, coarse_past, coarse_weights, go_on, stop)
@@ -243,7 +234,15 @@ def _smooth_factors(
     return smooth if left < _MOVES * alone else None
 
 
-def _of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
+def refuse_few(knots: int, n: int) -> None:
+    """ValueError where so many views are too few for so many volumes."""
+    if not 2 <= knots <= n // _LEAST_VIEWS:
+        raise ValueError(
+            f"{knots} volumes of {n} views: expected 2 volumes or more, and {_LEAST_VIEWS} views or more for each"
+        )
+
+
+def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
     """The views as of so many moments at most, of equal numbers of views; and the moments within the scan, 0 ... 1."""
     n = views.geometry.n_views
     moments = min(most, n)

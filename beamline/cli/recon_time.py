@@ -62,7 +62,7 @@ def recon_series(options: ReconOptions, volumes: int, moves: bool | None, dry: b
     clock, wanted, found = SystemClock(), WantedSeries(volumes, moves), None
     with events_shown(as_json) as sink:
         if dry:
-            needs = series_needs(options, wanted)
+            needs = series_needs(options, wanted, clock)
         else:
             found = reconstruct_series(
                 options, wanted, sink, clock, lambda stage: counting(stage, sink, clock), StopOnSignal(ready=False)

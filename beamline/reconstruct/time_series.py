@@ -28,10 +28,13 @@ from beamline.report.html import write_report
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.writers.recon_file import SUFFIXES, ReconRecord, VolumesInTime, write_reconstruction
 from drivers.base.clock import Clock
+from recon.assess.time_model import duration_text
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
-from recon.series import TimedViews, fit_series, trial_sweeps
+from recon.run_time import RunTime
+from recon.series import TimedViews, fit_series
+from recon.series_time import series_seconds
 
 _SWEEPS = 60
 _COPIES = 7  # of all line integrals: views, lines, a part held out, moments, binned views, weights
@@ -57,27 +60,24 @@ class SeriesNeeds:
 
     Attributes:
         shape: [time, z, y, x].
-        trials: sweeps of all trials, at most.
         memory, allowed: bytes in memory, and those that may be used.
         output: bytes on the disk.
+        time: that it takes, without reading and correction; None: not estimated.
     """
 
     shape: tuple[int, int, int, int]
     views: int
-    trials: int
     memory: int
     allowed: int
     output: int
+    time: RunTime | None = None
 
     @classmethod
     def of(cls, options: ReconOptions, wanted: WantedSeries, geometry: Geometry) -> SeriesNeeds:
         voxels = 4 * math.prod(shape := Grid.matching(geometry).shape)
         rays = 4 * geometry.n_views * math.prod(geometry.detector_shape)
         memory = (_VOLUMES * wanted.volumes + _FIELDS) * voxels + _COPIES * rays
-        trials = trial_sweeps(geometry.detector_shape[1]) + _SWEEPS
-        return cls(
-            (wanted.volumes, *shape), geometry.n_views, trials, memory, memory_of(options), wanted.volumes * voxels
-        )
+        return cls((wanted.volumes, *shape), geometry.n_views, memory, memory_of(options), wanted.volumes * voxels)
 
     def refuse(self) -> None:
         """ConfigError where it takes more memory than it may."""
@@ -93,20 +93,27 @@ class SeriesNeeds:
     def lines(self) -> list[str]:
         """For people."""
         shape = " x ".join(str(n) for n in self.shape[1:])
-        return [
+        lines = [
             f"{'volumes':<10}{self.shape[0]} of {shape} voxels, from {self.views} views",
             f"{'memory':<10}{size(self.memory)} of {size(self.allowed)}",
             f"{'disk':<10}{size(self.output)} for the result",
-            f"{'time':<10}not estimated; {_SWEEPS} sweeps, and {self.trials} at most before them",
         ]
+        if self.time is None:
+            return lines
+        least, most = (duration_text(seconds) for seconds in (self.time.least, self.time.most))
+        return [*lines, f"{'time':<10}about {least} to {most}, reading and correction not counted"]
 
 
-def series_needs(options: ReconOptions, wanted: WantedSeries) -> SeriesNeeds:
+def series_needs(options: ReconOptions, wanted: WantedSeries, clock: Clock) -> SeriesNeeds:
     """What it takes, before any frame is read. ConfigError where the memory does not suffice, or options do not fit."""
     with options.source.open() as source:
-        needs = SeriesNeeds.of(options, wanted, stated_geometry(source, options.selection))
+        geometry = stated_geometry(source, options.selection)
+    needs = SeriesNeeds.of(options, wanted, geometry)
     needs.refuse()
-    return needs
+    try:
+        return replace(needs, time=series_seconds(geometry, wanted.volumes, wanted.moves, _SWEEPS, clock.now))
+    except ValueError as error:
+        raise ConfigError(f"--time {wanted.volumes}: {error}. Nothing was written.") from error
 
 
 @dataclass(frozen=True)

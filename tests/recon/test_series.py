@@ -13,7 +13,7 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.proportions import SOLUTION_STEPS
-from recon.series import TimedViews, TimedVolumes, _of_moments, fit_series, hats
+from recon.series import TimedViews, TimedVolumes, fit_series, hats, of_moments
 from recon.voxels.projector import Projector
 
 SIDE, ROWS = 40, 4
@@ -84,7 +84,7 @@ def test_a_linear_change_is_found_from_views_without_noise() -> None:
 def test_a_scan_counts_at_most_so_many_moments_and_learns_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     views, found = views_of(60, noise=0.05), list[F32]()
     for most in (16, 64):
-        monkeypatch.setattr("recon.series._MOMENTS", most)
+        monkeypatch.setattr("recon.series.MOMENTS", most)
         found.append(fit_series(views, 3, motion=False, tv_weight=0.5, sweeps=20).volumes)
     assert psnr(found[0], found[1]) > 35
 
@@ -224,7 +224,7 @@ def test_each_part_of_a_scan_with_a_moment_a_view_sees_all_times_and_directions(
     """Also the views held out, of which there are eight parts."""
     views = views_of(72)
     for parts in (8, 9):
-        timed, past = _of_moments(views, np.array([0.0, 10.0]), 72)
+        timed, past = of_moments(views, np.array([0.0, 10.0]), 72)
         part = timed.parted(parts)
         assert past.size == 72
         for number in range(parts):

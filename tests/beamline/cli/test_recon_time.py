@@ -149,6 +149,7 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
         (("--time", "4"), 2, "12 views or more for each"),
         (("--time", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
         (("--time", "2", "--memory", "300K"), 2, "made in slabs: give --rows with 1 row or fewer at a time, or --bin"),
+        (("--time", "4", "--dry-run"), 2, "4 volumes of 36 views: expected 2 volumes or more, and 12 views or more"),
         (("--time", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
         (("--time", "2", "--axis", "try:18:20:1"), 2, "Find the axis first: give --axis try without --time"),
     ],
@@ -170,6 +171,7 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     assert done.exit_code == 0, done.output
     assert "2 of 2 x 40 x 40 voxels, from 36 views" in done.output
     assert "memory" in done.output
+    assert " s to " in done.output.splitlines()[-1]
     assert not left(tmp_path)
 
 
