@@ -22,9 +22,10 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.volumes.files import opened_volume
 from beamline.study.run import Rig
 from beamline.study.studies import StudyRow
+from beamline.tradeoff.compared import split
 from beamline.tradeoff.data import Data
 from beamline.tradeoff.opened import ComparedScan
-from beamline.tradeoff.run import TradeoffOptions, run_tradeoff, split
+from beamline.tradeoff.run import TradeoffOptions, run_tradeoff
 from beamline.tradeoff.trials import Trial
 from beamline.tradeoff.worker import run
 from drivers.base.clock import SystemClock
