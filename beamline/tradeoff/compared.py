@@ -26,6 +26,7 @@ from beamline.tradeoff.varied import Depth
 from recon.base.arrays import F32
 from recon.base.volume import Grid
 from recon.methods import names_compared
+from recon.series import refuse_few
 from recon.splatting.initialise import default_count
 
 _HELD_OUT_ONE_IN = 8  # without a truth, one view in this many is held out
@@ -102,6 +103,10 @@ def _in_time(scan: ComparedScan, methods: Sequence[str], volumes: int, warn: War
     held = hold_out(opened.prepared, _HELD_OUT_ONE_IN, most=_HELD_OUT_VIEWS, advice="leave out --time")
     if held.emission is not None:
         raise ConfigError(f"--time: {scan.source.path} is of an emission. Leave it out. Nothing was written.")
+    try:
+        refuse_few(volumes, held.geometry.n_views)
+    except ValueError as error:
+        raise ConfigError(f"--time {volumes}: {error}. Nothing was written.") from error
     with scan.source.open() as source:
         used, unseen = held.projections.view_ids, held.held_out_ids
         seconds = times_of(source, used if unseen is None else np.concatenate((used, unseen)), warn)

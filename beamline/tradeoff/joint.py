@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +28,11 @@ PartFit = Callable[[F32, Geometry, F32 | None], F32]
 _TOYS = 12  # copies of the four views of a toy
 
 
-def jointly(trial: Trial, data: Data, seed: int) -> VolumeAt:
+def jointly(trial: Trial, data: Data, seed: int, **given: Any) -> VolumeAt:
     """The volumes of `recon.fit_series` or `recon.fit_materials`.
+
+    Args:
+        given: other arguments of these.
 
     Raises:
         ValueError: too few views, or settings that there are not.
@@ -39,10 +43,10 @@ def jointly(trial: Trial, data: Data, seed: int) -> VolumeAt:
     if data.sections is None:
         timed = TimedViews(shown, data.geometry, data.shown[:n], weights)
         motion, _ = MOTION[str(trial.settings["motion"])]
-        return fit_series(timed, int(trial.settings["volumes"] or 0), motion=motion, seed=seed).at
+        return fit_series(timed, int(trial.settings["volumes"] or 0), motion=motion, seed=seed, **given).at
     sections, grid = data.sections, Grid.matching(data.geometry)
     views = EnergyViews(shown, data.geometry, data.shown[:n].astype(np.intp), sections, weights)
-    made = fit_materials(views, grid, seed=seed)
+    made = fit_materials(views, grid, seed=seed, **given)
     if trial.settings.get("share"):
         made = fit_share(views, made, (data.states[0], data.states[1]))
     return lambda energy: np.tensordot(sections[int(energy)].astype(np.float32), made.densities, 1)

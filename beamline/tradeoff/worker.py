@@ -136,8 +136,9 @@ def ready(trial: Trial, geometry: Geometry) -> None:
         ValueError: the method does not take such views.
     """
     if trial.method in JOINT:
-        volumes = {"volumes": 2} if "volumes" in trial.settings else {}
-        jointly(replace(trial, settings={**trial.settings, **volumes}), toy_like(geometry, trial), 0)
+        series = {"volumes": 2, "motion": "none" if trial.settings.get("motion") == "none" else "learnt"}
+        settings = series if "volumes" in trial.settings else trial.settings
+        jointly(replace(trial, settings=settings), toy_like(geometry, trial), 0, tv_weight=0.1, sweeps=1)
     else:
         warm_up(trial.build(), geometry)
 

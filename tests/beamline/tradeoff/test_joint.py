@@ -188,7 +188,7 @@ def test_too_few_views_are_a_failed_trial(in_time: Data, tmp_path: Path, capsys:
 @pytest.mark.parametrize("how", ["none", "learnt", "chosen"])
 def test_compiling_takes_a_toy_of_the_same_trial(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     toys: list[Data] = []
-    monkeypatch.setattr(worker, "jointly", lambda trial, data, seed: toys.append(data))
+    monkeypatch.setattr(worker, "jointly", lambda trial, data, seed, **given: toys.append(data))
     cone = Geometry.cone(np.linspace(0, 6, 9), (30, 40), 1.0, 60.0, 120.0)
     ready(replace(SERIES, settings={"volumes": 5, "motion": how}), cone)
     assert toys[0].geometry.is_cone and toys[0].geometry.detector_shape < (30, 40)
