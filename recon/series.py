@@ -26,7 +26,8 @@ from recon.voxels.projector import Projector, projection_lines, volume_lines, vo
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
 _MOTION_MOMENTS = 4  # likewise, to learn the motion, which is smooth in time
-_MOVES = 0.95  # of what volumes leave of views held out: a motion that leaves less is there, or factors that do
+_MOVES = 0.9  # of what volumes leave of views held out: a motion that leaves less is there
+_FACTORS = 0.95  # likewise of its square: factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _LEAST_VIEWS = 12  # for each volume: views held out must see it, too
 _LEAST_NEAR = 6  # nearer to a volume than to any other; volumes at the ends have views on one side
@@ -231,7 +232,7 @@ def _smooth_factors(
     if not steps.going or stop():
         return None
     alone = replace(judge, matter=np.ones_like(judge.matter)).left(np.stack([volume_lines(one) for one in free])).sum()
-    return smooth if left < _MOVES * alone else None
+    return smooth if left < _FACTORS * alone else None
 
 
 def refuse_few(knots: int, n: int) -> None:
