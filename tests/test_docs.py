@@ -1,4 +1,4 @@
-"""The pages of the docs site: short enough to be read, in the navigation, and with links that lead somewhere."""
+"""The pages of the docs site: in the navigation, and with links that lead somewhere."""
 
 from __future__ import annotations
 
@@ -9,15 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-LONGEST = 12_000
-"""Bytes of a page."""
 PAGES = sorted(path for path in DOCS.rglob("*.md") if path.relative_to(DOCS).parts[0] != "notes")
 ENTRANCES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
-def test_a_page_is_short_enough_to_be_read(page: Path) -> None:
-    assert page.stat().st_size <= LONGEST
 
 
 def test_every_page_but_the_single_decisions_is_in_the_navigation() -> None:
