@@ -59,6 +59,8 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
         raise DataError(f"--calibrate gains: {error}. Leave it out, or give --rings.") from error
     values = {"learnt_gains_held_out_before": found.without, "learnt_gains_held_out_after": found.left}
     judged = f"views held out are left {found.without:.4g} without them and {found.left:.4g} with them"
+    if found.without == 0:
+        judged = "no stripes are seen in the views that are the detector's"
     if not found.confirmed:
         said = f"Gains learnt with the volume: none taken off; {judged}."
         return StepDone(said, {"learnt_gains": said, **values})

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, median_filter
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
 from scipy.signal import find_peaks
 
 from recon.base.arrays import F32
@@ -22,7 +23,9 @@ _CLEARLY = 1.15  # structure is taken for noise, where the noise beside it is le
 _BOW_TIE_ROWS, _BOW_TIE_BINS, _LEAST_POWERS = 32, 16, 200
 _LEAST_FIELD = 0.4  # of the columns, on the shorter side of the axis
 _EVEN, _MARGIN = 0.02, 1.1  # of a step between views; of the bound
+_BLOCKS, _BLOCK = 8, 5
 _RING_VIEWS, _NEIGHBOURS = 20, 9  # views; pixels along a row
+_SURE, _SHARED, _FEWEST_PAIRS = 3.0, 2.0, 40  # standard deviations; columns with one on the other side of the axis
 _SAMPLED, _BINS, _PEAK = 2**20, 400, 0.1  # values of a histogram, its bins, and the height of a peak, of the highest
 _CLIPPED, _ROUNDS = 4.0, 20  # standard deviations of air, rounds
 _GROWTH = 4.0  # largest deviation of air, over that of the values below its commonest value
@@ -126,25 +129,73 @@ def median_deviation(images: NDArray[np.floating[Any]]) -> float:
     return float(np.median(np.abs(finite))) / _MEDIAN if finite.size else 0.0
 
 
-def ring_offsets(residual: F32) -> F32:
+def ring_offsets(residual: F32, axis_col: float) -> F32:
     """Offsets of single pixels [row, col] that stay in all views and become rings in a volume.
 
-    It is the median of the residual over the views, less its neighbourhood along the row and along the column. The wall
-    of a can around the axis stays in all views, too, but in all rows alike (-1.1 dB on a battery). Offsets below three
-    standard errors of their scatter are 0. With few views noise cannot be separated from the sample: then all are 0.
+    It is the median of the residual over the views, less its neighbourhood along the row. The wall of a can around the
+    axis stays in all views, too, in all rows alike (-1.1 dB on a battery), and on both sides of the axis. So of what
+    rows have in common only that counts which the other side lacks, see `without_layers`. Offsets below three standard
+    errors of their scatter between blocks of views count by the share that gains have in them, as columns differ from
+    those on the other side (Wiener). With few views noise cannot be separated from the sample: then all are 0.
 
     Args:
         residual: views less a model's views, [view, row, col].
+        axis_col: column of the rotation axis.
     """
-    n = len(residual)
-    if n < _RING_VIEWS or residual.shape[2] < _NEIGHBOURS:
-        return np.zeros(residual.shape[1:], np.float32)
-    steady = np.median(residual, axis=0)
-    steady -= median_filter(steady, (1, _NEIGHBOURS), mode="nearest")
-    if len(steady) >= _NEIGHBOURS:
-        steady -= median_filter(steady, (_NEIGHBOURS, 1), mode="nearest")
-    error = 1.25 * median_deviation(residual - np.median(residual)) / np.sqrt(n)
-    return np.where(np.abs(steady) > 3 * error, steady, 0).astype(np.float32)
+    n, rows, cols = residual.shape
+    if n < _RING_VIEWS or cols < _NEIGHBOURS:
+        return np.zeros((rows, cols), np.float32)
+    blocks = np.stack([_fine(np.median(part, axis=0)) for part in np.array_split(residual, min(n // _BLOCK, _BLOCKS))])
+    steady = blocks.mean(axis=0)
+    if rows >= _NEIGHBOURS:
+        shared = median_filter(steady, (_NEIGHBOURS, 1), mode="nearest")
+        steady += without_layers(shared, axis_col) - shared
+    else:
+        steady = without_layers(steady, axis_col)
+    error2 = blocks.var(axis=0) / (len(blocks) - 1)
+    error2 = np.maximum(error2, np.median(error2)) + 1e-30
+    odd = (blocks - mirrored(blocks, axis_col)) / math.sqrt(2)
+    spread2 = median_deviation(odd.mean(axis=0)) ** 2 - median_deviation(odd - odd.mean(axis=0)) ** 2 / (
+        len(blocks) - 1
+    )
+    prior = max(spread2, 0.0)
+    share = np.where(steady**2 > _SURE**2 * error2, 1.0, prior / (prior + error2))
+    return np.asarray(steady * share, np.float32)
+
+
+def _fine(image: F32) -> F32:
+    return image - median_filter(image, (1, _NEIGHBOURS), mode="nearest")
+
+
+def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floating]:
+    """Values [..., col] of the columns on the other side of the axis; NaN where there are none."""
+    cols = values.shape[-1]
+    at = 2 * axis_col - np.arange(cols)
+    return np.where((at >= 0) & (at <= cols - 1), spline_at(values, np.clip(at, 0, cols - 1)), np.nan)
+
+
+def without_layers(stripes: F32, axis_col: float) -> F32:
+    """Stripes [row, col] less what the columns on the other side of the axis have, too.
+
+    Where both sides have more in common than twice the standard deviation of what is one-sided, it belongs to layers of
+    the sample around the axis: of 800 pairs of independent columns, one has. Columns without one on the other side stay
+    as they are.
+    """
+    cols = stripes.shape[1]
+    at = 2 * axis_col - np.arange(cols)
+    seen = (at >= 0) & (at <= cols - 1)
+    mirrored = spline_at(stripes, np.clip(at, 0, cols - 1))
+    if seen.sum() < _FEWEST_PAIRS:
+        return stripes
+    usual = _SHARED * median_deviation(((stripes - mirrored) / math.sqrt(2))[:, seen])
+    low, high = (extreme(mirrored, (1, 3), mode="nearest") for extreme in (minimum_filter, maximum_filter))
+    shared = np.where(stripes > 0, np.clip(high, 0, np.maximum(stripes, 0)), np.clip(low, np.minimum(stripes, 0), 0))
+    return np.asarray(stripes - np.where(seen & (np.abs(shared) > usual), shared, 0), np.float32)
+
+
+def spline_at(values: NDArray[np.floating], places: NDArray[np.float64]) -> NDArray[np.floating]:
+    """Values [..., col] at places between columns, by cubic splines."""
+    return np.asarray(make_interp_spline(np.arange(values.shape[-1]), values, 3, axis=-1)(places))
 
 
 def air_level(values: F32) -> tuple[float, float]:

@@ -1,9 +1,10 @@
 """Gains of pixels, learnt with the volume: a constant of each pixel in all views, which makes a ring.
 
 A few sweeps of FISTA-TV and the median of the residual over the views alternate, see `ring_offsets`. Total variation
-keeps rings out of the volume, and bodies in it. Three sorts of gain stay in
-the views. A gain near the axis looks like a body on the axis. A stripe of all rows looks like the wall of a can. A
-slow change along a row looks like density.
+keeps rings out of the volume, and bodies in it. Without stripes, see `recon.prep.rings.steadiness`, nothing is learnt:
+what few sweeps leave at edges would count as gains. Three sorts of gain stay in the views. A gain near the axis looks
+like a body on the axis. What pixels on both sides of the axis have in common looks like the wall of a can. A slow
+change along a row looks like density.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import ring_offsets
 from recon.base.volume import Grid, Volume
+from recon.prep.rings import steadiness
 from recon.voxels.held_out_weight import beyond_chance, busiest_rows, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods.fista_tv import FistaTv
@@ -33,6 +35,7 @@ _ONE_IN = 6  # views held out
 _TV_WEIGHT = 1e-3  # three times as much takes a sixth of a ball on the axis
 _FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
 _BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; see `beyond_chance`
+_LOOKED_AT = 8  # rows
 _VOLUMES, _RAYS, _WEIGHTS = 8.5, 7.0, 5.0  # float32 copies at most
 
 
@@ -42,7 +45,8 @@ class LearntGains:
 
     Attributes:
         pixels: float32 [row, col]; 0 where the views held out do not confirm them.
-        without, left: root mean square that volumes leave of views held out, in the rows with most matter.
+        without, left: root mean square that volumes leave of views held out, in the rows with most matter; 0 where no
+            stripes were seen, so that nothing was learnt.
         confirmed: by the views held out.
     """
 
@@ -77,6 +81,8 @@ def learn_gains(
     seen, unseen = split_views(geometry, _ONE_IN)
     found, height = np.zeros((rows, cols), np.float32), _height(geometry)
     busiest = busiest_rows(projections, height).start
+    if not _stripes_seen(projections[:, busiest : busiest + height], geometry):
+        return LearntGains(found, 0.0, 0.0, False)
     lowest = busiest % height - height * (busiest % height > 0)
     starts = sorted(range(lowest, rows, height), key=lambda at: at != busiest)
     without = left = np.zeros(1)
@@ -103,6 +109,14 @@ def gains_memory(geometry: Geometry) -> int:
     outer = min(_height(geometry) + 2 * _HALO, rows)
     band = geometry if outer == rows else geometry.rows(0, outer)
     return iterative_memory(band, Grid.matching(band), _VOLUMES, _RAYS, _WEIGHTS) + 8 * rows * cols
+
+
+def _stripes_seen(projections: F32, geometry: Geometry) -> bool:
+    """Whether pixels of some rows [view, row, col] answer unequally, as far as the sample lets it be seen."""
+    views = np.argsort(geometry.angles, kind="stable")
+    rows = np.arange(0, projections.shape[1], max(1, projections.shape[1] // _LOOKED_AT))
+    steady = steadiness(projections[np.ix_(views, rows)], geometry.axis_col)
+    return steady is None or steady.stripes
 
 
 def _height(geometry: Geometry) -> int:
@@ -141,7 +155,7 @@ class _Band:
             method = FistaTv(_SWEEPS if at else _FIRST, _TV_WEIGHT)
             volume = solve(method, projector, data, weight=weight, start=volume, decide=decide)
             if gains and at + 1 < _ROUNDS:
-                left = ring_offsets(data - projector.forward(volume.data)) * self._told_apart()
+                left = ring_offsets(data - projector.forward(volume.data), self.geometry.axis_col) * self._told_apart()
                 data -= left
                 found += left
         assert volume is not None

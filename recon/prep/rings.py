@@ -14,17 +14,23 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from recon.base.arrays import F32
 from recon.base.choices import Rings
+from recon.base.noise import spline_at, without_layers
 
 _ROBUST = 1.4826  # median deviation to standard deviation, for normal values
 _FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
 _FEWEST_VIEWS, _NARROWEST = 8, 64  # columns; in 40 columns the methods add more than they remove
 _MOST = 0.1  # of the columns
 _EVEN = 0.4  # a stripe has nearly the same shift in all views: largest standard deviation over the shift
-_SEEN = 4.5  # `stripe_score` from which on there are stripes: 1.4 to 3.6 without, 5 to 10 in two real scans
+_SEEN = 3.5  # `Steadiness.score` from which on there are stripes: 0.3 to 2.7 without, 4.4 and 5.3 in two real scans
+_ONE_SIDED = 0.5  # of pixels' answers the odd part equals the even one; layers of the sample have hardly any
+_BLOCKS, _BLOCK = 8, 8  # contiguous blocks of views, and views of the smallest one
+_AT_AXIS = 4.0  # columns on either side: a body this small on the axis stays in them
+_FEWEST_PAIRS = 20  # mirrored columns
+_ROWS = 8  # looked at
 _COPIES = 13  # float32 copies of a sinogram
 _LEVELS, _DAMPING = 2, 1.0  # levels of the wavelets; more levels remove wider stripes, and more of the sample
 
@@ -122,6 +128,73 @@ REMOVERS: Mapping[str, Callable[[F32], F32]] = MappingProxyType(
     {"sort": by_sorting, "vo": by_vo, "wavelet": by_wavelets}
 )
 """Ways to remove stripes, by name."""
+_NAMES: Mapping[Callable[[F32], F32], str] = {
+    by_sorting: "sort",
+    without_dead_columns: "dead columns",
+    without_large_stripes: "large stripes",
+}
+
+
+@dataclass(frozen=True)
+class Steadiness:
+    """What stays in the columns of a sinogram through all views, as standard deviations of fine differences.
+
+    A layer of the sample around the axis stays in its columns, too, but in those on both sides of the axis alike. The
+    answer of a pixel knows nothing of the pixel on the other side. So stripes are odd about the axis as much as they
+    are even, and only those of the sample are even alone.
+
+    Attributes:
+        odd, even: parts of the mean over blocks of views.
+        noise: of the odd part, by how it differs between the blocks.
+    """
+
+    odd: float
+    even: float
+    noise: float
+
+    @property
+    def score(self) -> float:
+        """The odd part in units of its noise; about 1 without stripes."""
+        return self.odd / max(self.noise, 1e-12)
+
+    @property
+    def stripes(self) -> bool:
+        """Whether pixels answer unequally."""
+        return self.score > _SEEN and self.odd > _ONE_SIDED * self.even
+
+
+def steadiness(sinograms: F32, axis_col: float) -> Steadiness | None:
+    """How steady and how one-sided the columns of sinograms are; None: too few columns have a mirrored one.
+
+    Args:
+        sinograms: [view, row, col] in the order of the angles.
+        axis_col: column of the rotation axis.
+    """
+    n, rows, cols = sinograms.shape
+    blocks = np.array_split(np.arange(n), min(max(n // _BLOCK, 2), _BLOCKS))
+    right = np.arange(math.ceil(axis_col + _AT_AXIS), cols, dtype=np.float64)
+    left = 2 * axis_col - right
+    right, left = right[left >= 0], left[left >= 0]
+    if right.size < _FEWEST_PAIRS:
+        return None
+    fine = np.stack([[_fine(sinograms[block, row]) for row in range(rows)] for block in blocks])
+    mirrored = spline_at(fine, left)
+    own = fine[..., right.astype(int)]
+    odd, even = (own - mirrored) / math.sqrt(2), (own + mirrored) / math.sqrt(2)
+    mean = odd.mean(axis=0)
+    noise = _spread(odd - mean) / math.sqrt(len(blocks) - 1)
+    return Steadiness(_spread(mean), _spread(even.mean(axis=0)), noise)
+
+
+def _fine(sinogram: F32) -> NDArray[np.floating]:
+    """[col] how a column differs from the four beside it in most views, without what bends slowly along the row."""
+    x = np.pad(sinogram, ((0, 0), (2, 2)), mode="edge")
+    off = np.median(x[:, 2:-2] - (x[:, :-4] + x[:, 1:-3] + x[:, 3:-1] + x[:, 4:]) / 4, axis=0)
+    return np.asarray(np.convolve(off, (-0.5, 1, -0.5), mode="same"))
+
+
+def _spread(values: NDArray[np.floating]) -> float:
+    return float(_ROBUST * np.median(np.abs(values)))
 
 
 def stripe_score(sinogram: F32) -> float:
@@ -154,14 +227,20 @@ class WithoutRings:
     said: str
 
 
-def remove_rings(projections: NDArray[np.floating], angles: NDArray[np.float64], rings: Rings = "auto") -> WithoutRings:
+def remove_rings(
+    projections: NDArray[np.floating],
+    angles: NDArray[np.float64],
+    rings: Rings = "auto",
+    axis_col: float | None = None,
+) -> WithoutRings:
     """A copy of line integrals without the stripes that make rings, for use between `recon.correct` and a method.
 
     Args:
         projections: [view, row, col], in any order; fewer than 8 views, or of fewer than 64 columns, are not changed.
         angles: [view], radians.
         rings: "sort" for small and medium stripes (Vo et al. 2018, algorithm 3), "vo" also for dead columns and large
-            ones. "wavelet" by wavelets (Münch et al. 2009), "none". "auto" looks and chooses sort, vo or none.
+            ones. "wavelet" by wavelets (Münch et al. 2009), "none". "auto" looks and chooses.
+        axis_col: column of the rotation axis; None: the middle.
 
     Raises:
         ValueError: shapes that do not fit, values that are not finite, or another `rings`.
@@ -173,17 +252,21 @@ def remove_rings(projections: NDArray[np.floating], angles: NDArray[np.float64],
         raise ValueError(f"rings is one of {', '.join(get_args(Rings))}, got {rings!r}")
     if not (np.isfinite(views).all() and np.isfinite(theta).all()):
         raise ValueError("projections or angles hold NaN or infinite values; correct them first")
-    return WithoutRings(views, *remove_rings_in_place(views, theta, rings))
+    return WithoutRings(views, *remove_rings_in_place(views, theta, rings, axis_col))
 
 
-def remove_rings_in_place(views: F32, angles: NDArray[np.float64], rings: Rings) -> tuple[F32, str]:
+def remove_rings_in_place(
+    views: F32, angles: NDArray[np.float64], rings: Rings, axis_col: float | None = None
+) -> tuple[F32, str]:
     """Stripes out of all rows of line integrals [view, row, col], in place.
 
     Args:
         views: in any order; fewer than 8, or of fewer than 64 columns, are not changed.
         angles: [view], radians.
-        rings: the method. "auto" looks at `stripe_score` of some rows: `sort` for stripes, `vo` for columns that are
-        dead or far off, otherwise nothing.
+        rings: the method. "auto" looks at some rows: it sorts where `steadiness` sees stripes, and takes out columns
+            that are dead or far off.
+        axis_col: column of the rotation axis; None: the middle. What a column has in common with the one on the other
+            side of the axis stays, see `without_layers`.
 
     Returns:
         float32 [row, col], mean removed part of a view, and a sentence about it; "" for "none".
@@ -197,29 +280,59 @@ def remove_rings_in_place(views: F32, angles: NDArray[np.float64], rings: Rings)
             f"least {_FEWEST_VIEWS} of {_NARROWEST}); none removed."
         )
     order = np.argsort(angles, kind="stable")
-    rows = np.unique(np.linspace(0, views.shape[1] - 1, min(views.shape[1], 8)).astype(int))
-    before = float(np.median([stripe_score(views[order, row]) for row in rows]))
-    way: str = rings
-    if rings == "auto":
-        odd = sum(_odd_columns(views[order, row]) for row in rows)
-        way = "vo" if odd else "sort" if before > _SEEN else "none"
-        if way == "none":
-            return taken, f"Rings: none seen (stripes of {before:.1f}, seen from {_SEEN:g} on); none removed."
-    remover = REMOVERS[way]
+    axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
+    rows = _some_rows(views)
+    before = _typical_score(views[np.ix_(order, rows)])
+    stages = (REMOVERS[rings],) if rings != "auto" else _stages(views[np.ix_(order, rows)], axis)
+    if not stages:
+        return taken, "Rings: no stripes seen that are the detector's; none removed."
     for row in range(views.shape[1]):
-        stripes = views[order, row]
-        clean = remover(stripes)
+        stripes = clean = views[order, row]
+        for remove in stages:
+            clean = remove(clean)
+        level = np.median(stripes - clean, axis=0)
+        clean = clean + (level - without_layers(level[None], axis)[0])
         taken[row] = (stripes - clean).mean(axis=0)
         views[order, row] = clean
-    after = float(np.median([stripe_score(views[order, row]) for row in rows]))
-    return taken, f"Rings: removed by {way}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+    after = _typical_score(views[np.ix_(order, rows)])
+    how = ", ".join(_NAMES.get(remove, rings) for remove in stages)
+    return taken, f"Rings: removed by {how}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+
+
+def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
+    """A sentence where pixels answer so unequally that rings are seen, with what removes them; otherwise ""."""
+    if len(views) < _FEWEST_VIEWS or views.shape[2] < _NARROWEST:
+        return ""
+    steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
+    if steady is None or not steady.stripes:
+        return ""
+    return (
+        f"Rings: pixels answer unequally, by {steady.odd:.2g} of line integral, {steady.score:.1f} times the noise of "
+        "a column; nothing was removed. --calibrate gains (by the volume) or --rings auto (by a filter) removes them."
+    )
+
+
+def _some_rows(views: F32) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, views.shape[1] - 1, min(views.shape[1], _ROWS)).astype(np.intp))
+
+
+def _typical_score(sinograms: F32) -> float:
+    return float(np.median([stripe_score(sinograms[:, row]) for row in range(sinograms.shape[1])]))
+
+
+def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]:
+    """What removes the stripes of these rows [view, row, col] that are the detector's, in order."""
+    steady = steadiness(sinograms, axis_col)
+    strong = (without_dead_columns, without_large_stripes)
+    far_off = any(_far_off(sinograms[:, row], axis_col) for row in range(sinograms.shape[1]))
+    return (strong if far_off else ()) + ((by_sorting,) if steady is not None and steady.stripes else ())
 
 
 def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
     """Most bytes that `remove_rings_in_place` takes beside views of a detector (rows, cols)."""
     rows, cols = shape
     if rings == "none" or views < _FEWEST_VIEWS or cols < _NARROWEST:
-        return 4 * rows * cols
+        return 4 * (rows + views * min(rows, _ROWS)) * cols
     padded = (views + 2 ** (_LEVELS + 3)) * (cols + 2 ** (_LEVELS + 3))
     return 4 * (rows * cols + _COPIES * (padded if rings == "wavelet" else views * cols))
 
@@ -229,12 +342,17 @@ def _noise(values: NDArray[np.floating]) -> float:
     return float(_ROBUST * np.median(np.abs(np.diff(values, 2, axis=0))) / math.sqrt(6))
 
 
-def _odd_columns(sinogram: F32) -> int:
-    """How many columns are dead or far off, at most a fifth."""
+def _far_off(sinogram: F32, axis_col: float) -> bool:
+    """Whether columns are dead or far off: at most a fifth of all, none near the axis or with one on its other side."""
     cleaned = without_large_stripes(without_dead_columns(sinogram))
     changed = (cleaned != sinogram).any(axis=0).sum()
     strong = np.abs(cleaned - sinogram).max(axis=0) > 0.1 * max(float(np.ptp(np.median(sinogram, axis=0))), 1e-12)
-    return int(strong.sum()) if changed <= sinogram.shape[1] / 5 else 0
+    columns = np.arange(strong.size)
+    across = np.rint(2 * axis_col - columns).astype(int)
+    seen = (across >= 0) & (across < strong.size)
+    mirrored = seen & maximum_filter1d(strong, 3)[np.clip(across, 0, strong.size - 1)]
+    own = strong & ~mirrored & (np.abs(columns - axis_col) > _AT_AXIS)
+    return bool(own.any() and changed <= strong.size / 5)
 
 
 def _around(values: NDArray[np.floating], width: int) -> NDArray[np.floating]:

@@ -301,7 +301,7 @@ def _prepared(gaussians: Gaussians, problem: ReconProblem, fit: FitSettings) -> 
     if not (data.any() and model.any()):
         return None
     data, known = _without_outliers(data, known, model)
-    return data - ring_offsets(data - model), known, model
+    return data - ring_offsets(data - model, problem.geometry.axis_col), known, model
 
 
 def _power(problem: VoxelProblem) -> int:

@@ -83,7 +83,7 @@ def unexplained(
     if weights is not None:
         unseen = unseen | (weights[:, rows] == 0)
     left[unseen] = 0
-    left -= ring_offsets(left)
+    left -= ring_offsets(left, views.axis_col)
     left[unseen] = 0
 
     signs = np.where(np.arange(len(left)) % 2, np.float32(1), np.float32(-1))

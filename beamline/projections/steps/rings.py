@@ -30,13 +30,11 @@ class Rings:
         "--rings",
         "none",
         "Stripes of the sinograms, which make rings. sort: small ones; vo: dead columns, large and small ones; "
-        "wavelet: by their wavelets; auto: sort or vo where there are some, and says so.",
+        "wavelet: by their wavelets; auto: what it sees. Layers of the sample around the axis stay.",
         choices=get_args(Way),
     )
 
-    @property
-    def needs_finished(self) -> str:
-        return "" if self.way == "none" else "--rings is for a finished scan: it needs all views."
+    needs_finished: ClassVar[str] = ""
 
     def memory(self, part: ScanPart) -> StepMemory:
         from recon.prep.rings import removal_memory
@@ -46,9 +44,13 @@ class Rings:
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
-        from recon.prep.rings import remove_rings_in_place
+        from recon.prep.rings import remove_rings_in_place, rings_seen
 
-        taken, said = remove_rings_in_place(views.projections.data, angles, self.way)
+        data, axis_col = views.projections.data, views.geometry.axis_col
+        if self.way == "none":
+            said = rings_seen(data, angles, axis_col)
+            return StepDone(said, {"rings": self.way, **({"rings_seen": said} if said else {})})
+        taken, said = remove_rings_in_place(data, angles, self.way, axis_col)
         if views.held_out is not None:
             views.held_out[0][...] -= taken
         return StepDone(said, {"rings": self.way, **({"rings_removed": said} if said else {})})

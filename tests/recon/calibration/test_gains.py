@@ -75,6 +75,26 @@ def test_gains_are_found_and_the_ball_on_the_axis_stays_as_no_filter_leaves_it(g
     assert rings["gains"] < 0.7 * ring_score((before - true)[3], (MIDDLE, MIDDLE))
 
 
+@pytest.mark.parametrize("size", [0.02, 0.0])
+def test_gains_of_columns_are_found_and_where_there_are_none_nothing_is(size: float) -> None:
+    """Gains that all rows share, beside a can's wall: of what FISTA-TV loses by them, half comes back."""
+    wall = (Cylinder(33, 100, 0.02), Cylinder(31.5, 100, -0.02))
+    clean = _views(*wall)
+    gains = np.random.default_rng(6).normal(0, size, SHAPE[1]).astype(np.float32)
+    found = learn_gains(clean + gains, GEOMETRY)
+    assert found.confirmed == (size > 0)
+    if not size:
+        assert not found.pixels.any()
+        return
+    true = recon.reconstruct(clean, GEOMETRY, recon.FistaTv(20, 1e-3)).volume.data
+    errors = [
+        _rms(recon.reconstruct(views, GEOMETRY, recon.FistaTv(20, 1e-3)).volume.data - true)
+        for views in (clean + gains, clean + gains - found.pixels)
+    ]
+    print("\n", errors)
+    assert errors[1] < 0.6 * errors[0]
+
+
 def _depth(volume: F32) -> float:
     """The ball over what is around it."""
     return float(volume[9:11, 34:38, 34:38].mean() - volume[9:11, 28:44, 28:44].mean())
