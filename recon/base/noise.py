@@ -147,11 +147,8 @@ def ring_offsets(residual: F32, axis_col: float) -> F32:
         return np.zeros((rows, cols), np.float32)
     blocks = np.stack([_fine(np.median(part, axis=0)) for part in np.array_split(residual, min(n // _BLOCK, _BLOCKS))])
     steady = blocks.mean(axis=0)
-    if rows >= _NEIGHBOURS:
-        shared = median_filter(steady, (_NEIGHBOURS, 1), mode="nearest")
-        steady += without_layers(shared, axis_col) - shared
-    else:
-        steady = without_layers(steady, axis_col)
+    shared = median_filter(steady, (min(rows, _NEIGHBOURS), 1), mode="nearest")
+    steady += without_layers(shared, axis_col) - shared
     error2 = blocks.var(axis=0) / (len(blocks) - 1)
     error2 = np.maximum(error2, np.median(error2)) + 1e-30
     odd = (blocks - mirrored(blocks, axis_col)) / math.sqrt(2)

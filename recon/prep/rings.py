@@ -331,10 +331,11 @@ def _stages(sinograms: F32, axis_col: float) -> tuple[Callable[[F32], F32], ...]
 def removal_memory(views: int, shape: tuple[int, int], rings: Rings) -> int:
     """Most bytes that `remove_rings_in_place` takes beside views of a detector (rows, cols)."""
     rows, cols = shape
+    looked_at = views * min(rows, _ROWS) * cols
     if rings == "none" or views < _FEWEST_VIEWS or cols < _NARROWEST:
-        return 4 * (rows + views * min(rows, _ROWS)) * cols
+        return 4 * (rows * cols + looked_at)
     padded = (views + 2 ** (_LEVELS + 3)) * (cols + 2 ** (_LEVELS + 3))
-    return 4 * (rows * cols + _COPIES * (padded if rings == "wavelet" else views * cols))
+    return 4 * (rows * cols + looked_at + _COPIES * (padded if rings == "wavelet" else views * cols))
 
 
 def _noise(values: NDArray[np.floating]) -> float:
