@@ -21,9 +21,9 @@ underscored = parsed(lambda value: value.replace("-", "_"))
 scan_options = together(
     click.option(
         "--quantity",
-        type=click.Choice(["counts", "line-integrals"]),
+        type=click.Choice(["counts", "transmission", "line-integrals"]),
         callback=underscored,
-        help="Quantity of the pixels, if the file does not state it: raw counts, or corrected line integrals.",
+        help="Quantity of the pixels, if the file does not state it: raw counts, transmission (0 to 1), or its -log.",
     ),
     click.option("--angles", type=_PATH, help="Text file with one angle per line, degrees."),
     click.option("--angle-rows", metavar="A:B", help="Lines of --angles that belong to the projections."),

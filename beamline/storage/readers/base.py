@@ -16,6 +16,8 @@ from beamline.storage.flag_legend import FrameFlags
 from drivers.base.frame import Frame, FrameKind
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
+Stated = Quantity | Literal["transmission"]
+"""Of a file or a caller; transmission is read as counts of a beam of 1 without darks."""
 Attributes = Mapping[str, str | float | int]
 
 WHOLE = slice(None)

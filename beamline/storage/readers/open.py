@@ -16,7 +16,7 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
-from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource
+from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
@@ -58,7 +58,8 @@ class SourceOptions:
 
     Attributes:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
-        quantity: of the pixels, if the file does not state it.
+        quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
+            darks of 0.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
             projection, or one for each frame.
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
@@ -72,7 +73,7 @@ class SourceOptions:
     """
 
     path: Path | str
-    quantity: Quantity | None = None
+    quantity: Stated | None = None
     angles: Angles | None = None
     angle_rows: str | None = None
     darks: Images | None = None
@@ -127,6 +128,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             table = select_rows(table, options.angle_rows)
         if table is not None and isinstance(base, StacksSource):
             _refuse_all_frames(base, table, angles_from)
+        if options.quantity == "transmission":
+            darks, flats = _beam_of_one(base, options)
         if any(given is not None for given in (table, darks, flats, options.quantity)):
             base = OverlaidSource(
                 base,
@@ -134,12 +137,24 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
                 angles_from=angles_from,
                 darks=None if darks is None else load_images(darks),
                 flats=None if flats is None else load_images(flats),
-                quantity=options.quantity,
+                quantity="counts" if options.quantity == "transmission" else options.quantity,
             )
         return base if options.cols is None else CroppedSource(base, options.cols)
     except BaseException:
         base.close()
         raise
+
+
+def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The darks and flats by which transmission was divided already: of 0 and 1. DataError for what is none."""
+    if options.darks is not None or options.flats is not None:
+        raise DataError("--quantity transmission is of frames divided by their flats: leave out --darks and --flats.")
+    if base.dtype.kind != "f":
+        raise DataError(
+            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
+            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
+        )
+    return np.zeros((1, *base.shape), base.dtype), np.ones((1, *base.shape), base.dtype)
 
 
 def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -118,4 +118,5 @@ def _reference(source: ScanSource, row: int) -> ReferenceFrame:
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
         return ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
-    return ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)
+    seen = ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)
+    return seen if image.dtype.kind in "ui" else replace(seen, rounding=0.0)  # transmission: flats of 1, darks of 0

@@ -26,7 +26,7 @@ from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
-from recon.base.units import look_like_counts, look_like_degrees
+from recon.base.units import look_like_counts, look_like_degrees, look_like_transmission
 
 __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 
@@ -35,6 +35,7 @@ Progress = Callable[[int, int], None]  # Is told how many of how many frames are
 _FARTHEST = 1e6  # degrees
 
 SAMPLES = 4  # frames of a kind that are looked at
+SHAPES = 32  # views whose shape is looked at
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
 
@@ -196,7 +197,8 @@ def quantity_said(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "quantity",
-            f"{said} whether pixels are counts or line integrals: say --quantity counts or --quantity line-integrals.",
+            f"{said} whether pixels are counts, transmission or line integrals: say --quantity counts, transmission "
+            "or line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
         )
 
 
@@ -209,7 +211,8 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 "references",
-                f"Counts without {name}: give --{name} FILE (or a folder), or --quantity line-integrals if they are.",
+                f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
+                "say --quantity transmission, or line-integrals where their logarithm was taken.",
             )
 
 
@@ -258,6 +261,10 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
             "If so, say --quantity counts, with darks and flats.",
         )
+    elif source.quantity == "line_integrals" and source.emission is None and _falls(source):
+        yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
+    elif source.quantity == "counts" and _rises(source):
+        yield Finding("error", "quantity", _RISES)
 
 
 def series_complete(source: ScanSource) -> Iterator[Finding]:
@@ -304,12 +311,37 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
 )
 
 
-def _sample(source: ScanSource, kind: FrameKind) -> NDArray[Any] | None:
+_FALLS = (
+    "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
+    "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
+)
+_RISES = (
+    "The frames are divided by flats of 1, but they are 0 at the edges of the views and rise where the sample is, as "
+    "line integrals do; transmission is 1 there and falls. Say --quantity line-integrals, without --darks and --flats."
+)
+
+
+def _falls(source: ScanSource) -> bool:
+    """The views look like transmission, which real numbers can be."""
+    views = _sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
+    return views is not None and look_like_transmission(views)
+
+
+def _rises(source: ScanSource) -> bool:
+    """The views look like line integrals, though they are to be divided by a beam of about 1."""
+    flats = _sample(source, FrameKind.FLAT) if source.dtype.kind == "f" else None
+    if flats is None or not 0.5 < np.nanmedian(flats) < 2:
+        return False
+    views = _sample(source, FrameKind.PROJECTION, SHAPES)
+    return views is not None and look_like_transmission(np.exp(-np.maximum(views, -1)))
+
+
+def _sample(source: ScanSource, kind: FrameKind, count: int = SAMPLES) -> NDArray[Any] | None:
     """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
     rows = np.flatnonzero(source.image_key == kind)
     if rows.size == 0:
         return None
-    chosen = np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))
+    chosen = np.unique(np.linspace(0, rows.size - 1, count).astype(int))
     middle = source.shape[0] // 2
     return source.read(rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
 
