@@ -32,6 +32,9 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
             n_views = len(stacks[-1].frames)
             source.angles[-n_views:] = _theta(file, n_views)
         pixel = file.attrs.get("pixel_size_mm")
+        units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
+        if source.quantity == "unknown" and units in ("counts", "line_integrals"):
+            source.quantity = "counts" if units == "counts" else "line_integrals"
         source.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
         return source
     except BaseException:
