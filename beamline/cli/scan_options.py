@@ -27,8 +27,16 @@ scan_options = together(
     ),
     click.option("--angles", type=_PATH, help="Text file with one angle per line, degrees."),
     click.option("--angle-rows", metavar="A:B", help="Lines of --angles that belong to the projections."),
-    click.option("--darks", type=_PATH, help="Image file or folder with darks, instead of those in the file."),
-    click.option("--flats", type=_PATH, help="Image file or folder with flats, instead of those in the file."),
+    click.option(
+        "--darks",
+        type=_PATH,
+        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file.",
+    ),
+    click.option(
+        "--flats",
+        type=_PATH,
+        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with flats, instead of those in the file.",
+    ),
     click.option(
         "--data-path",
         metavar="DATASET",

@@ -143,9 +143,7 @@ def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Ca
     )
     with whole_file(path) as partial, hdf5.created(partial, layout.LIBVER) as file:
         kind = np.dtype("<f4")
-        layout.create(
-            file, info, geometry.detector_shape, kind, quantity="line_integrals", preview_bin=4, start=None
-        )
+        layout.create(file, info, geometry.detector_shape, kind, quantity="line_integrals", preview_bin=4, start=None)
         rows = Rows(file)
         for view in range(angles.size):
             image = project(model.gaussians, geometry, [view]).numpy()[0]

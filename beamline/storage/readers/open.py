@@ -18,8 +18,8 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated
 from beamline.storage.readers.overlay import OverlaidSource
+from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
-from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeriesSource
 from beamline.storage.readers.wrapped import CroppedSource, PartsSource
 from drivers.base.frame import FrameKind
@@ -49,8 +49,6 @@ FORMATS: tuple[ScanFormat, ...] = (
 )
 """Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 
-Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [frame, row, col]
-
 
 @dataclass(frozen=True, eq=False)
 class SourceOptions:
@@ -63,7 +61,8 @@ class SourceOptions:
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
             projection, or one for each frame.
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
-        darks, flats: replace the file's; they come before its frames.
+        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or an HDF5 file of their own
+            (FILE::DATASET where it has several).
         data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
@@ -135,8 +134,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
                 base,
                 angles=table,
                 angles_from=angles_from,
-                darks=None if darks is None else load_images(darks),
-                flats=None if flats is None else load_images(flats),
+                darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
+                flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
                 quantity="counts" if options.quantity == "transmission" else options.quantity,
             )
         return base if options.cols is None else CroppedSource(base, options.cols)
