@@ -52,6 +52,10 @@ class NotReadyError(DataError):
     """The file is just being created. This is not a fault: try again."""
 
 
+class UnreadableError(DataError):
+    """A file does not give a frame that it should hold; the others may be good."""
+
+
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
@@ -399,7 +403,7 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
             out[start : start + end - first] = item[first:end, rows]
         except OSError as error:
             which = f"Frame {first}" if end == first + 1 else f"One of the frames {first} to {end - 1}"
-            raise DataError(
+            raise UnreadableError(
                 f"{which} of {item.name} in {item.file.filename} cannot be read ({reason(error)})."
             ) from error
         start += end - first

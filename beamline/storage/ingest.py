@@ -111,6 +111,8 @@ def _copy(
     n, invalid = int(source.image_key.size), 0
     for i, (given, record) in enumerate(_frames(source)):
         image = given.astype(dtype, copy=False)
+        if i in source.unreadable:
+            raise DataError(f"{source.unreadable[i]} Nothing is left of {out}.")
         if i in source.damaged:
             raise DataError(
                 f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "

@@ -28,6 +28,7 @@ from beamline.storage.readers.base import (
     ScanSource,
     count_in_blocks,
     frame_indices,
+    read_known,
 )
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
@@ -283,9 +284,10 @@ class NXtomoSource(ScanSource):
             for column in (trigger, framestamp):
                 column[[*self._altered]] = -1
         for i in range(first, self.n):
+            counts = read_known(self, [i])[0]
             yield Frame(
-                counts=self.read([i])[0],
-                kind=FrameKind(int(self.image_key[i])),
+                counts=counts,
+                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(self.image_key[i])),
                 index=i,
                 trigger=int(trigger[i]),
                 framestamp=int(framestamp[i]),

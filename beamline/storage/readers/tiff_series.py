@@ -22,13 +22,14 @@ from beamline.core.errors import DataError
 from beamline.core.files import decoded
 from beamline.core.text import spans
 from beamline.storage import hdf5
-from beamline.storage.hdf5 import require_real
+from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.image_names import angles_of, kinds_of, without_angle
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image, refuse_volume
 from drivers.base.frame import FrameKind
 
 MOST_FILES = 100_000
+_TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
@@ -65,7 +66,7 @@ class TiffSeriesSource(ScanSource):
             if in_names is not None:
                 self.angles[len(order) :] = in_names
             self.exposures = np.full(len(self._files), np.nan)
-            samples = [self._image(name) for name in (*order, series[0])]
+            samples = [*self._readable(order), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1].shape[0], samples[-1].shape[1]
             self.dtype = np.result_type(*(image.dtype for image in samples))
             texts = [name for name in names if ANGLE_FILE.search(name.lower())]
@@ -113,7 +114,19 @@ class TiffSeriesSource(ScanSource):
         try:
             return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
         except (*UNREADABLE, RuntimeError) as error:  # of an archive with a password
-            raise DataError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+            raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+
+    def _readable(self, names: list[str], at_least: int = 0) -> list[NDArray[Any]]:
+        """The images of these files that can be read; DataError where they are fewer than `at_least`."""
+        images, failed = list[NDArray[Any]](), list[UnreadableError]()
+        for name in names:
+            try:
+                images.append(self._image(name))
+            except UnreadableError as error:
+                failed.append(error)
+        if len(images) < at_least:
+            raise failed[0]
+        return images
 
     def _text(self, name: str) -> str:
         content = self._bytes(name)
@@ -127,7 +140,9 @@ class TiffSeriesSource(ScanSource):
         try:
             image = read_image(io.BytesIO(content))
         except UNREADABLE as error:
-            raise DataError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+        if image.size == 0:
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
         if image.ndim != 2:
             raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
         require_real(image.dtype, f"{name} in {self.path}")

@@ -35,6 +35,12 @@ class WrappedSource(ScanSource):
         self._update()
         return int(self.image_key.size)
 
+    def _frames_of_base(self, first: int) -> Iterator[Frame]:
+        """Frames of `base`, whose rows are those of this scan."""
+        for frame in self._base.frames(first):
+            self.unreadable = self._base.unreadable
+            yield frame
+
     def close(self) -> None:
         self._base.close()
 
@@ -79,7 +85,7 @@ class CroppedSource(WrappedSource):
         return self._base.read(frames, rows)[..., self._cols]
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        return (replace(frame, counts=frame.counts[:, self._cols]) for frame in self._base.frames(first))
+        return (replace(frame, counts=frame.counts[:, self._cols]) for frame in self._frames_of_base(first))
 
 
 class PartsSource(WrappedSource):

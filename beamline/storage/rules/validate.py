@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
+from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.parts import is_joined, joined_file_of, other_parts
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
@@ -104,6 +105,10 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
     if unreadable:
         said = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
         yield Finding("error", "unreadable", said)
+    elif progress is None and source.unreadable:
+        which = f"{count(len(source.unreadable), 'frame')} cannot be read: {spans(sorted(source.unreadable))}."
+        said = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` leaves such frames out."
+        yield Finding("warning", "unreadable", f"{said} `validate --deep` reads all frames.")
     if source.damaged:
         yield Finding(
             "error",
@@ -343,7 +348,11 @@ def _sample(source: ScanSource, kind: FrameKind, count: int = SAMPLES) -> NDArra
         return None
     chosen = np.unique(np.linspace(0, rows.size - 1, count).astype(int))
     middle = source.shape[0] // 2
-    return source.read(rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    images = read_known(source, rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    known = ~np.isin(rows[chosen], sorted(source.unreadable))
+    if not known.any():
+        raise UnreadableError(next(iter(source.unreadable.values())))
+    return images[known]
 
 
 def _as_hdf5(path: Path) -> list[Finding]:
