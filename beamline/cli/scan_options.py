@@ -40,7 +40,7 @@ scan_options = together(
     click.option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file of any layout: its projections [frame, row, col], e.g. /raw/images.",
+        help="For an HDF5 file of any layout, or of several detectors: its projections [frame, row, col]: /raw/images.",
     ),
     click.option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
     click.option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),

@@ -39,12 +39,15 @@ from drivers.base.frame import Frame, FrameKind
 class NXtomoSource(ScanSource):
     """A scan in NXtomo's structure; see ScanSource."""
 
-    def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
-        """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units."""
+    def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True, data: str | None = None) -> None:
+        """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units.
+
+        `data` is where the frames are, of several detectors; None: of the only one, or the file's default.
+        """
         self.path = path
         self._file = hdf5.open_hdf5(path, follow)
         try:
-            self._places = places = choose(self._file, find(self._file))
+            self._places = places = choose(self._file, find(self._file), data)
             self._ours = layout.COMMITTED in self._file
             self._check()
             shape = places.data.shape

@@ -17,6 +17,8 @@ from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated
+from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
@@ -63,7 +65,8 @@ class SourceOptions:
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
         darks, flats: replace the file's; they come before its frames. An array, TIFFs, or an HDF5 file of their own
             (FILE::DATASET where it has several).
-        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are.
+        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are; of an NXtomo with several
+            detectors: where the frames of one are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
         angles_unit: "deg" or "rad", of these, instead of what the file says.
@@ -103,11 +106,12 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
+    base: ScanSource
     path, angles, darks, flats = Path(options.path), options.angles, options.darks, options.flats
     _refuse(options, follow)
     if options.data_path is not None:
         with hdf5.readable(path):
-            base: ScanSource = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
+            base = _at_data_path(path, options.data_path, options)
     else:
         base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
@@ -125,6 +129,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             if table is None:
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
+        if table is not None:
+            _refuse_fewer(base, table, angles_from)
         if table is not None and isinstance(base, StacksSource):
             _refuse_all_frames(base, table, angles_from)
         if options.quantity == "transmission":
@@ -142,6 +148,27 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     except BaseException:
         base.close()
         raise
+
+
+def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
+    """The detector of an NXtomo whose frames these are, or a scan of these stacks."""
+    if options.darks_path is None and options.flats_path is None:
+        with hdf5.open_hdf5(path) as file:
+            named = hdf5.dataset(file, data)
+            keyed = named is not None and any(places.data == named for places in find(file))
+        if keyed:
+            return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
+    return open_stacks(path, data, options.darks_path, options.flats_path)
+
+
+def _refuse_fewer(base: ScanSource, table: NDArray[np.float64], name: str) -> None:
+    """DataError for fewer angles than projections: some have none, whichever they are."""
+    n = int((base.image_key == FrameKind.PROJECTION).sum())
+    if table.size < n:
+        raise DataError(
+            f"{name} has {table.size} angles for {n} projections, so that {n - table.size} have none. Is it cut off, "
+            "or of another scan? Give one angle for each projection, in their order."
+        )
 
 
 def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any], NDArray[Any]]:
