@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,19 +16,21 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
-from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated
+from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.nexus_places import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff_series import TiffSeriesSource
-from beamline.storage.readers.wrapped import CroppedSource, PartsSource
+from beamline.storage.readers.wrapped import CroppedSource, PartsSource, UnsignedSource, has_wrapped
 from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
+_SHORT = "i1", "i2"  # signed types that cameras' counts do not fit
+_LOOKED_AT = 3  # frames of a kind, for counts that wrapped
 REGISTRY = (  # modules in this folder, asked in this order
     "tiff_series",
     "tiff_stack",
@@ -117,21 +119,24 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     try:
         if options.earlier:
             base = _of_parts(options.earlier, base)
+        series, stacked = base, isinstance(base, StacksSource)
+        if base.dtype.str[1:] in _SHORT and any(has_wrapped(images) for images in _some_of_each_kind(base)):
+            base = UnsignedSource(base)
         table = None if angles is None else load_angles(angles)
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
         if options.angles_path is not None:
             angles_from = f"{options.angles_path} in {path}"
             table = angles_at(path, options.angles_path, options.angles_unit)
-        if table is None and isinstance(base, TiffSeriesSource) and base.angle_text is not None:
-            angles_from = f"{base.angle_text[0]} in {path}"
-            table = parse_angles(base.angle_text[1], angles_from)
+        if table is None and isinstance(series, TiffSeriesSource) and series.angle_text is not None:
+            angles_from = f"{series.angle_text[0]} in {path}"
+            table = parse_angles(series.angle_text[1], angles_from)
         if options.angle_rows is not None:
             if table is None:
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
         if table is not None:
             _refuse_fewer(base, table, angles_from)
-        if table is not None and isinstance(base, StacksSource):
+        if table is not None and stacked:
             _refuse_all_frames(base, table, angles_from)
         if options.quantity == "transmission":
             darks, flats = _beam_of_one(base, options)
@@ -183,7 +188,14 @@ def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any]
     return np.zeros((1, *base.shape), base.dtype), np.ones((1, *base.shape), base.dtype)
 
 
-def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str) -> None:
+def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
+    for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
+        rows = np.flatnonzero(source.image_key == kind)
+        if rows.size:
+            yield read_known(source, rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))])
+
+
+def _refuse_all_frames(base: ScanSource, table: NDArray[np.float64], name: str) -> None:
     """DataError for angles of all frames if the order of darks and flats is unknown."""
     n = int((base.image_key == FrameKind.PROJECTION).sum())
     if n < base.image_key.size == table.size:

@@ -17,6 +17,7 @@ from beamline.storage.hdf5 import require_real
 from beamline.storage.readers.nexus_places import find
 from beamline.storage.readers.stacks import dataset_at
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image
+from beamline.storage.readers.wrapped import has_wrapped, unsigned
 from drivers.base.frame import FrameKind
 
 Images = Path | str | NDArray[Any]
@@ -129,4 +130,5 @@ def _read(path: Path, item: h5py.Dataset, rows: NDArray[np.intp] | None = None) 
 
 def _stack(images: NDArray[Any], name: str) -> NDArray[Any]:
     require_real(images.dtype, name)
+    images = unsigned(images) if has_wrapped(images) else images
     return images[None] if images.ndim == 2 else images

@@ -272,6 +272,12 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "quantity", _RISES)
 
 
+def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
+    """Counts beyond the end of a signed type are read without its sign."""
+    if wrapped := source.attributes.get("pixels"):
+        yield Finding("warning", "pixels", f"The file's label is wrong: counts are {wrapped}.")
+
+
 def series_complete(source: ScanSource) -> Iterator[Finding]:
     """No trigger without a frame, and no number left out of a series of files."""
     missing = source.attributes.get("missing_triggers", 0)
@@ -310,6 +316,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     references_present,
     exposures_agree,
     pixels_measured,
+    pixels_as_labelled,
     series_complete,
     scale_known,
     parts_joined,

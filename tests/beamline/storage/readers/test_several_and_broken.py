@@ -82,8 +82,8 @@ def _broken(path: Path, where: str, link: object) -> Path:
 @pytest.mark.parametrize(
     "where",
     [
-        "exchange/data", "exchange/data_dark", "exchange/data_white", "exchange/theta", "entry/instrument/detector/data",
-        "entry/instrument/detector/image_key",
+        "exchange/data", "exchange/data_dark", "exchange/data_white", "exchange/theta",
+        "entry/instrument/detector/data", "entry/instrument/detector/image_key",
     ],
 )  # fmt: skip
 def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, where: str, link: object, to: str) -> None:
