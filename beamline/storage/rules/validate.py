@@ -34,6 +34,10 @@ __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
 _FARTHEST = 1e6  # degrees
+_GAP = 0.5  # degrees without a view beyond the others, of views in even steps
+_SAME = 0.1  # of the mean step: views so close are one
+_FALSE_ALARM = 1e-3  # of scans whose views are at random
+_OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
@@ -186,12 +190,36 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angle-spread",
             f"{angles.size} projections span only {span:.3f} degrees: are these radians under a label of degrees?",
         )
-    elif span + step < 179.5:
+    elif (unseen := half_turn_unseen(angles)) > 0:
+        said = f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
+            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view.",
         )
+
+
+def half_turn_unseen(angles: NDArray[np.float64]) -> float:
+    """Degrees of half a turn in one piece without a view, beyond what the spacing of views [view] in rad explains.
+
+    Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
+    distributed length, whose mean is that of all gaps (Rényi 1953): of a thousandth (of ten views: a hundredth) by more
+    than is allowed for. Views in
+    even steps have gaps alike, and half a degree more is told.
+    """
+    places = np.sort(np.mod(np.degrees(angles), 180.0))
+    gaps = np.diff(places, append=places[0] + 180.0)
+    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # views side by side are one
+    if gaps.size < 2:
+        return 180.0
+    *others, second, largest = np.sort(gaps)
+    uneven = float(np.std([*others, second])) / _OF_MEAN
+    n = len(others) + 1
+    times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
+    limit = second + max(_GAP, times * uneven)
+    if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
+        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
+    return float(largest) if largest > limit else 0.0
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ import pytest
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import source_findings, validate
+from beamline.storage.rules.validate import half_turn_unseen, source_findings, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal
@@ -316,3 +316,32 @@ def test_real_scans_can_be_reconstructed(shared_data: Path) -> None:
         with open_scan(SourceOptions(shared_data / name, **how)) as source:  # type: ignore[arg-type]
             assert all(found.severity != "error" for found in source_findings(source)), name
             assert int((source.image_key == FrameKind.PROJECTION).sum()) >= 91
+
+
+@pytest.mark.parametrize("views", [12, 45, 180, 721])
+def test_uneven_angles_over_half_a_turn_are_no_limited_angle(views: int) -> None:
+    rng, even = np.random.default_rng(views), np.arange(views)
+    whole = {
+        "half a turn": np.linspace(0, 180, views),
+        "a turn": np.linspace(0, 360, views, endpoint=False),
+        "golden": (even * 111.246) % 180,
+        "golden over a turn": (even * 137.508) % 360,
+        "denser at one end": 180 * np.linspace(0, 1, views) ** 1.3,
+        "with jitter": np.linspace(0, 180, views) + rng.normal(0, 0.02, views),
+        "some twice": np.repeat(np.linspace(0, 180, views), 2),
+        "from -90": np.linspace(-90, 90, views, endpoint=False),
+    }
+    for name, degrees in whole.items():
+        assert half_turn_unseen(np.radians(degrees)) == 0, name
+    for lost in (25, 60, 90):
+        kept = np.linspace(0, 180 - lost, views)
+        for degrees in (kept, kept + 70, np.where(kept > 40, kept + lost, kept), np.where(kept > 40, kept + 180, kept)):
+            step = (180 - lost) / (views - 1)
+            assert half_turn_unseen(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
+
+
+def test_angles_at_random_are_rarely_a_limited_angle() -> None:
+    rng = np.random.default_rng(5)
+    for views in (30, 60, 200):
+        alarms = sum(half_turn_unseen(rng.uniform(0, np.pi, views)) > 0 for _ in range(400))
+        assert alarms <= 4  # a thousandth is asked: more than 4 of 400 have a chance of 1 in 16 000
