@@ -25,6 +25,9 @@ scan_options = together(
         callback=underscored,
         help="Quantity of the pixels, if the file does not state it: raw counts, transmission (0 to 1), or its -log.",
     ),
+    click.option(
+        "--horizontal-axis", is_flag=True, help="The rotation axis lies along the rows: turn frames by a quarter turn."
+    ),
     click.option("--angles", type=_PATH, help="Text file with one angle per line, degrees."),
     click.option("--angle-rows", metavar="A:B", help="Lines of --angles that belong to the projections."),
     click.option(

@@ -23,7 +23,7 @@ from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff_series import TiffSeriesSource
-from beamline.storage.readers.wrapped import CroppedSource, PartsSource, UnsignedSource, has_wrapped
+from beamline.storage.readers.wrapped import CroppedSource, PartsSource, TurnedSource, UnsignedSource, has_wrapped
 from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
@@ -73,6 +73,7 @@ class SourceOptions:
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
         angles_unit: "deg" or "rad", of these, instead of what the file says.
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
+        horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
     """
 
@@ -87,6 +88,7 @@ class SourceOptions:
     flats_path: str | None = None
     angles_path: str | None = None
     angles_unit: str | None = None
+    horizontal_axis: bool = False
     earlier: tuple[Path, ...] = ()
     cols: tuple[int, int] | None = None
 
@@ -149,6 +151,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
                 flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
                 quantity="counts" if options.quantity == "transmission" else options.quantity,
             )
+        if options.horizontal_axis:
+            base = TurnedSource(base)
         return base if options.cols is None else CroppedSource(base, options.cols)
     except BaseException:
         base.close()
@@ -235,6 +239,7 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     """DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
+    replaced += ["--horizontal-axis"] if options.horizontal_axis else []
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "

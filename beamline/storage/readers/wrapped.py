@@ -88,6 +88,34 @@ class CroppedSource(WrappedSource):
         return (replace(frame, counts=frame.counts[:, self._cols]) for frame in self._frames_of_base(first))
 
 
+class TurnedSource(WrappedSource):
+    """A ScanSource of the frames of `base` turned by a quarter turn: a horizontal rotation axis becomes vertical.
+
+    What was the last column is the first row. Any rows take reading whole frames.
+    """
+
+    def __init__(self, base: ScanSource) -> None:
+        """Raises DataError for an emission and for a scan with flags: both have a vertical axis."""
+        super().__init__(base)
+        if base.emission is not None or base.flags is not None:
+            raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
+        self.shape, self.axis_col = (base.shape[1], base.shape[0]), None
+        self._update()
+
+    @property
+    def shifts(self) -> NDArray[np.float64] | None:
+        known = self._base.shifts
+        return None if known is None else np.stack([known[:, 1], -known[:, 0]], axis=1)
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        return np.ascontiguousarray(np.rot90(self._base.read(frames), axes=(1, 2))[:, rows])
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        return (
+            replace(frame, counts=np.ascontiguousarray(np.rot90(frame.counts))) for frame in self._frames_of_base(first)
+        )
+
+
 class UnsignedSource(WrappedSource):
     """A ScanSource of counts that `base` holds as a signed type, so that the larger ones are negative."""
 

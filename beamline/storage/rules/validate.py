@@ -41,6 +41,9 @@ _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, ove
 
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
+TURNED = 12  # views by which the direction of the axis is told
+_LEAST = 8  # views, rows and columns: fewer tell nothing of it
+_HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
 
@@ -306,6 +309,57 @@ def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
         yield Finding("warning", "pixels", f"The file's label is wrong: counts are {wrapped}.")
 
 
+def axis_vertical(source: ScanSource) -> Iterator[Finding]:
+    """The rotation axis lies along the columns: each row then holds the same matter in every view of a sample."""
+    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    if source.emission is not None or source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
+        return
+    ratio = change_of_rows(_depths(source, views[np.unique(np.linspace(0, views.size - 1, TURNED).astype(int))]))
+    if ratio > _HORIZONTAL:
+        yield Finding(
+            "warning",
+            "axis",
+            f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
+            "the rotation axis were horizontal; it is expected along the columns. If it is, say --horizontal-axis.",
+        )
+
+
+def change_of_rows(depths: NDArray[np.float64]) -> float:
+    """How much the sums of rows of [view, row, col] change from view to view, over what those of columns do; squared.
+
+    About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
+    are. What a drifting beam does to rows is in their ends, too: a parabola over the rows is taken off.
+    """
+    change = depths - depths.mean(axis=0)
+    ends = max(1, depths.shape[2] // 16)
+    beside = np.median(np.concatenate([change[..., :ends], change[..., -ends:]], axis=2), axis=2)
+    heights = np.polynomial.legendre.legvander(np.linspace(-1, 1, depths.shape[1]), 2)
+    change = change - (beside @ np.linalg.pinv(heights).T @ heights.T)[..., None]
+    of_rows, of_cols = (float(change.sum(axis=axis).var(axis=0).sum()) for axis in (2, 1))
+    rounding = 1e-20 * float((np.abs(depths).sum(axis=2) ** 2).sum())
+    return of_rows / max(of_cols, rounding) if of_rows > rounding else 0.0
+
+
+def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Line integrals of some views [view, row, col], coarse, but for what all views share."""
+    block = max(1, min(max(source.shape) // 128, min(source.shape) // _LEAST))
+    rows, cols = (n // block for n in source.shape)
+    darks = np.flatnonzero(source.image_key == FrameKind.DARK)[:1]
+    dark = read_known(source, darks)[0].astype(np.float64) if darks.size and source.quantity == "counts" else 0.0
+    found = []
+    for view in views.tolist():
+        image = read_known(source, [view])[0].astype(np.float64)
+        if view in source.unreadable or not np.isfinite(image).all():
+            continue
+        image = image if source.quantity == "line_integrals" else image - dark
+        coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
+        found.append(coarse)
+    depths = np.array(found).reshape(-1, rows, cols)
+    if source.quantity == "line_integrals" or not len(depths):
+        return depths
+    return -np.log(np.maximum(depths, 1e-3 * np.max(depths)))
+
+
 def series_complete(source: ScanSource) -> Iterator[Finding]:
     """No trigger without a frame, and no number left out of a series of files."""
     missing = source.attributes.get("missing_triggers", 0)
@@ -345,6 +399,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     exposures_agree,
     pixels_measured,
     pixels_as_labelled,
+    axis_vertical,
     series_complete,
     scale_known,
     parts_joined,
