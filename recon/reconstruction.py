@@ -17,7 +17,7 @@ from torch import Tensor
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, Progress, ReconProblem, RunControl
 from recon.base.picture import html, middle_slices
-from recon.base.units import look_like_counts, warn_of_degrees
+from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.volume import Grid, Volume
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
@@ -121,8 +121,8 @@ def reconstruct(
         for an argument that the method does not take: views held out, a device, checkpoints, or these views.
 
     Warns:
-        UserWarning: angles look like degrees, projections like counts, or, for a method that keeps no voxel below 0,
-            like line integrals of the other sign. The reconstruction goes on.
+        UserWarning: angles look like degrees, projections like counts or transmission, or, for a method that keeps no
+            voxel below 0, like line integrals of the other sign. The reconstruction goes on.
     """
     if isinstance(method, type):
         raise ValueError(
@@ -137,12 +137,8 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
     else:
         data = _line_integrals(projections, geometry)
-        if use.emission is None and look_like_counts(data):
-            warnings.warn(
-                f"projections have a median of {np.nanmedian(data[:1]):.4g}: they look like counts. Line integrals are "
-                "-log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
-                stacklevel=2,
-            )
+        if use.emission is None:
+            warn_of_other_quantity(data)
     if not getattr(chosen, "allow_negative", True):
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)

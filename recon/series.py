@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
+from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.learnt_motion import learnt_motion, unseen_residuals
@@ -140,6 +141,7 @@ def fit_series(
     """
     n = views.geometry.n_views
     refuse_few(knots, n)
+    warn_of_other_quantity(views.projections)
     times = np.linspace(*views.span, knots)
     near = (hats(views.times, times) > 0.5).sum(0)
     if near.min() < _LEAST_NEAR:

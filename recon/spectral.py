@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64
+from recon.base.units import warn_of_other_quantity
 from recon.base.volume import Grid
 from recon.energy_fit import EnergyFit, EnergyViews, fitted
 from recon.voxels.held_out_weight import ONE_IN, busiest_rows, slab_of
@@ -87,6 +88,7 @@ def fit_materials(
         stop: asked many times within a sweep, from the second step on. True ends the fit with the volumes before the
             step that it interrupts.
     """
+    warn_of_other_quantity(views.projections)
     grid, views = grid or Grid.matching(views.geometry), _weighed(views)
     n = views.cross_sections.shape[1]
     weights = weights_by_views(views, grid, seed, go_on, stop) if tv_weight is None else np.full(n, tv_weight)

@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Done
 from beamline.core.files import refuse_existing
 from beamline.core.signals import terminated_like_interrupted
-from beamline.core.text import size
+from beamline.core.text import count, size
 from beamline.storage.volumes.registry import suffixes_text
 from drivers.base.clock import SystemClock
 
@@ -33,6 +33,7 @@ def window_of(text: str) -> tuple[float, float]:
 
 
 _PLY, _CSV = ".ply", ".csv"
+_SLICES, _VALUES = 9, 2**20  # of a volume at most, and values of a slice, for a window
 
 
 def _output_path(text: str) -> Path:
@@ -147,10 +148,20 @@ def _export_poses(volume: Path, output: Path, as_json: bool) -> None:
 
 
 def _suggestion(record: ReconRecord) -> str:
-    """A window for the middle slice."""
+    """A window for the volume, by some of its slices."""
     import numpy as np
 
-    middle = record.volume.grid.shape[0] // 2
-    values = np.asarray(record.volume.data[middle : middle + 1], np.float32)
-    low, high = np.percentile(values[np.isfinite(values)], (0.1, 99.9)) if np.isfinite(values).any() else (0.0, 1.0)
-    return f"99.8 % of the values of the middle slice lie in {low:.4g}:{high:.4g}. Nothing was written."
+    depth = record.volume.grid.shape[0]
+    chosen = np.unique(np.linspace(0, depth - 1, min(depth, _SLICES)).astype(int))
+    some = [np.ravel(np.asarray(record.volume.data[z : z + 1], np.float32)) for z in chosen.tolist()]
+    values = np.concatenate([values[:: max(1, values.size // _VALUES)] for values in some])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return "No value of the slices looked at is finite. Nothing was written."
+    low, high = (float(f"{value:.4g}") for value in np.percentile(values, (0.1, 99.9)))
+    if low < high:
+        return f"99.8 % of the values of {count(chosen.size, 'slice')} lie in {low:g}:{high:g}. Nothing was written."
+    lowest, highest = float(values.min()), float(values.max())
+    if lowest < highest:  # matter in a few voxels, or values that differ in their last digits
+        return f"The values of {count(chosen.size, 'slice')} lie in {lowest:.8g}:{highest:.8g}. Nothing was written."
+    return f"Every value of the slices looked at is {lowest:g}: there is no window to take. Nothing was written."

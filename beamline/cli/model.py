@@ -113,7 +113,7 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
 def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_json: bool) -> None:
     """Project the Gaussians behind VOLUME onto its detector: line integrals of views at any angle.
 
-    The output is a Data Exchange file, which every command reads.
+    The output is a scan of line integrals, which every command reads; its /exchange is Data Exchange for others.
     """
     from beamline.reconstruct.model import write_views
 

@@ -21,18 +21,29 @@ underscored = parsed(lambda value: value.replace("-", "_"))
 scan_options = together(
     click.option(
         "--quantity",
-        type=click.Choice(["counts", "line-integrals"]),
+        type=click.Choice(["counts", "transmission", "line-integrals"]),
         callback=underscored,
-        help="Quantity of the pixels, if the file does not state it: raw counts, or corrected line integrals.",
+        help="Quantity of the pixels, if the file does not state it: raw counts, transmission (0 to 1), or its -log.",
+    ),
+    click.option(
+        "--horizontal-axis", is_flag=True, help="The rotation axis lies along the rows: turn frames by a quarter turn."
     ),
     click.option("--angles", type=_PATH, help="Text file with one angle per line, degrees."),
     click.option("--angle-rows", metavar="A:B", help="Lines of --angles that belong to the projections."),
-    click.option("--darks", type=_PATH, help="Image file or folder with darks, instead of those in the file."),
-    click.option("--flats", type=_PATH, help="Image file or folder with flats, instead of those in the file."),
+    click.option(
+        "--darks",
+        type=_PATH,
+        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with darks, instead of those in the file.",
+    ),
+    click.option(
+        "--flats",
+        type=_PATH,
+        help="TIFF, folder of TIFFs, or HDF5 file (FILE::DATASET) with flats, instead of those in the file.",
+    ),
     click.option(
         "--data-path",
         metavar="DATASET",
-        help="For an HDF5 file of any layout: its projections [frame, row, col], e.g. /raw/images.",
+        help="For an HDF5 file of any layout, or of several detectors: its projections [frame, row, col]: /raw/images.",
     ),
     click.option("--darks-path", metavar="DATASET", help="For --data-path: its darks."),
     click.option("--flats-path", metavar="DATASET", help="For --data-path: its flats."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import math
 import os
@@ -64,15 +65,24 @@ def require_regular(path: Path, largest: float = math.inf) -> None:
         raise OSError(errno.EFBIG, f"It has {found.st_size} bytes, and at most {largest:.0f} are read", str(path))
 
 
-def text_in(path: Path, largest: int = TEXT, encoding: str = "utf-8") -> str:
-    """The content of a text file of so many bytes at most. OSError as `require_regular`, and for what is no UTF-8."""
+def text_in(path: Path, largest: int = TEXT) -> str:
+    """The content of a text file of so many bytes at most. OSError as `require_regular`, and for what is no UTF-8.
+
+    A byte-order mark, which some editors write, tells UTF-16, and is no part of the text.
+    """
     require_regular(path, largest)
     try:
-        return path.read_text(encoding=encoding)
+        return decoded(path.read_bytes())
     except UnicodeDecodeError as error:
         raise OSError(
             errno.EILSEQ, f"It is no UTF-8 text, by its byte {error.start}. Save it as UTF-8", str(path)
         ) from error
+
+
+def decoded(content: bytes) -> str:
+    """Text with \n for any end of line, by its byte-order mark where it has one. UnicodeDecodeError for other text."""
+    utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if utf16 else "utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def refuse_existing(path: Path) -> None:

@@ -69,6 +69,7 @@ class ReferenceFrame:
         saturated: fraction of the pixels at or above the saturation value.
         blocks: float32, means of blocks of pixels; a part of the preview where that is large.
         block: pixels a side of a block.
+        rounding: noise that the pixels' type may hide; 0 of real numbers.
     """
 
     row: int
@@ -77,6 +78,7 @@ class ReferenceFrame:
     saturated: float
     blocks: NDArray[np.float32]
     block: int
+    rounding: float = LEAST_NOISE
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
@@ -206,13 +208,13 @@ def _without_beam(flats: Group, darks: Group | None, bright: Group, limits: Refe
     if darks is None:
         return None
     if not _has_light(flats, darks, limits):
-        light, noise = _level(flats) - _level(darks), max(_noise(darks), LEAST_NOISE)
+        light, noise = _level(flats) - _level(darks), max(_noise(darks), darks[0].rounding)
         said = (
             f"there is no beam in them: their level {_level(flats):.6g} is {light:.3g} above the darks' "
             f"{_level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limits.light_over_noise:g} times it). "
             "Was the shutter open for them, and closed for the darks?"
         )
-        return ReferenceFault(FaultKind.NO_BEAM, light / noise, limits.light_over_noise, said)
+        return ReferenceFault(FaultKind.NO_BEAM, light / noise if noise else 0.0, limits.light_over_noise, said)
     most = _light(bright, darks)
     gone = 1 - _light(flats, darks) / most
     if gone <= limits.light_gone:
@@ -301,7 +303,7 @@ def _lit(darks: Group, flats: Group, base: Group, limits: ReferenceLimits) -> Re
 
 
 def _has_light(flats: Group, darks: Group, limits: ReferenceLimits) -> bool:
-    return _level(flats) - _level(darks) > limits.light_over_noise * max(_noise(darks), LEAST_NOISE)
+    return _level(flats) - _level(darks) > limits.light_over_noise * max(_noise(darks), darks[0].rounding)
 
 
 def _level(group: Group) -> float:

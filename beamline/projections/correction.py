@@ -197,23 +197,22 @@ class ScanCorrection:
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one and are not damaged, and these frames."""
         data = read_binned(self._source, frames, self._filters.read(rows), self.binning, progress)
+        lost = tell_damaged(self._source, self._selection, frames, self._warn)
+        data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
-            lost = frames[~alive]
+            dark = frames[~alive]
             if rows is None:  # in a band it says nothing of the views
                 self._warn(
-                    f"{lost.size} of {len(frames)} views hold no finite pixel (first: frame {lost[0]}): left out."
+                    f"{dark.size} of {len(frames)} views hold no finite pixel (first: frame {dark[0]}): left out."
                 )
             data, frames = data[alive], frames[alive]
-        damaged = tell_damaged(self._source, self._selection, frames, self._warn)
-        if damaged.any() and self._selection.step(Flags).used:
-            data, frames = data[~damaged], frames[~damaged]
         return data, frames
 
     def _no_view(self) -> DataError:
         return DataError(
-            f"{self._source.path}: no chosen view can be used. Their pixels are not finite, or differ from their "
-            "checksums."
+            f"{self._source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, or differ "
+            "from their checksums."
         )
 
     def _look_for_shadow(self, views: NDArray[np.int64]) -> None:

@@ -14,6 +14,7 @@ from beamline.projections.read import (
     current_scale,
     read_binned,
     read_references,
+    spoilt_frames,
     tell_damaged,
     use_current,
     with_dynamic_flats,
@@ -153,7 +154,7 @@ def photons_of(
     binning = selection.binning
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
-    spoilt = [] if not selection.step(Flags).used else sorted(source.damaged)
+    spoilt = spoilt_frames(source, not selection.step(Flags).used)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
         for groups in (used.flats, used.darks)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
-from beamline.core.text import spans
+from beamline.core.text import count, spans
 from beamline.projections.selection import Selection
 from beamline.projections.steps.defects import Defects
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.flats import Flats
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.references import ReferenceGroups
 from drivers.base.frame import FrameKind
 from recon.prep.correct import References
@@ -44,7 +44,7 @@ def read_binned(
     frame_bytes = (rows.stop - rows.start) * source.shape[1] * source.dtype.itemsize
     batch = max(1, _BATCH_BYTES // max(1, frame_bytes))
     for start in range(0, len(frames), batch):
-        raw = source.read(frames[start : start + batch], rows)
+        raw = read_known(source, frames[start : start + batch], rows)
         if binning > 1:
             raw = _mean_bins(raw[:, : height * binning, : width * binning].astype(np.float32), binning)
         out[start : start + batch] = raw
@@ -89,12 +89,12 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
     for group in groups.flats:
         mean = _mean(source, group, rows, binning, scale[group], use_damaged)
         if dark is not None and mean is not None:
-            used = group if use_damaged else np.setdiff1d(group, list(source.damaged))
+            used = np.setdiff1d(group, spoilt_frames(source, use_damaged))
             flats.append((float(used.mean()), (mean + (1 - scale[used].mean()) * dark).astype(np.float32)))
     if dark is None or not flats:
         raise DataError(
-            f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: their pixels are not those that "
-            "were written, by their checksums. Use a good copy, or --flags ignore, which takes them as they are."
+            f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are not "
+            "what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
         )
     return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.part_starts.tolist()))
 
@@ -108,8 +108,7 @@ def with_dynamic_flats(
         ConfigError: there are too few flats.
     """
     frames = np.concatenate(groups.flats)
-    if selection.step(Flags).used:
-        frames = np.setdiff1d(frames, list(source.damaged))
+    frames = np.setdiff1d(frames, spoilt_frames(source, not selection.step(Flags).used))
     scale = light_scale(source, use_current(selection))
 
     def flats() -> Iterator[NDArray[np.float32]]:
@@ -126,15 +125,29 @@ def with_dynamic_flats(
 
 
 def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> NDArray[np.bool_]:
-    """Which of the frames are not what was written, as far as they were read; a warning names them."""
-    damaged = np.isin(frames, sorted(source.damaged))
+    """Which of the frames are left out: those that could not be read, and, by the selection, those that are not what
+    was written. Warnings name them."""
+    lost = np.isin(frames, sorted(source.unreadable))
+    if lost.any():
+        first = int(frames[lost].min())
+        warn(
+            f"{count(int(lost.sum()), 'frame')} cannot be read: {spans(np.sort(frames[lost]).tolist())}, left out. "
+            f"{source.unreadable[first]}"
+        )
+    damaged = np.isin(frames, sorted(source.damaged)) & ~lost
+    used = selection.step(Flags).used
     if damaged.any():
-        taken = "left out" if selection.step(Flags).used else "used as they are (--flags ignore)"
+        taken = "left out" if used else "used as they are (--flags ignore)"
         warn(
             f"Frames {spans(np.sort(frames[damaged]).tolist())} do not have the pixels that were written, by their "
             f"checksums: {taken}. Look for a good copy of {source.path}."
         )
-    return damaged
+    return lost | damaged if used else lost
+
+
+def spoilt_frames(source: ScanSource, use_damaged: bool) -> list[int]:
+    """Rows read so far that cannot be used: those that the file does not give, and those that are not as written."""
+    return sorted({*source.unreadable} | (set() if use_damaged else source.damaged))
 
 
 def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
@@ -186,7 +199,7 @@ def _mean(
     total, n = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64), 0
     for i, frame in enumerate(frames):
         image = read_binned(source, np.array([frame]), rows, binning)[0]
-        if use_damaged or int(frame) not in source.damaged:
+        if int(frame) not in spoilt_frames(source, use_damaged):
             total += image if weights is None else weights[i] * image
             n += 1
     return total / n if n else None

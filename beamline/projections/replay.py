@@ -17,7 +17,7 @@ from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.validate import altered_said
 from drivers.base.clock import Clock
@@ -236,7 +236,7 @@ def _saturation(source: ScanSource) -> float:
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         rows = np.flatnonzero(source.image_key == kind)
         for row in rows[np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))] if rows.size else ():
-            image = source.read([int(row)])[0]
+            image = read_known(source, [int(row)])[0]
             largest = float(image.max())
             if largest == full_scale(largest) and (image == image.max()).mean() > PILED_UP:
                 return largest
@@ -252,12 +252,13 @@ def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
 def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:
     """Frames of other types than a camera's: counts as they are, line integrals as counts of a beam."""
     for row in range(first, source.image_key.size):
-        pixels: NDArray[np.uint16] = source.read([row])[0]
+        pixels: NDArray[np.uint16] = read_known(source, [row])[0]
         if source.quantity == "line_integrals":
             with np.errstate(over="ignore"):
                 pixels = np.nan_to_num(BEAM * np.exp(-pixels.astype(np.float64)), posinf=65535).clip(0, 65535)
             pixels = pixels.round().astype(np.uint16)
         kind, angle = FrameKind(int(source.image_key[row])), float(source.angles[row])
+        kind = FrameKind.INVALID if row in source.unreadable else kind
         yield Frame(pixels, kind, row, row, -1, angle, np.nan, float(source.exposures[row]))
 
 

@@ -76,9 +76,7 @@ def read_spectra(path: Path) -> Spectra:
         DataError: the file cannot be read, or is no such table.
     """
     try:
-        lines = [
-            line for line in csv.reader(text_in(path, encoding="utf-8-sig").splitlines(True)) if "".join(line).strip()
-        ]
+        lines = [line for line in csv.reader(text_in(path).splitlines(True)) if "".join(line).strip()]
     except (OSError, csv.Error) as error:
         raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
     head, *rest = lines or [[]]

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import ConfigError, DataError
 from beamline.projections.prepared import PreparedProjections
 from beamline.storage import hdf5
-from beamline.storage.volume_file import read_volume
-from beamline.storage.volumes.files import opened_volume
+from beamline.storage.volumes.files import opened_volume, whole_volume
 from recon.assess import metrics
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
@@ -40,7 +39,7 @@ def read_truth(spec: str) -> NDArray[np.float32]:
         raise ConfigError(f"--truth {spec}: there is no such file. Expected FILE or FILE:first:end.")
     path = Path(match["path"])
     try:
-        data, _ = read_volume(path, _volume_in(path))
+        data, _ = whole_volume(path, _volume_in(path))
     except DataError as error:
         raise DataError(f"--truth {path} holds no volume that can be read: {error}") from error
     first, end = int(match["first"] or 0), int(match["end"] or data.shape[0])
@@ -159,7 +158,7 @@ def measured_file(path: Path, truth: str | None, masks: Path | None) -> dict[str
             values["ssim3d"] = metrics.ssim3d(true, volume)
             values["ssim_slices"] = metrics.ssim_of_whole_slices(true, volume)
         if masks is not None:
-            labels, _ = read_volume(masks)
+            labels, _ = whole_volume(masks)
             if not np.isin(labels, (0, 1, 2)).all():
                 raise ValueError(f"{masks} holds other labels than 0 (not used), 1 (dense) and 2 (empty)")
             regions = np.array([-1, 1, 0], np.int8)[labels.astype(np.intp)]

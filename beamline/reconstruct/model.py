@@ -12,8 +12,13 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
+from beamline.monitor.digest import digest
 from beamline.storage import hdf5
+from beamline.storage.ingest import PER_FLUSH, complete
+from beamline.storage.writers import layout
 from beamline.storage.writers.recon_file import ReconRecord, opened_reconstruction
+from beamline.storage.writers.rows import Record, Rows
+from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid, Volume
@@ -111,27 +116,43 @@ def voxelised(model: Model, grid: Grid, count: Callable[[int, int], None]) -> Vo
 
 
 def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Callable[[int, int], None]) -> None:
-    """Line integrals of the model at `angles` [view] in radians: a Data Exchange file that every command reads.
+    """Line integrals of the model at `angles` [view] in radians: a scan of ours, which every command reads.
 
-    The views are straight, in their place: the poses of the views that were fitted are those of their own angles.
+    It states quantity, pixel size, axis and cone, and has the /exchange view of Data Exchange. The views are straight,
+    in their place: the poses of the views that were fitted are those of their own angles.
 
     Raises:
-        DataError: `path` exists, or the disk refuses; nothing is left.
+        DataError: a cone that a scan file cannot state, `path` exists, or the disk refuses; nothing is left.
     """
-    one = model.geometry.select([0])
+    one, in_mm = model.geometry.select([0]), model.record.length_unit == "mm"
     geometry = replace(one, shifts=np.zeros((1, 2)), roll=np.zeros(1), tilt=np.zeros(1)).at(angles)
-    with whole_file(path) as partial, hdf5.created(partial) as file:
-        if model.record.length_unit == "mm":
-            file.attrs["pixel_size_mm"] = geometry.pixel_pitch
-        group = file.create_group("exchange")
-        data = group.create_dataset("data", (angles.size, *geometry.detector_shape), np.float32)
-        data.attrs["units"], data.attrs["axes"] = "line_integrals", "theta:y:x"
-        theta = group.create_dataset("theta", data=np.degrees(angles))
-        theta.attrs["units"] = "deg"
+    middle = (geometry.detector_shape[0] - 1) / 2
+    if geometry.is_cone and not (in_mm and abs(geometry.axis_row - middle) < 1e-3):
+        raise DataError(
+            f"The cone of {path} meets the detector at right angles in row {geometry.axis_row:g}, with lengths in "
+            f"{model.record.length_unit}; a scan file states cones in mm about the middle row, {middle:g}. Reconstruct "
+            "all rows, with a pixel size. Nothing was written."
+        )
+    info = layout.ScanInfo(
+        sample=model.record.sample,
+        title=f"views of the Gaussians behind {model.record.title}",
+        pixel_size_mm=geometry.pixel_pitch if in_mm else None,
+        axis_col=geometry.axis_col,
+        source_distance_mm=geometry.sod if geometry.is_cone else None,
+        distance_mm=geometry.sdd - geometry.sod if geometry.is_cone else None,
+    )
+    with whole_file(path) as partial, hdf5.created(partial, layout.LIBVER) as file:
+        kind = np.dtype("<f4")
+        layout.create(file, info, geometry.detector_shape, kind, quantity="line_integrals", preview_bin=4, start=None)
+        rows = Rows(file)
         for view in range(angles.size):
-            data[view] = project(model.gaussians, geometry, [view]).numpy()[0]
+            image = project(model.gaussians, geometry, [view]).numpy()[0]
+            rows.write(view, image, digest(image, None), Record(FrameKind.PROJECTION, float(angles[view])))
             file.require_taken()
             count(view + 1, angles.size)
+            if view % PER_FLUSH == PER_FLUSH - 1:
+                rows.flush()
+        complete(file, rows, angles.size)
 
 
 def write_ply(path: Path, model: Model) -> None:

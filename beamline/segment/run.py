@@ -21,7 +21,8 @@ from beamline.core.shipped import version
 from beamline.report.figures import downwards, grey_window, png, show_grey
 from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
-from beamline.storage.volume_file import axes_of, read_volume
+from beamline.storage.volume_file import axes_of
+from beamline.storage.volumes.files import whole_volume
 from beamline.storage.writers.recon_file import DEVIATION
 from recon.base.volume import Grid, Volume
 from recon.post.clusters import Clusters, clusters
@@ -164,7 +165,7 @@ def _read(options: SegmentOptions) -> tuple[Volume, str]:
             if dataset is None and isinstance(file.get(_SIGNAL), h5py.Dataset):
                 dataset = _SIGNAL
             spacing, first = axes_of(file, dataset)
-    data, stated = read_volume(path, dataset)
+    data, stated = whole_volume(path, dataset)
     if data.ndim != 3 or data.dtype.kind not in "fiub" or min(data.shape) < 3:
         raise DataError(f"{path} holds {data.dtype} of shape {data.shape}; expected real numbers [z, y, x], 3 or more.")
     values = np.ascontiguousarray(data, np.float32)

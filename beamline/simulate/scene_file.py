@@ -16,7 +16,7 @@ from beamline.core.files import SETTINGS, text_in
 from beamline.core.shipped import shipped_scenes
 from beamline.core.text import size
 from beamline.storage.mesh_reader import READERS, read_mesh
-from beamline.storage.volume_file import read_volume
+from beamline.storage.volumes.files import whole_volume
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import CannotExposeError
 from simulators.scenes.emission import EmissionScene, load_emission
@@ -126,6 +126,6 @@ def volumes_beside(folder: Path) -> ReadVolume:
     def read_beside(file: str, dataset: str | None) -> Stored:
         if (folder / file).suffix.lower() in READERS:
             return Stored(read_mesh(folder / file))
-        return Stored(*read_volume(folder / file, dataset))  # a full path stays itself
+        return Stored(*whole_volume(folder / file, dataset))  # a full path stays itself
 
     return read_beside

@@ -52,6 +52,10 @@ class NotReadyError(DataError):
     """The file is just being created. This is not a fault: try again."""
 
 
+class UnreadableError(DataError):
+    """A file does not give a frame that it should hold; the others may be good."""
+
+
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     """Open for reading, also a file that is being written or whose writer died (SWMR).
 
@@ -73,13 +77,16 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
     being_written = head is not None and head.open_for_writing and head.intact
     # A follower takes no lock, so as not to be taken for a writer.
     growing, whole, shared = (True, False), (False, None), (True, None)  # (swmr, locking)
-    for swmr, locking in (growing, whole, shared) if follow else (whole, growing, shared):
+    tries = [growing, whole, shared] if follow else [whole, growing, shared]
+    for swmr, locking in tries:
         if swmr and (missing or not (follow or being_written)):
             continue  # HDF5 would wait for ever for a writer that mends what is missing or damaged
         try:
             file = h5py.File(path, "r", swmr=swmr, locking=locking)
         except (OSError, ValueError) as error:
             problems.append(str(error))
+            if _without_locks(str(error)):
+                tries.append((swmr, False))  # nobody can lock it there, so that no lock says that it is written
             continue
         try:
             with readable(path):
@@ -100,7 +107,23 @@ def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
             f"{path} is marked as being written ({problems[0]}). If a scan just begins or ends, try again. If its "
             "writer died, `beamline recover` clears the mark; nothing was read."
         )
+    if (locked := next((problem for problem in problems if _LOCK.search(problem)), None)) is not None:
+        raise DataError(
+            f"{path} is locked: another program has it open to write it ({reason(OSError(locked))}). Close it there, "
+            "and try again. Where no program writes it, as after a crash on a network disk, read a copy of it, or "
+            "set HDF5_USE_FILE_LOCKING=FALSE. Nothing was read."
+        )
     raise DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
+
+
+_LOCK = re.compile(r"unable to lock file(?:, errno = (\d+))?")
+
+
+def _without_locks(problem: str) -> bool:
+    """Whether HDF5 could not lock a file because its file system has no locks, as some network disks."""
+    found = _LOCK.search(problem)
+    no_locks = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
+    return found is not None and found[1] is not None and int(found[1]) in no_locks
 
 
 def grows_here(path: Path) -> bool:
@@ -288,6 +311,26 @@ def resolve(group: h5py.Group, path: str) -> Any | None:
         return None
 
 
+def broken_link(group: h5py.Group, path: str) -> str:
+    """Where a path ends at a link that leads nowhere, and where that should lead; "" for a path that is not there."""
+    here: Any = group
+    for name in path.strip("/").split("/"):
+        if not isinstance(here, h5py.Group):
+            return ""
+        link, there = here.get(name, getlink=True), resolve(here, name)
+        if there is None and isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+            file = f"{link.filename}::" if isinstance(link, h5py.ExternalLink) else ""
+            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which is not there"
+        here = there
+    return ""
+
+
+def refuse_broken(group: h5py.Group, path: str) -> None:
+    """Raises DataError where a path ends at a link that leads nowhere."""
+    if broken := broken_link(group, path):
+        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
+
+
 def dataset(group: h5py.Group, path: str) -> h5py.Dataset | None:
     """The dataset at a path; None if it is missing or can hold nothing (a null dataspace).
 
@@ -399,7 +442,7 @@ def read_frames(item: h5py.Dataset, indices: NDArray[np.int64], rows: slice, out
             out[start : start + end - first] = item[first:end, rows]
         except OSError as error:
             which = f"Frame {first}" if end == first + 1 else f"One of the frames {first} to {end - 1}"
-            raise DataError(
+            raise UnreadableError(
                 f"{which} of {item.name} in {item.file.filename} cannot be read ({reason(error)})."
             ) from error
         start += end - first

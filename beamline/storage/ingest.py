@@ -111,6 +111,8 @@ def _copy(
     n, invalid = int(source.image_key.size), 0
     for i, (given, record) in enumerate(_frames(source)):
         image = given.astype(dtype, copy=False)
+        if i in source.unreadable:
+            raise DataError(f"{source.unreadable[i]} Nothing is left of {out}.")
         if i in source.damaged:
             raise DataError(
                 f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
@@ -124,13 +126,18 @@ def _copy(
             progress(i + 1, n)
         if (i + 1) % PER_FLUSH == 0:
             rows.flush()
+    complete(file, rows, n)
+    return invalid
+
+
+def complete(file: hdf5.NewFile, rows: Rows, n: int) -> None:
+    """State that a file that `layout.create` made holds all its n frames, with the /exchange view of them."""
     rows.flush()
     file[layout.COMMITTED][()] = n
     file[layout.STATUS][()] = b"complete"
     file[layout.FINISHED][()] = 1
     layout.state_field_of_view(file)
     add_exchange_view(file)
-    return invalid
 
 
 def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:

@@ -95,7 +95,7 @@ def read_poses(text: str) -> PoseTable:
     try:
         if hdf5.is_hdf5(path):
             return _of_hdf5(path, (match[2], match[3]) if match else None)
-        return _of_csv(path, text_in(path, _LARGEST, "utf-8-sig"))
+        return _of_csv(path, text_in(path, _LARGEST))
     except _NoPosesError as error:
         raise ValueError(str(error)) from error
     except (OSError, DataError) as error:

@@ -1,4 +1,4 @@
-"""Volume file: a volume [z, y, x] read from TIFF, NumPy, NIfTI, HDF5 or Zarr."""
+"""Volume file: a volume [z, y, x] read from TIFF (a file, or a folder of slices), NumPy, NIfTI, HDF5 or Zarr."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.machine import free_memory
@@ -41,6 +42,8 @@ def read_volume(
         scale, spacing = open_zarr(path, dataset)
         _check_size(path, math.prod(scale.shape) * scale.dtype.itemsize)
         return scale[:], spacing
+    if path.is_dir():
+        return _from_folder(path), None
     if not path.is_file():
         raise DataError(f"There is no volume {path}.")
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
@@ -93,6 +96,40 @@ def _from_tiff(path: Path) -> NDArray[np.generic]:
         if n > PACKED * path.stat().st_size:
             raise DataError(f"{path} claims to hold {n / 1e9:.3g} GB in {path.stat().st_size} bytes: it is damaged.")
         return tif.asarray()
+
+
+def _from_folder(path: Path) -> NDArray[np.generic]:
+    """The TIFF slices of a folder, in the order of the numbers in their names."""
+    files = [
+        item for item in path.iterdir() if item.suffix.lower() in (".tif", ".tiff") and not item.name.startswith(".")
+    ]
+    if not files:
+        inside = [path / name for name in ("recon.h5", "volume.h5") if (path / name).is_file()]
+        raise DataError(
+            f"{path} is a folder without TIFF slices"
+            + (
+                f"; its volume is {inside[0]}."
+                if inside
+                else f"; a volume is such a folder, a Zarr, or {', '.join(SUFFIXES)}."
+            )
+        )
+    slices: NDArray[np.generic] | None = None
+    for z, name in enumerate(natural_sorted(item.name for item in files)):
+        try:
+            values = tifffile.imread(path / name)
+        except Exception as error:  # as of other foreign files
+            raise DataError(f"{path / name} cannot be read ({type(error).__name__}: {error}).") from error
+        if slices is None:
+            _check_size(path, values.nbytes * len(files))
+            slices = np.empty((len(files), *values.shape), values.dtype)
+        if values.ndim != 2 or (values.shape, values.dtype) != (slices.shape[1:], slices.dtype):
+            raise DataError(
+                f"{path / name} is {values.dtype} {values.shape}; expected slices [y, x] alike, of {slices.dtype} "
+                f"{slices.shape[1:]}."
+            )
+        slices[z] = values
+    assert slices is not None
+    return slices
 
 
 def _check_size(path: Path, n: int) -> None:

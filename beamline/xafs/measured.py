@@ -42,7 +42,7 @@ def read_table(path: Path, unit: str | None) -> XafsCurve:
         DataError: it does not exist, or is not such a table.
     """
     try:
-        lines = text_in(path, encoding="utf-8-sig").splitlines()
+        lines = text_in(path).splitlines()
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error}).") from error
     rows = []

@@ -1,4 +1,4 @@
-"""Units: warns of values that look like another quantity: degrees for radians, counts for line integrals."""
+"""Units: warns of degrees given for radians, and of counts or transmission given for line integrals."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ _TURNS = 10  # fewer are no reason for doubt, unless all angles are whole number
 _FEWEST = 5  # with fewer views there is no warning
 _OPAQUE = 15.0  # exp(-15) of the light, which no detector measures in nine of ten pixels
 _LOOKED_AT = 2**16  # values
+_VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # of a scan, in which transmission is looked for
+_LEVEL = 0.15  # by so much the beam of transmission may differ from 1, and from view to view
+_NOT_ABOVE = 0.03  # of the beam: by so much nine values in ten are not above it
+_EDGE = 32  # of the columns are an edge
+_SIGMAS = 3.0
 
 
 def look_like_degrees(angles: NDArray[np.floating]) -> bool:
@@ -55,3 +60,63 @@ def look_like_counts(projections: NDArray[np.floating]) -> bool:
     if some.size == 0 or not np.median(some) > _OPAQUE:
         return False
     return bool(np.quantile(some, 0.1) > _OPAQUE or np.array_equal(some, np.round(some)))
+
+
+def look_like_transmission(projections: NDArray[np.floating]) -> bool:
+    """Whether values [view, row, col] given as line integrals look like transmission, by a sample of them.
+
+    Beside the sample, line integrals are 0 and transmission is 1; where the sample is, line integrals rise and
+    transmission falls. So it is transmission if half of the left and right edges of the views have a level near 1 and
+    are flat, nine values in ten are not above it, none lies much below 0, and the middle of the views does. Line
+    integrals of a sample within the field never do so. Of one that fills the field, edges of about 1 with less matter
+    between them are those of a tube seen from within, whose profile falls all the way from the edge: it is not flat.
+    """
+    if projections.ndim != 3 or projections.shape[0] < 2 or not projections.shape[1] or projections.shape[2] < 16:
+        return False
+    views, rows, cols = projections.shape
+    looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
+    some = projections[np.unique(np.linspace(0, views - 1, looked_at).astype(int))]
+    some = some[:, np.unique(np.linspace(0, rows - 1, _ROWS).astype(int))].astype(np.float32)
+    some[~np.isfinite(some)] = np.nan
+    width, middle = cols // _EDGE or 1, some[..., cols // 3 : cols - cols // 3]
+    edges = np.concatenate([some[..., :width], some[..., -width:]])
+    within = np.concatenate([some[..., width : 2 * width], some[..., -2 * width : -width]])
+    seen = np.isfinite(edges).any(axis=(1, 2)) & np.isfinite(within).any(axis=(1, 2))
+    if not seen.any() or not np.isfinite(middle).any():
+        return False
+    edges, within = edges[seen], within[seen]
+    levels, beside = (np.nanmedian(part, axis=(1, 2)) for part in (edges, within))
+    air = levels + beside >= np.median(levels + beside)  # a sample may reach the others
+    beam = float(np.median(levels[air]))
+    scatter = edges[air] - levels[air, None, None]
+    noise = 1.4826 * float(np.nanmedian(np.abs(scatter)))
+    lowest, highest = np.nanquantile(some, (0.001, 0.9))
+    if (np.abs(levels[air] - 1) > _LEVEL).any() or lowest < -_NOT_ABOVE - _SIGMAS * noise:
+        return False
+    if highest > levels.max() * (1 + _NOT_ABOVE) + 2 * noise:
+        return False
+    fall = beam - float(np.nanmean(middle))
+    step = float(np.mean(levels[air] - beside[air]))
+    uncertain = 2 * noise / np.sqrt(np.isfinite(edges[air]).sum())  # of a difference of two medians of the edges
+    flat = fall / _EDGE  # a profile that is convex falls twice as much from the edge to the columns beside it
+    return bool(step < flat and flat > max(_SIGMAS * uncertain, 1e-4 * beam))
+
+
+def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 3) -> None:
+    """A UserWarning if values [view, row, col] given as line integrals look like counts or transmission.
+
+    Args:
+        stacklevel: of the warning; 3 names the line that called the asking function.
+    """
+    if look_like_counts(projections):
+        warnings.warn(
+            f"projections have a median of {np.nanmedian(projections[:1]):.4g}: they look like counts. Line integrals "
+            "are -log((counts - dark) / (flat - dark)), see recon.correct; or give recon.Counts",
+            stacklevel=stacklevel,
+        )
+    elif look_like_transmission(projections):
+        warnings.warn(
+            "projections are about 1 at the edges of the views and fall where the sample is: they look like "
+            "transmission. Line integrals are its logarithm, -np.log(transmission), and rise there",
+            stacklevel=stacklevel,
+        )

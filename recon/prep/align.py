@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import uniform_filter1d
 
-from recon.base.units import warn_of_degrees
+from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.prep.axis_search import AGREE, MOST_ROWS, Floats, Search, few_rows, lowest, optimum, within
 from recon.prep.axis_search import AxisError as AxisError
 from recon.prep.axis_search import AxisEstimate as AxisEstimate
@@ -161,12 +161,13 @@ def find_axis(projections: NDArray[np.floating], angles: Floats, search: Search 
         ValueError, AxisError: as `axis_from_sinogram`.
 
     Warns:
-        UserWarning: where angles look like degrees.
+        UserWarning: where angles look like degrees, or projections like counts or transmission.
     """
     theta = np.asarray(angles, np.float64)
     if projections.ndim != 3:
         raise ValueError(f"projections must be [view, row, col], got shape {projections.shape}")
     warn_of_degrees(theta)
+    warn_of_other_quantity(projections)
     try:
         from_all = axis_from_sinogram(projections, theta, search)
     except AxisError:

@@ -19,6 +19,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from recon.base.arrays import F32
 from recon.base.choices import Rings
 from recon.base.noise import spline_at, without_layers
+from recon.base.units import warn_of_other_quantity
 
 _ROBUST = 1.4826  # median deviation to standard deviation, for normal values
 _FAR = 3.0  # a column this many standard deviations off its neighbours is a stripe (Vo 2018: snr 3)
@@ -252,6 +253,7 @@ def remove_rings(
         raise ValueError(f"rings is one of {', '.join(get_args(Rings))}, got {rings!r}")
     if not (np.isfinite(views).all() and np.isfinite(theta).all()):
         raise ValueError("projections or angles hold NaN or infinite values; correct them first")
+    warn_of_other_quantity(views)
     return WithoutRings(views, *remove_rings_in_place(views, theta, rings, axis_col))
 
 

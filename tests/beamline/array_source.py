@@ -37,6 +37,7 @@ class ArraySource:
     times = None
     emission = None
     plan: dict[str, Any] = {}  # noqa: RUF012
+    unreadable: dict[int, str] = {}  # noqa: RUF012
 
     def __init__(
         self,

@@ -18,6 +18,7 @@ import recon
 import recon.splatting.initialise
 from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
+from recon.axis_by_views import axis_by_views
 from recon.methods import build, by_name, names
 from simulators.frame.detector import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -194,6 +195,23 @@ def test_degrees_and_counts_cause_a_warning_with_advice(noisy: np.ndarray) -> No
     assert told[0].filename == __file__  # the line of the caller
     with pytest.warns(UserWarning, match="look like counts.*recon.correct"):
         recon.reconstruct(np.round(2e4 * np.exp(-noisy)), VIEWS, "fbp")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda light: recon.reconstruct(light, VIEWS, "fbp"),
+        lambda light: recon.find_axis(light, ANGLES),
+        lambda light: recon.remove_rings(light, ANGLES),
+        lambda light: axis_by_views(light, VIEWS),
+    ],
+)
+def test_transmission_causes_a_warning_with_advice(noisy: np.ndarray, call: Callable[[np.ndarray], object]) -> None:
+    light = np.exp(-noisy)
+    with pytest.warns(UserWarning, match=r"look like transmission.*-np\.log") as told, suppress(ValueError):
+        call(light)
+    assert told[0].filename == __file__
+    call(-np.log(light))
 
 
 def test_the_names_that_load_late_are_listed() -> None:

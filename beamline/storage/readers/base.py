@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -13,9 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.hdf5 import UnreadableError
 from drivers.base.frame import Frame, FrameKind
 
 Quantity = Literal["counts", "line_integrals", "unknown"]
+Stated = Quantity | Literal["transmission"]
+"""Of a file or a caller; transmission is read as counts of a beam of 1 without darks."""
 Attributes = Mapping[str, str | float | int]
 
 WHOLE = slice(None)
@@ -53,6 +57,7 @@ class ScanSource(ABC):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
+        unreadable: rows that `read_known` was asked for and the file does not give, and why.
     """
 
     path: Path
@@ -69,6 +74,7 @@ class ScanSource(ABC):
     axis_col: float | None = None
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
+    unreadable: Mapping[int, str] = MappingProxyType({})
 
     @property
     def row_period(self) -> float | None:
@@ -177,9 +183,10 @@ class ScanSource(ABC):
         keys, angles, exposures = self.image_key, self.angles, self.exposures
         triggers = count_in_blocks(keys)
         for i in range(first, keys.size):
+            counts = read_known(self, [i])[0]
             yield Frame(
-                counts=self.read([i])[0],
-                kind=FrameKind(int(keys[i])),
+                counts=counts,
+                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(keys[i])),
                 index=i,
                 trigger=int(triggers[i]),
                 framestamp=-1,
@@ -215,6 +222,23 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
     if indices.min() < -n or indices.max() >= n:
         raise IndexError(f"Frames {indices.min()}..{indices.max()} asked for, but only 0..{n - 1} can be read.")
     return np.where(indices < 0, indices + n, indices)
+
+
+def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+    """As `source.read`, with NaN (0 of whole numbers) for frames that the file does not give: see its `unreadable`."""
+    try:
+        return source.read(frames, rows)
+    except UnreadableError:
+        indices = frame_indices(frames, int(source.image_key.size))
+    out = np.zeros((indices.size, len(range(source.shape[0])[rows]), source.shape[1]), source.dtype)
+    for image, row in zip(out, indices.tolist(), strict=True):
+        try:
+            image[...] = source.read([row], rows)[0]
+        except UnreadableError as error:
+            source.unreadable = {**source.unreadable, row: str(error)}
+            if source.dtype.kind == "f":
+                image[...] = np.nan
+    return out
 
 
 def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -25,6 +25,8 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open. `own_angles` False: the caller brings the angles, so theta may be absent."""
     file = hdf5.open_hdf5(path)
     try:
+        for _, where in PLACES:
+            hdf5.refuse_broken(file, where)
         found = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
         stacks = [FrameStack(kind, where, item) for kind, where, item in found if item is not None]
         source = StacksSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
@@ -32,6 +34,9 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
             n_views = len(stacks[-1].frames)
             source.angles[-n_views:] = _theta(file, n_views)
         pixel = file.attrs.get("pixel_size_mm")
+        units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
+        if source.quantity == "unknown" and units in ("counts", "line_integrals"):
+            source.quantity = "counts" if units == "counts" else "line_integrals"
         source.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
         return source
     except BaseException:
@@ -42,6 +47,7 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
 def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:
     theta = hdf5.dataset(file, "exchange/theta")
     if theta is None:
+        hdf5.refuse_broken(file, "exchange/theta")
         raise DataError(
             f"{file.filename} has no /exchange/theta. Some readers then assume 0 to 180 degrees; we do not: "
             "give them with --angles FILE (degrees, one a line)."
@@ -74,7 +80,7 @@ def _recognises(path: Path, opening: Opening) -> bool:
     if not hdf5.is_hdf5(path, opening.follow):
         return False
     with hdf5.open_hdf5(path, opening.follow) as file:
-        return hdf5.dataset(file, "exchange/data") is not None
+        return hdf5.dataset(file, "exchange/data") is not None or bool(hdf5.broken_link(file, "exchange/data"))
 
 
 FORMAT = ScanFormat(

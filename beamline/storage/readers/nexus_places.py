@@ -10,6 +10,8 @@ import h5py
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 
+_LISTED = 6  # detectors that an error names
+
 
 @dataclass(frozen=True, eq=False)
 class Places:
@@ -35,14 +37,13 @@ def find(file: h5py.File) -> list[Places]:
             for detector in _groups(hdf5.resolve(entry, "instrument")):
                 key = hdf5.dataset(detector, "image_key")
                 data = hdf5.dataset(detector, "data")
+                for name in ("data", "image_key"):
+                    if broken := hdf5.broken_link(detector, name):
+                        unresolved.append(broken)
                 if key is not None and data is not None and data.ndim == 3:
                     found.append(Places(entry, detector, data, key, *_find_angle(entry, detector)))
-                elif key is not None and detector.get("data", getlink=True) is not None and data is None:
-                    unresolved.append(_link(detector, "data"))
     if unresolved and not found:
-        raise DataError(
-            f"{file.filename} has no frames: {unresolved[0]} is not there. Put the linked file back beside this one."
-        )
+        raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back beside this one.")
     return found
 
 
@@ -69,19 +70,38 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group) -> tuple[h5py.Dataset |
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
         angle = hdf5.dataset(data, name)
         return angle, "" if angle is not None else f"{_link(data, name)} is not there"
-    return None, f"{entry.name} has no sample/rotation_angle"
+    return None, hdf5.broken_link(entry, "sample/rotation_angle") or f"{entry.name} has no sample/rotation_angle"
 
 
-def choose(file: h5py.File, found: list[Places]) -> Places:
-    """The one entry to read; DataError where there is none, or several and no `default` among them."""
+def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
+    """The one detector to read: whose frames are `data`, or which the attributes `default` of file and entry name.
+
+    DataError where there is none, or several could be meant.
+    """
     if not found:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
-    if len(found) > 1:
-        default = hdf5.attribute(file, "default")
-        found = [places for places in found if str(places.entry.name).strip("/") == default]
-    if len(found) != 1:
-        raise DataError(
-            f"{file.filename} has several tomography entries or detectors and no `default` that names one of them. "
-            "Set the attribute `default` of the file, or split it."
-        )
-    return found[0]
+    if data is not None:
+        return next(places for places in found if places.data == hdf5.resolve(file, data))
+    if len(found) == 1:
+        return found[0]
+    default = hdf5.attribute(file, "default").strip("/")
+    named = [places for places in found if str(places.entry.name).strip("/") == default]
+    plotted = [places for places in named if _is_default(places)]
+    for some in (named, plotted):
+        if len(some) == 1:
+            return some[0]
+    names = ", ".join(f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in found[:_LISTED])
+    raise DataError(
+        f"{file.filename} has several detectors with frames, and no attribute `default` names one of them: {names}. "
+        f"Say which: --data-path {found[0].data.name}."
+    )
+
+
+def _is_default(places: Places) -> bool:
+    """Whether the NXdata that an entry's `default` names shows these frames."""
+    name = hdf5.attribute(places.entry, "default")
+    data = hdf5.resolve(places.entry, name) if name else None
+    if not isinstance(data, h5py.Group):
+        return False
+    signal = hdf5.attribute(data, "signal") or "data"
+    return bool(hdf5.dataset(data, signal) == places.data)

@@ -28,6 +28,7 @@ from beamline.storage.readers.base import (
     ScanSource,
     count_in_blocks,
     frame_indices,
+    read_known,
 )
 from beamline.storage.readers.nexus_places import choose, find
 from beamline.storage.writers import layout
@@ -38,12 +39,15 @@ from drivers.base.frame import Frame, FrameKind
 class NXtomoSource(ScanSource):
     """A scan in NXtomo's structure; see ScanSource."""
 
-    def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True) -> None:
-        """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units."""
+    def __init__(self, path: Path, *, follow: bool = False, own_angles: bool = True, data: str | None = None) -> None:
+        """Open. `own_angles` False: the caller brings the angles, so the file's may be absent or without units.
+
+        `data` is where the frames are, of several detectors; None: of the only one, or the file's default.
+        """
         self.path = path
         self._file = hdf5.open_hdf5(path, follow)
         try:
-            self._places = places = choose(self._file, find(self._file))
+            self._places = places = choose(self._file, find(self._file), data)
             self._ours = layout.COMMITTED in self._file
             self._check()
             shape = places.data.shape
@@ -283,9 +287,10 @@ class NXtomoSource(ScanSource):
             for column in (trigger, framestamp):
                 column[[*self._altered]] = -1
         for i in range(first, self.n):
+            counts = read_known(self, [i])[0]
             yield Frame(
-                counts=self.read([i])[0],
-                kind=FrameKind(int(self.image_key[i])),
+                counts=counts,
+                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(self.image_key[i])),
                 index=i,
                 trigger=int(trigger[i]),
                 framestamp=int(framestamp[i]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from importlib import import_module
@@ -16,17 +16,21 @@ from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
-from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource
+from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
+from beamline.storage.readers.nexus_places import find
+from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
+from beamline.storage.readers.reference_files import Images, load_images
 from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
-from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeriesSource
-from beamline.storage.readers.wrapped import CroppedSource, PartsSource
+from beamline.storage.readers.wrapped import CroppedSource, PartsSource, TurnedSource, UnsignedSource, has_wrapped
 from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
 
+_SHORT = "i1", "i2"  # signed types that cameras' counts do not fit
+_LOOKED_AT = 3  # frames of a kind, for counts that wrapped
 REGISTRY = (  # modules in this folder, asked in this order
     "tiff_series",
     "tiff_stack",
@@ -49,8 +53,6 @@ FORMATS: tuple[ScanFormat, ...] = (
 )
 """Every format that is read, those of other packages last; adding one takes its file and its line in REGISTRY."""
 
-Images = Path | str | NDArray[Any]  # a TIFF, a folder of TIFFs, or an array [frame, row, col]
-
 
 @dataclass(frozen=True, eq=False)
 class SourceOptions:
@@ -58,21 +60,25 @@ class SourceOptions:
 
     Attributes:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
-        quantity: of the pixels, if the file does not state it.
+        quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
+            darks of 0.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
             projection, or one for each frame.
         angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
-        darks, flats: replace the file's; they come before its frames.
-        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are.
+        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or an HDF5 file of their own
+            (FILE::DATASET where it has several).
+        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are; of an NXtomo with several
+            detectors: where the frames of one are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
         angles_path: of any HDF5 file: where the angles are, instead of `angles`.
         angles_unit: "deg" or "rad", of these, instead of what the file says.
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
+        horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
     """
 
     path: Path | str
-    quantity: Quantity | None = None
+    quantity: Stated | None = None
     angles: Angles | None = None
     angle_rows: str | None = None
     darks: Images | None = None
@@ -82,6 +88,7 @@ class SourceOptions:
     flats_path: str | None = None
     angles_path: str | None = None
     angles_unit: str | None = None
+    horizontal_axis: bool = False
     earlier: tuple[Path, ...] = ()
     cols: tuple[int, int] | None = None
 
@@ -103,46 +110,96 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
+    base: ScanSource
     path, angles, darks, flats = Path(options.path), options.angles, options.darks, options.flats
     _refuse(options, follow)
     if options.data_path is not None:
         with hdf5.readable(path):
-            base: ScanSource = open_stacks(path, options.data_path, options.darks_path, options.flats_path)
+            base = _at_data_path(path, options.data_path, options)
     else:
         base = _open(path, Opening(follow, own_angles=angles is None and options.angles_path is None))
     try:
         if options.earlier:
             base = _of_parts(options.earlier, base)
+        series, stacked = base, isinstance(base, StacksSource)
+        if base.dtype.str[1:] in _SHORT and any(has_wrapped(images) for images in _some_of_each_kind(base)):
+            base = UnsignedSource(base)
         table = None if angles is None else load_angles(angles)
         angles_from = str(angles) if isinstance(angles, Path | str) else "The array of angles"
         if options.angles_path is not None:
             angles_from = f"{options.angles_path} in {path}"
             table = angles_at(path, options.angles_path, options.angles_unit)
-        if table is None and isinstance(base, TiffSeriesSource) and base.angle_text is not None:
-            angles_from = f"{base.angle_text[0]} in {path}"
-            table = parse_angles(base.angle_text[1], angles_from)
+        if table is None and isinstance(series, TiffSeriesSource) and series.angle_text is not None:
+            angles_from = f"{series.angle_text[0]} in {path}"
+            table = parse_angles(series.angle_text[1], angles_from)
         if options.angle_rows is not None:
             if table is None:
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
-        if table is not None and isinstance(base, StacksSource):
+        if table is not None:
+            _refuse_fewer(base, table, angles_from)
+        if table is not None and stacked:
             _refuse_all_frames(base, table, angles_from)
+        if options.quantity == "transmission":
+            darks, flats = _beam_of_one(base, options)
         if any(given is not None for given in (table, darks, flats, options.quantity)):
             base = OverlaidSource(
                 base,
                 angles=table,
                 angles_from=angles_from,
-                darks=None if darks is None else load_images(darks),
-                flats=None if flats is None else load_images(flats),
-                quantity=options.quantity,
+                darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
+                flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
+                quantity="counts" if options.quantity == "transmission" else options.quantity,
             )
+        if options.horizontal_axis:
+            base = TurnedSource(base)
         return base if options.cols is None else CroppedSource(base, options.cols)
     except BaseException:
         base.close()
         raise
 
 
-def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str) -> None:
+def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
+    """The detector of an NXtomo whose frames these are, or a scan of these stacks."""
+    if options.darks_path is None and options.flats_path is None:
+        with hdf5.open_hdf5(path) as file:
+            named = hdf5.dataset(file, data)
+            keyed = named is not None and any(places.data == named for places in find(file))
+        if keyed:
+            return NXtomoSource(path, own_angles=options.angles is None and options.angles_path is None, data=data)
+    return open_stacks(path, data, options.darks_path, options.flats_path)
+
+
+def _refuse_fewer(base: ScanSource, table: NDArray[np.float64], name: str) -> None:
+    """DataError for fewer angles than projections: some have none, whichever they are."""
+    n = int((base.image_key == FrameKind.PROJECTION).sum())
+    if table.size < n:
+        raise DataError(
+            f"{name} has {table.size} angles for {n} projections, so that {n - table.size} have none. Is it cut off, "
+            "or of another scan? Give one angle for each projection, in their order."
+        )
+
+
+def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The darks and flats by which transmission was divided already: of 0 and 1. DataError for what is none."""
+    if options.darks is not None or options.flats is not None:
+        raise DataError("--quantity transmission is of frames divided by their flats: leave out --darks and --flats.")
+    if base.dtype.kind != "f":
+        raise DataError(
+            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
+            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
+        )
+    return np.zeros((1, *base.shape), base.dtype), np.ones((1, *base.shape), base.dtype)
+
+
+def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
+    for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
+        rows = np.flatnonzero(source.image_key == kind)
+        if rows.size:
+            yield read_known(source, rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))])
+
+
+def _refuse_all_frames(base: ScanSource, table: NDArray[np.float64], name: str) -> None:
     """DataError for angles of all frames if the order of darks and flats is unknown."""
     n = int((base.image_key == FrameKind.PROJECTION).sum())
     if n < base.image_key.size == table.size:
@@ -182,6 +239,7 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     """DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
+    replaced += ["--horizontal-axis"] if options.horizontal_axis else []
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "

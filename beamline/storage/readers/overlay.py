@@ -132,4 +132,4 @@ class OverlaidSource(WrappedSource):
         if len(self._front) or self.dtype != np.uint16:
             return super().frames(first)
         angles = self.angles
-        return (replace(frame, angle=float(angles[frame.index])) for frame in self._base.frames(first))
+        return (replace(frame, angle=float(angles[frame.index])) for frame in self._frames_of_base(first))

@@ -139,13 +139,14 @@ def dataset_at(file: h5py.File, where: str) -> h5py.Dataset:
     """The dataset at a path. Without one, DataError lists the datasets of the file."""
     item = hdf5.dataset(file, where)
     if item is None:
+        hdf5.refuse_broken(file, where)
         raise DataError(f"{file.filename} has no dataset {where}. {datasets_text(file)}")
     return item
 
 
 def datasets_text(file: h5py.File) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    found: list[h5py.Dataset] = []
+    found = list[h5py.Dataset]()
     file.visititems(lambda _, item: found.append(item) if isinstance(item, h5py.Dataset) and item.shape else None)
     found.sort(key=lambda item: (-item.ndim, -item.size))
     shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in found[:_LISTED]]

@@ -1,4 +1,4 @@
-"""TIFF images: reading them whole, and the reference frames that a caller names."""
+"""TIFF images: reading them whole, and what all readers of them ask."""
 
 from __future__ import annotations
 
@@ -12,11 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
-from beamline.storage import hdf5
-from beamline.storage.hdf5 import require_real
 
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
@@ -50,28 +47,9 @@ class Complaints(logging.Handler):
         logging.getLogger("tifffile").removeHandler(self)
 
 
-def load_images(images: Path | str | NDArray[Any]) -> NDArray[Any]:
-    """Reference frames [frame, row, col]: from an array, one TIFF (any pages) or a folder of TIFFs, all in memory."""
-    if not isinstance(images, Path | str):
-        stack = np.asarray(images)
-        require_real(stack.dtype, "The array of reference frames")
-        return stack[None] if stack.ndim == 2 else stack
-    path = Path(images)
-    files = (
-        [path / name for name in natural_sorted(f.name for f in path.iterdir() if f.suffix.lower() in SUFFIXES)]
-        if path.is_dir()
-        else [path]
-    )
-    if not files:
-        raise DataError(f"{path} holds no .tif or .tiff file.")
-    try:
-        parts = [read_image(file) for file in files]
-        stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
-    except UNREADABLE as error:
-        wanted = "" if isinstance(error, OSError) and error.errno else " as TIFFs of one shape"
-        raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
-    require_real(stack.dtype, str(path))
-    return stack
+def is_hidden(name: str) -> bool:
+    """Files that a system keeps beside others, such as a Mac's `._0001.tif`; they are no images."""
+    return name.rpartition("/")[2].startswith(".")
 
 
 def read_image(file: Path | BinaryIO) -> NDArray[Any]:

@@ -1,8 +1,8 @@
 """TIFF series: a folder (or .zip) with one image a file.
 
-The name of a file tells its kind: `dark`, `flat`, `white` or `open_beam` at the start of a word of the name or of a
-folder above it; the others must be one series. They are put in the order of the numbers in their names, never of a
-listing. Files are read one at a time, so that memory does not grow with the scan.
+The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
+order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
+the scan. Hidden files (`._0001.tif` of a Mac) are not looked at.
 """
 
 from __future__ import annotations
@@ -19,15 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 from tifffile import TiffFile, natural_sorted
 
 from beamline.core.errors import DataError
+from beamline.core.files import decoded
 from beamline.core.text import spans
 from beamline.storage import hdf5
-from beamline.storage.hdf5 import require_real
+from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
-from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, read_image, refuse_volume
+from beamline.storage.readers.image_names import angles_of, kinds_of, without_angle
+from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, is_hidden, read_image, refuse_volume
 from drivers.base.frame import FrameKind
 
-REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
 MOST_FILES = 100_000
+_TRIED = 3  # first images of a series, of which one must be readable, as the others are then
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$")
 
@@ -46,26 +48,36 @@ class TiffSeriesSource(ScanSource):
         try:
             names = self._names()
             images = natural_sorted(name for name in names if name.lower().endswith(SUFFIXES))
-            kinds = {name: kind_of(name) for name in images}
+            kinds = kinds_of(path, images)
             series = [name for name in images if kinds[name] is FrameKind.PROJECTION]
             _check_one_series(path, series)
             with suppress(*UNREADABLE), TiffFile(io.BytesIO(self._bytes(series[0]))) as tif:  # damage is told below
                 refuse_volume(path, tif)
+            in_names = angles_of(series)
+            if in_names is not None:  # their angle does not say their order
+                rest = [without_angle(name) for name in series]
+                place = {name: i for i, name in enumerate(natural_sorted(set(rest)))}
+                taken = np.argsort([place[name] for name in rest], kind="stable")
+                series, in_names = [series[i] for i in taken], in_names[taken]
             order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
             self._files = order + series
             self.image_key = np.array([kinds[name] for name in self._files], np.int32)
             self.angles = np.full(len(self._files), np.nan)
+            if in_names is not None:
+                self.angles[len(order) :] = in_names
             self.exposures = np.full(len(self._files), np.nan)
-            samples = [self._image(name) for name in (*order, series[0])]
+            samples = [*self._readable(order), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1].shape[0], samples[-1].shape[1]
             self.dtype = np.result_type(*(image.dtype for image in samples))
             texts = [name for name in names if ANGLE_FILE.search(name.lower())]
-            self.angle_text = (texts[0], self._bytes(texts[0]).decode("utf-8", "replace")) if len(texts) == 1 else None
+            self.angle_text = (texts[0], self._text(texts[0])) if len(texts) == 1 else None
         except BaseException:
             self.close()
             raise
-        gaps = _gaps(series)
+        gaps = _gaps(series if in_names is None else [without_angle(name) for name in series])
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
+        if in_names is not None and self.angle_text is None:
+            self.facts |= {"angles_from": "the names of the files"}
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices = frame_indices(frames, self.image_key.size)
@@ -89,11 +101,12 @@ class TiffSeriesSource(ScanSource):
 
     def _names(self) -> list[str]:
         if self._zip is not None:
-            return [name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name]
+            packed = (name for name in self._zip.namelist() if not name.endswith("/") and "__MACOSX" not in name)
+            return [name for name in packed if not is_hidden(name)]
         names = []
         for n, item in enumerate(self.path.rglob("*")):
             _refuse_more(self.path, n)
-            if item.is_file():
+            if not is_hidden(item.name) and item.is_file():
                 names.append(item.relative_to(self.path).as_posix())
         return names
 
@@ -101,26 +114,39 @@ class TiffSeriesSource(ScanSource):
         try:
             return (self.path / name).read_bytes() if self._zip is None else self._zip.read(name)
         except (*UNREADABLE, RuntimeError) as error:  # of an archive with a password
-            raise DataError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+            raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
+
+    def _readable(self, names: list[str], at_least: int = 0) -> list[NDArray[Any]]:
+        """The images of these files that can be read; DataError where they are fewer than `at_least`."""
+        images, failed = list[NDArray[Any]](), list[UnreadableError]()
+        for name in names:
+            try:
+                images.append(self._image(name))
+            except UnreadableError as error:
+                failed.append(error)
+        if len(images) < at_least:
+            raise failed[0]
+        return images
+
+    def _text(self, name: str) -> str:
+        content = self._bytes(name)
+        try:
+            return decoded(content)
+        except UnicodeDecodeError:
+            return content.decode("utf-8", "replace")  # a comment in another alphabet; numbers are told later
 
     def _image(self, name: str) -> NDArray[Any]:
         content = self._bytes(name)
         try:
             image = read_image(io.BytesIO(content))
         except UNREADABLE as error:
-            raise DataError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF ({hdf5.reason(error)}).") from error
+        if image.size == 0:
+            raise UnreadableError(f"{name} in {self.path} cannot be read as TIFF (it holds no image).")
         if image.ndim != 2:
             raise DataError(f"{name} in {self.path} is {image.shape}; expected one grey image a file.")
         require_real(image.dtype, f"{name} in {self.path}")
         return image
-
-
-def kind_of(name: str) -> FrameKind:
-    """The kind of a file, by its name relative to the scan's folder."""
-    match = REFERENCE.search(name.lower())
-    if match is None:
-        return FrameKind.PROJECTION
-    return FrameKind.DARK if match[1] == "dark" else FrameKind.FLAT
 
 
 def _open_zip(path: Path) -> zipfile.ZipFile:
@@ -154,10 +180,10 @@ def _prefix(name: str) -> str:
 
 
 def _check_one_series(path: Path, names: list[str]) -> None:
-    prefixes = sorted({_prefix(name) for name in names})
     if not names:
         raise DataError(f"{path} holds no projections: no .tif or .tiff file but those named as darks or flats.")
-    if len(prefixes) > 1:
+    prefixes = sorted({_prefix(name) for name in names})
+    if len(prefixes) > 1 and (angles_of(names) is None or len({_prefix(without_angle(name)) for name in names}) > 1):
         found = ", ".join(f"{sum(_prefix(name) == prefix for name in names)} of {prefix!r}" for prefix in prefixes[:6])
         raise DataError(
             f"{path} holds several series of images: {found}. Name darks and flats so (dark_0001.tif, flat_0001.tif), "

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.hdf5 import require_real
+from beamline.storage.hdf5 import UnreadableError, require_real
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.tiff import SUFFIXES, UNREADABLE, Complaints, appended, pages_one_by_one, refuse_volume
 from drivers.base.frame import FrameKind
@@ -80,7 +80,7 @@ class TiffStackSource(ScanSource):
             try:
                 self._fill(out[i], int(page), rows)
             except UNREADABLE as error:
-                raise DataError(f"Page {page} of {self.path} cannot be read ({hdf5.reason(error)}).") from error
+                raise UnreadableError(f"Page {page} of {self.path} cannot be read ({hdf5.reason(error)}).") from error
         return out
 
     def _fill(self, out: NDArray[Any], page: int, rows: slice) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.readers.base import WHOLE, ScanSource, frame_indices
+from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
 from drivers.base.frame import Frame
 
 
@@ -34,6 +34,12 @@ class WrappedSource(ScanSource):
         self._base.refresh()
         self._update()
         return int(self.image_key.size)
+
+    def _frames_of_base(self, first: int) -> Iterator[Frame]:
+        """Frames of `base`, whose rows are those of this scan."""
+        for frame in self._base.frames(first):
+            self.unreadable = self._base.unreadable
+            yield frame
 
     def close(self) -> None:
         self._base.close()
@@ -79,7 +85,78 @@ class CroppedSource(WrappedSource):
         return self._base.read(frames, rows)[..., self._cols]
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        return (replace(frame, counts=frame.counts[:, self._cols]) for frame in self._base.frames(first))
+        return (replace(frame, counts=frame.counts[:, self._cols]) for frame in self._frames_of_base(first))
+
+
+class TurnedSource(WrappedSource):
+    """A ScanSource of the frames of `base` turned by a quarter turn: a horizontal rotation axis becomes vertical.
+
+    What was the last column is the first row. Any rows take reading whole frames.
+    """
+
+    def __init__(self, base: ScanSource) -> None:
+        """Raises DataError for an emission and for a scan with flags: both have a vertical axis."""
+        super().__init__(base)
+        if base.emission is not None or base.flags is not None:
+            raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
+        self.shape, self.axis_col = (base.shape[1], base.shape[0]), None
+        self._update()
+
+    @property
+    def shifts(self) -> NDArray[np.float64] | None:
+        known = self._base.shifts
+        return None if known is None else np.stack([known[:, 1], -known[:, 0]], axis=1)
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        return np.ascontiguousarray(np.rot90(self._base.read(frames), axes=(1, 2))[:, rows])
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        return (
+            replace(frame, counts=np.ascontiguousarray(np.rot90(frame.counts))) for frame in self._frames_of_base(first)
+        )
+
+
+class UnsignedSource(WrappedSource):
+    """A ScanSource of counts that `base` holds as a signed type, so that the larger ones are negative."""
+
+    def __init__(self, base: ScanSource) -> None:
+        super().__init__(base)
+        self.dtype = _unsigned(base.dtype)
+        self._update()
+
+    @property
+    def attributes(self) -> Attributes:
+        return {**self._base.attributes, "pixels": f"{self._base.dtype} that wrapped, read as {self.dtype}"}
+
+    def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        return unsigned(self._base.read(frames, rows))
+
+
+def unsigned(images: NDArray[Any]) -> NDArray[Any]:
+    """The same bits as counts without a sign."""
+    return images.view(_unsigned(images.dtype))
+
+
+def _unsigned(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    return np.dtype(f"{dtype.byteorder}u{dtype.itemsize}")
+
+
+def has_wrapped(images: NDArray[Any]) -> bool:
+    """Whether signed integers [..., col] are counts whose sign bit is one of the counts.
+
+    Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
+    without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
+    noise around 0, or marks pixels without data by one value, has not wrapped.
+    """
+    if images.dtype.kind != "i" or images.dtype.itemsize > 2 or images.shape[-1] < 2:
+        return False
+    negative = images[images < 0]
+    if negative.size == 0 or negative.min() == negative.max():
+        return False
+    signed, plain = (
+        np.abs(np.diff(some.astype(np.int32), axis=-1)).sum(dtype=np.int64) for some in (images, unsigned(images))
+    )
+    return bool(plain < signed or (plain == signed and np.median(images) < 0))
 
 
 class PartsSource(WrappedSource):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from beamline.core.text import spans
 from beamline.monitor.digest import block_means, digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 
@@ -64,12 +64,12 @@ def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
     """The references of a scan of counts, judged by a few frames of each group; flats beside those of their part."""
     darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
-    dark, lit = ([[_reference(source, int(row)) for row in _some(group)] for group in of] for of in (darks, flats))
+    dark, lit = ([_readable(source, _some(group)) for group in of] for of in (darks, flats))
     views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
     found = judge([*dark, *lit], limits)[: len(darks)]
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
         own, seen = [group for group in lit if start <= group[0].row < end], views[(views >= start) & (views < end)]
-        witnesses = [_reference(source, int(row)) for row in _some(seen)] if seen.size and own else []
+        witnesses = _readable(source, _some(seen)) if seen.size and own else []
         found += judge([*dark, *own], limits, witnesses)[len(darks) :]
     whole = [JudgedGroup(j.kind, tuple(g.tolist()), j.faults) for j, g in zip(found, (*darks, *flats), strict=True)]
     return ReferenceGroups(darks, flats, tuple(whole))
@@ -111,11 +111,18 @@ def _some(group: Frames) -> Frames:
     return group[np.unique(np.linspace(0, group.size - 1, SAMPLES).astype(int))]
 
 
+def _readable(source: ScanSource, rows: Frames) -> list[ReferenceFrame]:
+    """Those of some frames that the file gives; all, where it gives none."""
+    read = [_reference(source, int(row)) for row in rows]
+    return [reference for reference in read if reference.row not in source.unreadable] or read
+
+
 def _reference(source: ScanSource, row: int) -> ReferenceFrame:
-    image = source.read([row])[0]
+    image = read_known(source, [row])[0]
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
     about = row, FrameKind(int(source.image_key[row])), float(source.exposures[row])
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
         return ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
-    return ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)
+    seen = ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)
+    return seen if image.dtype.kind in "ui" else replace(seen, rounding=0.0)  # transmission: flats of 1, darks of 0

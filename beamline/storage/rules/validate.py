@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.storage import hdf5
+from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.parts import is_joined, joined_file_of, other_parts
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.finding import Finding
 from beamline.storage.rules.flags import frames_flagged
@@ -26,15 +27,23 @@ from beamline.storage.rules.volume import volume_findings
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writers.partial_volume import completion_cut_short
 from drivers.base.frame import FrameKind
-from recon.base.units import look_like_counts, look_like_degrees
+from recon.base.units import look_like_counts, look_like_degrees, look_like_transmission
 
 __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
 _FARTHEST = 1e6  # degrees
+_GAP = 0.5  # degrees without a view beyond the others, of views in even steps
+_SAME = 0.1  # of the mean step: views so close are one
+_FALSE_ALARM = 1e-3  # of scans whose views are at random
+_OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 
 SAMPLES = 4  # frames of a kind that are looked at
+SHAPES = 32  # views whose shape is looked at
+TURNED = 12  # views by which the direction of the axis is told
+_LEAST = 8  # views, rows and columns: fewer tell nothing of it
+_HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 
 
@@ -103,6 +112,10 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
     if unreadable:
         said = f"{count(len(unreadable), 'frame')} cannot be read: {spans(unreadable)}. {why} Look for a good copy."
         yield Finding("error", "unreadable", said)
+    elif progress is None and source.unreadable:
+        which = f"{count(len(source.unreadable), 'frame')} cannot be read: {spans(sorted(source.unreadable))}."
+        said = f"{which} {next(iter(source.unreadable.values()))} `beamline recon` leaves such frames out."
+        yield Finding("warning", "unreadable", f"{said} `validate --deep` reads all frames.")
     if source.damaged:
         yield Finding(
             "error",
@@ -180,12 +193,36 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angle-spread",
             f"{angles.size} projections span only {span:.3f} degrees: are these radians under a label of degrees?",
         )
-    elif span + step < 179.5:
+    elif (unseen := half_turn_unseen(angles)) > 0:
+        said = f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
+            f"The projections {said} (limited angle): {unseen:.4g} of 180 degrees have no view.",
         )
+
+
+def half_turn_unseen(angles: NDArray[np.float64]) -> float:
+    """Degrees of half a turn in one piece without a view, beyond what the spacing of views [view] in rad explains.
+
+    Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
+    distributed length, whose mean is that of all gaps (Rényi 1953): of a thousandth (of ten views: a hundredth) by more
+    than is allowed for. Views in
+    even steps have gaps alike, and half a degree more is told.
+    """
+    places = np.sort(np.mod(np.degrees(angles), 180.0))
+    gaps = np.diff(places, append=places[0] + 180.0)
+    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # views side by side are one
+    if gaps.size < 2:
+        return 180.0
+    *others, second, largest = np.sort(gaps)
+    uneven = float(np.std([*others, second])) / _OF_MEAN
+    n = len(others) + 1
+    times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
+    limit = second + max(_GAP, times * uneven)
+    if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
+        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
+    return float(largest) if largest > limit else 0.0
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:
@@ -196,7 +233,8 @@ def quantity_said(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "quantity",
-            f"{said} whether pixels are counts or line integrals: say --quantity counts or --quantity line-integrals.",
+            f"{said} whether pixels are counts, transmission or line integrals: say --quantity counts, transmission "
+            "or line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
         )
 
 
@@ -209,7 +247,8 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
             yield Finding(
                 "error",
                 "references",
-                f"Counts without {name}: give --{name} FILE (or a folder), or --quantity line-integrals if they are.",
+                f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
+                "say --quantity transmission, or line-integrals where their logarithm was taken.",
             )
 
 
@@ -258,6 +297,67 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
             "If so, say --quantity counts, with darks and flats.",
         )
+    elif source.quantity == "line_integrals" and source.emission is None and _falls(source):
+        yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
+    elif source.quantity == "counts" and _rises(source):
+        yield Finding("error", "quantity", _RISES)
+
+
+def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
+    """Counts beyond the end of a signed type are read without its sign."""
+    if wrapped := source.attributes.get("pixels"):
+        yield Finding("warning", "pixels", f"The file's label is wrong: counts are {wrapped}.")
+
+
+def axis_vertical(source: ScanSource) -> Iterator[Finding]:
+    """The rotation axis lies along the columns: each row then holds the same matter in every view of a sample."""
+    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    if source.emission is not None or source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
+        return
+    ratio = change_of_rows(_depths(source, views[np.unique(np.linspace(0, views.size - 1, TURNED).astype(int))]))
+    if ratio > _HORIZONTAL:
+        yield Finding(
+            "warning",
+            "axis",
+            f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
+            "the rotation axis were horizontal; it is expected along the columns. If it is, say --horizontal-axis.",
+        )
+
+
+def change_of_rows(depths: NDArray[np.float64]) -> float:
+    """How much the sums of rows of [view, row, col] change from view to view, over what those of columns do; squared.
+
+    About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
+    are. What a drifting beam does to rows is in their ends, too: a parabola over the rows is taken off.
+    """
+    change = depths - depths.mean(axis=0)
+    ends = max(1, depths.shape[2] // 16)
+    beside = np.median(np.concatenate([change[..., :ends], change[..., -ends:]], axis=2), axis=2)
+    heights = np.polynomial.legendre.legvander(np.linspace(-1, 1, depths.shape[1]), 2)
+    change = change - (beside @ np.linalg.pinv(heights).T @ heights.T)[..., None]
+    of_rows, of_cols = (float(change.sum(axis=axis).var(axis=0).sum()) for axis in (2, 1))
+    rounding = 1e-20 * float((np.abs(depths).sum(axis=2) ** 2).sum())
+    return of_rows / max(of_cols, rounding) if of_rows > rounding else 0.0
+
+
+def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Line integrals of some views [view, row, col], coarse, but for what all views share."""
+    block = max(1, min(max(source.shape) // 128, min(source.shape) // _LEAST))
+    rows, cols = (n // block for n in source.shape)
+    darks = np.flatnonzero(source.image_key == FrameKind.DARK)[:1]
+    dark = read_known(source, darks)[0].astype(np.float64) if darks.size and source.quantity == "counts" else 0.0
+    found = []
+    for view in views.tolist():
+        image = read_known(source, [view])[0].astype(np.float64)
+        if view in source.unreadable or not np.isfinite(image).all():
+            continue
+        image = image if source.quantity == "line_integrals" else image - dark
+        coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
+        found.append(coarse)
+    depths = np.array(found).reshape(-1, rows, cols)
+    if source.quantity == "line_integrals" or not len(depths):
+        return depths
+    return -np.log(np.maximum(depths, 1e-3 * np.max(depths)))
 
 
 def series_complete(source: ScanSource) -> Iterator[Finding]:
@@ -298,20 +398,51 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     references_present,
     exposures_agree,
     pixels_measured,
+    pixels_as_labelled,
+    axis_vertical,
     series_complete,
     scale_known,
     parts_joined,
 )
 
 
-def _sample(source: ScanSource, kind: FrameKind) -> NDArray[Any] | None:
+_FALLS = (
+    "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
+    "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
+)
+_RISES = (
+    "The frames are divided by flats of 1, but they are 0 at the edges of the views and rise where the sample is, as "
+    "line integrals do; transmission is 1 there and falls. Say --quantity line-integrals, without --darks and --flats."
+)
+
+
+def _falls(source: ScanSource) -> bool:
+    """The views look like transmission, which real numbers can be."""
+    views = _sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
+    return views is not None and look_like_transmission(views)
+
+
+def _rises(source: ScanSource) -> bool:
+    """The views look like line integrals, though they are to be divided by a beam of about 1."""
+    flats = _sample(source, FrameKind.FLAT) if source.dtype.kind == "f" else None
+    if flats is None or not 0.5 < np.nanmedian(flats) < 2:
+        return False
+    views = _sample(source, FrameKind.PROJECTION, SHAPES)
+    return views is not None and look_like_transmission(np.exp(-np.maximum(views, -1)))
+
+
+def _sample(source: ScanSource, kind: FrameKind, count: int = SAMPLES) -> NDArray[Any] | None:
     """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
     rows = np.flatnonzero(source.image_key == kind)
     if rows.size == 0:
         return None
-    chosen = np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))
+    chosen = np.unique(np.linspace(0, rows.size - 1, count).astype(int))
     middle = source.shape[0] // 2
-    return source.read(rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    images = read_known(source, rows[chosen], slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    known = ~np.isin(rows[chosen], sorted(source.unreadable))
+    if not known.any():
+        raise UnreadableError(next(iter(source.unreadable.values())))
+    return images[known]
 
 
 def _as_hdf5(path: Path) -> list[Finding]:

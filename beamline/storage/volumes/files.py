@@ -8,13 +8,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from beamline.core.errors import DataError
 from beamline.core.files import bring_to_disk, whole_file
 from beamline.storage import hdf5
 from beamline.storage.foreign_zarr import is_zarr, open_zarr
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
-from beamline.storage.volume_file import SUFFIXES, read_volume
+from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.base import Pixels, Slices, VolumeFormat, bare_record, checksum
 from beamline.storage.volumes.nxtomoproc import NXtomoproc
 from beamline.storage.volumes.plain import Npy
@@ -88,6 +91,22 @@ def volume_format(path: Path) -> VolumeFormat | None:
     return found
 
 
+def whole_volume(
+    path: Path, dataset: str | None = None
+) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
+    """As `read_volume`, also of every format that this program writes, with the voxel that it states.
+
+    Raises:
+        DataError: as `opened_volume`.
+    """
+    kind = None if dataset is not None else volume_format(path)
+    if kind is None or isinstance(kind, NXtomoproc | Npy):
+        return read_volume(path, dataset)
+    with kind.open(path) as record:
+        values = np.asarray(record.volume.data[: record.volume.grid.shape[0]])
+        return values, record.volume.grid.spacing if record.length_unit == "mm" else None
+
+
 def times_of(path: Path) -> tuple[float, ...]:
     """When each of several volumes in time was, s from the first view on; empty where a file holds no such series."""
     if not NXtomoproc().holds(path):
@@ -120,8 +139,6 @@ def opened_volume(path: Path, dataset: str | None = None, at: int | None = None)
     if is_zarr(path):
         yield bare_record(path, *open_zarr(path, dataset))
         return
-    if path.is_dir():
-        raise DataError(f"{path} is a folder, and not one of slices that this program wrote; expected {SUFFIXES}.")
     values, spacing = read_volume(path, dataset)
     if values.ndim != 3 or values.dtype.kind not in "uifb":
         raise DataError(f"{path} holds {values.dtype} of shape {values.shape}; expected real numbers [z, y, x].")

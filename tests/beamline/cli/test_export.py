@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -61,7 +63,7 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
         (["-o", "v.png"], 2, "'.png' is not known"),
         (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
         (["-o", "no/v.tif"], 5, "does not exist"),
-        (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of the middle slice lie in"),
+        (["-o", "g.tif", "--bits", "8"], 2, "99.8 % of the values of"),
         (["-o", "g.tif", "--window", "0:1"], 2, "give --bits 8"),
         (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
         (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "no window"),
@@ -74,6 +76,46 @@ def test_refused_with_one_sentence_and_nothing_left(volume: Path, options: list[
     assert result.exit_code == code, result.output
     assert said in result.stderr and result.stdout == ""
     assert left(volume) == before
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ([], "Every value of the slices looked at is 0: there is no window"),
+        ([((3, 4, 5), 2.5)], "lie in 0:2.5. "),
+        ([(0, 1.5)], "lie in 0:1.5. "),
+        ([(..., 1.0), ((..., slice(0, 3)), 1e-6)], "lie in 1:1.000001. "),
+        ([(..., np.nan)], "No value of the slices looked at is finite"),
+    ],
+)
+def test_a_window_is_proposed_that_can_be_given(folder: Path, values: list[Any], said: str) -> None:
+    data = np.zeros((9, 40, 40), np.float32)
+    for where, value in values:
+        data[where] += np.float32(value)
+    np.save(folder / "v.npy", data)
+    result = beamline("export", "v.npy", "-o", "g.tif", "--bits", "16")
+    assert result.exit_code == 2 and said in result.stderr
+    if (window := re.search(r"lie in (\S+)\. ", result.stderr)) is not None:
+        assert beamline("export", "v.npy", "-o", "g.tif", "--bits", "16", "--window", window[1]).exit_code == 0
+        assert np.ptp(tifffile.imread(folder / "g.tif")) > 30_000
+
+
+def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None:
+    data = np.random.default_rng(2).random((12, 8, 9)).astype(np.float32)
+    (folder / "slices").mkdir()
+    for z, values in enumerate(data):
+        tifffile.imwrite(folder / f"slices/rec_{z}.tif", values)  # 9 before 10, as numbers
+    (folder / "slices/._rec_0.tif").write_bytes(b"\0\5\26\7")
+    assert beamline("export", "slices", "-o", "v.npy").exit_code == 0
+    np.testing.assert_array_equal(np.load(folder / "v.npy"), data)
+    tifffile.imwrite(folder / "slices/rec_12.tif", data[0, :4])
+    assert (
+        "rec_12.tif is float32 (4, 9); expected slices [y, x] alike"
+        in beamline("export", "slices", "-o", "w.npy").stderr
+    )
+    (folder / "empty").mkdir()
+    assert "empty is a folder without TIFF slices" in beamline("export", "empty", "-o", "w.npy").stderr
+    assert "There is no volume none" in beamline("export", "none", "-o", "w.npy").stderr
 
 
 def test_what_is_no_volume_is_refused(volume: Path) -> None:

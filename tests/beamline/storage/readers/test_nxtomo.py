@@ -188,7 +188,7 @@ def test_several_entries_need_a_default(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.copy("entry0000", "entry0001")
         file["entry0001/sample/rotation_angle"][...] = 7
-    with pytest.raises(DataError, match="several tomography entries"):
+    with pytest.raises(DataError, match="several detectors with frames"):
         open_scan(path)
     with h5py.File(path, "r+") as file:
         file.attrs["default"] = "entry0001"
@@ -206,7 +206,7 @@ def test_frames_in_a_linked_file_that_is_gone(tmp_path: Path) -> None:
     with open_scan(path) as source:
         assert source.read([5])[0, -1, -1] == 119
     (tmp_path / "pixels.h5").unlink()
-    with pytest.raises(DataError, match=r"pixels\.h5:data is not there"):
+    with pytest.raises(DataError, match=r"is a link to pixels\.h5::data, which is not there"):
         open_scan(path)
 
 

@@ -11,9 +11,9 @@ import pytest
 import tifffile
 
 from beamline.core.errors import DataError
+from beamline.storage.readers.image_names import kind_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.tiff import load_images
-from beamline.storage.readers.tiff_series import kind_of
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)
@@ -71,7 +71,8 @@ def test_a_folder_or_zip_explains_itself_by_names(series: tuple[Path, np.ndarray
         ("flats/0001.tif", FrameKind.FLAT),
         ("white-0001.tif", FrameKind.FLAT),
         ("open_beam_1.tif", FrameKind.FLAT),
-        ("darkroom/x_flat.tif", FrameKind.DARK),
+        ("darkroom/x_flat.tif", FrameKind.FLAT),
+        ("dark_chocolate/flat_1.tif", FrameKind.FLAT),
         ("inflated_0001.tif", FrameKind.PROJECTION),
     ],
 )
@@ -217,7 +218,7 @@ def test_pages_appended_one_at_a_time_are_one_stack(
         assert (source.shape, source.dtype, source.image_key.size) == (SHAPE, np.float32, 7)
         np.testing.assert_array_equal(source.read(slice(None)), stack)
         np.testing.assert_array_equal(source.read([6, 3], slice(1, 4)), stack[[6, 3], 1:4])
-    np.testing.assert_array_equal(load_images(tmp_path / "s.tif"), stack)
+    np.testing.assert_array_equal(load_images(tmp_path / "s.tif", FrameKind.FLAT), stack)
 
 
 def test_pages_of_different_shapes_are_refused(tmp_path: Path) -> None:

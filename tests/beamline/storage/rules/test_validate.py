@@ -11,11 +11,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import source_findings, validate
+from beamline.storage.rules.validate import change_of_rows, half_turn_unseen, source_findings, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal
@@ -316,3 +318,77 @@ def test_real_scans_can_be_reconstructed(shared_data: Path) -> None:
         with open_scan(SourceOptions(shared_data / name, **how)) as source:  # type: ignore[arg-type]
             assert all(found.severity != "error" for found in source_findings(source)), name
             assert int((source.image_key == FrameKind.PROJECTION).sum()) >= 91
+
+
+@pytest.mark.parametrize("views", [12, 45, 180, 721])
+def test_uneven_angles_over_half_a_turn_are_no_limited_angle(views: int) -> None:
+    rng, even = np.random.default_rng(views), np.arange(views)
+    whole = {
+        "half a turn": np.linspace(0, 180, views),
+        "a turn": np.linspace(0, 360, views, endpoint=False),
+        "golden": (even * 111.246) % 180,
+        "golden over a turn": (even * 137.508) % 360,
+        "denser at one end": 180 * np.linspace(0, 1, views) ** 1.3,
+        "with jitter": np.linspace(0, 180, views) + rng.normal(0, 0.02, views),
+        "some twice": np.repeat(np.linspace(0, 180, views), 2),
+        "from -90": np.linspace(-90, 90, views, endpoint=False),
+    }
+    for name, degrees in whole.items():
+        assert half_turn_unseen(np.radians(degrees)) == 0, name
+    for lost in (40, 60, 90):
+        kept = np.linspace(0, 180 - lost, views)
+        for degrees in (kept, kept + 70, np.where(kept > 40, kept + lost, kept), np.where(kept > 40, kept + 180, kept)):
+            step = (180 - lost) / (views - 1)
+            assert half_turn_unseen(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
+
+
+def test_angles_at_random_are_rarely_a_limited_angle() -> None:
+    rng = np.random.default_rng(5)
+    for views in (30, 60, 200):
+        alarms = sum(half_turn_unseen(rng.uniform(0, np.pi, views)) > 0 for _ in range(400))
+        assert alarms <= 4  # a thousandth is asked: more than 4 of 400 have a chance of 1 in 16 000
+
+
+def _lopsided(views: int, rows: int, cols: int) -> np.ndarray:
+    """Line integrals [view, row, col] of a slanting rod that goes round, 0 at the ends of each row."""
+    theta = np.linspace(0, np.pi, views, endpoint=False)[:, None, None]
+    height = np.linspace(-1, 1, rows)[None, :, None]
+    u = np.linspace(-1, 1, cols)[None, None] - 0.5 * height * np.cos(theta) - 0.15 * np.sin(theta)
+    return (np.exp(-((u / 0.2) ** 2)) * (1.2 + height)).astype(np.float64)
+
+
+@settings(deadline=None, max_examples=30)
+@given(rows=st.integers(12, 60), cols=st.integers(24, 90), noise=st.floats(0, 0.1), drift=st.floats(0, 0.2))
+def test_a_horizontal_axis_is_told_and_a_vertical_one_never(rows: int, cols: int, noise: float, drift: float) -> None:
+    rng = np.random.default_rng(rows)
+    lines, even = _lopsided(12, rows, cols), np.ones((12, rows, cols))
+    for sample in (lines, 0 * lines, even * lines[:1].mean(axis=0)):  # also none, and one that is round
+        beam = drift * rng.standard_normal((12, 1, 1)) + drift * np.linspace(-1, 1, rows)[:, None] * even
+        assert change_of_rows(sample + beam + noise * rng.standard_normal(lines.shape)) < 10
+    turned = np.rot90(lines, axes=(1, 2))
+    if noise < 0.02:
+        assert change_of_rows(turned + noise * rng.standard_normal(turned.shape)) > 10
+
+
+@pytest.mark.parametrize("quantity", ["counts", "line_integrals"])
+def test_a_scan_with_a_horizontal_axis_is_named_and_read(tmp_path: Path, quantity: str) -> None:
+    lines, path = _lopsided(24, 20, 40), tmp_path / "s.h5"
+    frames = (100 + 2e4 * np.exp(-lines)).astype(np.uint16) if quantity == "counts" else lines.astype(np.float32)
+    turned = np.rot90(frames, k=-1, axes=(1, 2))
+    with h5py.File(path, "w") as file:
+        file["exchange/data"], file["exchange/theta"] = turned, np.linspace(0, 180, 24, endpoint=False)
+        if quantity == "counts":
+            file["exchange/data_dark"] = np.full((2, 40, 20), 100, np.uint16)
+            file["exchange/data_white"] = np.full((2, 40, 20), 20100, np.uint16)
+    stated = SourceOptions(path, quantity=quantity)  # type: ignore[arg-type]
+    assert [f.rule for f in validate(stated) if "say --horizontal-axis" in f.message] == ["axis"]
+    upright = replace(stated, horizontal_axis=True)
+    assert not [f for f in validate(upright) if f.rule == "axis"]
+    with open_scan(upright) as source:
+        views = np.flatnonzero(source.image_key == 0)
+        assert source.shape == (20, 40)
+        np.testing.assert_array_equal(source.read(views, slice(3, 9)), frames[:, 3:9])
+        if quantity == "counts":
+            np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], frames[-1])
+    with open_scan(replace(upright, cols=(5, 30))) as source:
+        np.testing.assert_array_equal(source.read(views[:2], slice(2, 4)), frames[:2, 2:4, 5:30])

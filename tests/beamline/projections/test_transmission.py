@@ -1,0 +1,92 @@
+"""Frames that others divided by their flats: transmission by its name, by flats of 1, and never as line integrals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.core.errors import DataError
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.validate import validate
+from tests.beamline.scans import TwoCylinders
+
+SCAN = TwoCylinders()
+LINES = SCAN.line_integrals()
+SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
+FACTS: dict[str, Any] = {"angles": SCAN.angles}
+
+
+def stack(path: Path, values: np.ndarray, dtype: Any = np.float32) -> Path:
+    tifffile.imwrite(path, values.astype(dtype), photometric="minisblack")
+    return path
+
+
+def lines(path: Path, **facts: Any) -> np.ndarray:
+    with open_scan(SourceOptions(path, **FACTS, **facts)) as source:
+        return prepare_projections(source, SELECTION, lambda _: None).projections.data
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_it_becomes_line_integrals_by_name_and_by_flats_of_one(
+    tmp_path: Path, noise: float, rng: np.random.Generator
+) -> None:
+    path = stack(tmp_path / "t.tif", np.exp(-LINES) + noise * rng.standard_normal(LINES.shape))
+    named = lines(path, quantity="transmission")
+    np.testing.assert_allclose(named, LINES, atol=12 * noise + 1e-5)
+    shape = (1, *SCAN.shape)
+    np.testing.assert_array_equal(lines(path, darks=np.zeros(shape), flats=np.ones(shape)), named)
+
+
+def test_whole_numbers_have_a_flat_of_their_own(tmp_path: Path) -> None:
+    path, shape = stack(tmp_path / "t.tif", 6e4 * np.exp(-LINES), np.uint16), (1, *SCAN.shape)
+    flats = np.full(shape, 60000, np.uint16)
+    np.testing.assert_allclose(lines(path, darks=np.zeros(shape, np.uint16), flats=flats), LINES, atol=1e-4)
+    with pytest.raises(DataError, match="uint16 pixels; transmission is a real number from 0 to 1"):
+        lines(path, quantity="transmission")
+
+
+@pytest.mark.parametrize("beam", [0.95, 1.0, 1.08])
+def test_it_is_never_taken_as_line_integrals(tmp_path: Path, beam: float) -> None:
+    path = stack(tmp_path / "t.tif", beam * np.exp(-LINES))
+    for quantity in ("line_integrals", None):
+        with pytest.raises(DataError, match=r"fall where the sample is.* Say --quantity transmission"):
+            lines(path, quantity=quantity)
+    assert "Say --quantity transmission" in validate(SourceOptions(path, **FACTS, quantity="line_integrals"))[0].message
+
+
+def test_line_integrals_are_never_taken_as_transmission(tmp_path: Path) -> None:
+    path, shape = stack(tmp_path / "p.tif", LINES), (1, *SCAN.shape)
+    np.testing.assert_array_equal(lines(path, quantity="line_integrals"), LINES.astype(np.float32))
+    for facts in ({"quantity": "transmission"}, {"darks": np.zeros(shape), "flats": np.ones(shape)}):
+        with pytest.raises(DataError, match=r"0 at the edges.* Say --quantity line-integrals"):
+            lines(path, **facts)
+
+
+def test_references_beside_it_are_refused(tmp_path: Path) -> None:
+    path = stack(tmp_path / "t.tif", np.exp(-LINES))
+    with pytest.raises(DataError, match="leave out --darks and --flats"):
+        open_scan(SourceOptions(path, quantity="transmission", flats=np.ones((1, *SCAN.shape))))
+
+
+@pytest.mark.parametrize("kind", ["exchange", "nxtomo"])
+def test_files_of_other_systems_state_it_likewise(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "t.h5"
+    with h5py.File(path, "w") as file:
+        if kind == "exchange":
+            file["exchange/data"], file["exchange/theta"] = np.exp(-LINES).astype(np.float32), np.degrees(SCAN.angles)
+        else:
+            detector = file.create_group("entry/instrument/detector")
+            detector["data"], detector["image_key"] = np.exp(-LINES).astype(np.float32), np.zeros(len(LINES), int)
+            file["entry/sample/rotation_angle"] = np.degrees(SCAN.angles)
+            file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+    with open_scan(SourceOptions(path, quantity="transmission")) as source:
+        prepared = prepare_projections(source, SELECTION, lambda _: None)
+    np.testing.assert_allclose(prepared.projections.data, LINES, atol=1e-5)

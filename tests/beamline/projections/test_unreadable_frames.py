@@ -1,0 +1,118 @@
+"""A frame that a file does not give is left out and named, in views and references, whatever the format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from beamline.core.errors import DataError
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.selection import Selection
+from beamline.projections.steps.air import Air
+from beamline.projections.steps.flags import Flags
+from beamline.storage.ingest import ingest
+from beamline.storage.readers.base import read_known
+from beamline.storage.readers.open import SourceOptions
+from beamline.storage.rules.validate import validate
+from drivers.base.frame import FrameKind
+from tests.beamline.scans import BEAM, DARK, TwoCylinders
+
+SCAN = TwoCylinders()
+FRAMES = np.concatenate(
+    [
+        np.full((3, *SCAN.shape), DARK, np.uint16),
+        np.full((3, *SCAN.shape), DARK + BEAM, np.uint16),
+        SCAN.counts(),
+    ]
+)
+KEYS = np.repeat([2, 1, 0], [3, 3, len(SCAN.angles)])
+SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
+
+
+def nxtomo(folder: Path, spoilt: list[int]) -> SourceOptions:
+    path = folder / "s.nx"
+    with h5py.File(path, "w") as file:
+        detector = file.create_group("entry/instrument/detector")
+        data = detector.create_dataset("data", data=FRAMES, chunks=(1, *SCAN.shape), fletcher32=True)
+        detector["image_key"] = KEYS
+        file["entry/sample/rotation_angle"] = np.degrees(np.concatenate([np.zeros(6), SCAN.angles]))
+        file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+        places = [data.id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in spoilt]
+    _spoil(path, places)
+    return SourceOptions(path)
+
+
+def exchange(folder: Path, spoilt: list[int]) -> SourceOptions:
+    path, places = folder / "s.h5", []
+    with h5py.File(path, "w") as file:
+        for name, first, end in (("data_dark", 0, 3), ("data_white", 3, 6), ("data", 6, len(FRAMES))):
+            data = file.create_dataset(
+                f"exchange/{name}", data=FRAMES[first:end], chunks=(1, *SCAN.shape), fletcher32=True
+            )
+            of = [row - first for row in spoilt if first <= row < end]
+            places += [data.id.get_chunk_info_by_coord((row, 0, 0)).byte_offset for row in of]
+        file["exchange/theta"] = np.degrees(SCAN.angles)
+    _spoil(path, places)
+    return SourceOptions(path)
+
+
+def series(folder: Path, spoilt: list[int]) -> SourceOptions:
+    path = folder / "s"
+    path.mkdir()
+    for i, (frame, key) in enumerate(zip(FRAMES, KEYS, strict=True)):
+        name = {2: "dark", 1: "flat", 0: "view"}[int(key)]
+        tifffile.imwrite(path / f"{name}_{i:03d}.tif", frame)
+        if i in spoilt:
+            (path / f"{name}_{i:03d}.tif").write_bytes(b"II*\0 no more")
+    return SourceOptions(path, angles=SCAN.angles)
+
+
+def _spoil(path: Path, places: list[int]) -> None:
+    with path.open("r+b") as file:
+        for place in places:
+            file.seek(place)
+            file.write(b"\xaa" * 16)
+
+
+@pytest.mark.parametrize("write", [nxtomo, exchange, series])
+@pytest.mark.parametrize("flags", ["use", "ignore"])
+def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
+    tmp_path: Path, write: object, flags: str
+) -> None:
+    spoilt = [1, 4, 9, 20, 21]
+    scan: SourceOptions = write(tmp_path, spoilt)  # type: ignore[operator]
+    told: list[str] = []
+    with scan.open() as source:
+        prepared = prepare_projections(source, SELECTION.having(Flags(flags)), told.append)
+    views = np.setdiff1d(np.arange(6, len(FRAMES)), spoilt)
+    assert prepared.projections.view_ids.tolist() == views.tolist()
+    np.testing.assert_allclose(prepared.projections.data, SCAN.line_integrals()[views - 6], atol=1e-3)
+    said = " ".join(told)
+    assert "frames cannot be read: 9, 20-21, left out." in said and "1, 4, left out." in said
+    with pytest.raises(DataError, match="cannot be read"):
+        ingest(scan, tmp_path / "copy.h5")
+    assert not (tmp_path / "copy.h5").exists()
+    findings = validate(scan, lambda n, of: None)
+    assert any(finding.rule == "unreadable" and "9, 20-21" in finding.message for finding in findings)
+
+
+@pytest.mark.parametrize("write", [nxtomo, exchange])
+def test_a_scan_whose_frames_all_cannot_be_read_is_refused_with_the_reason(tmp_path: Path, write: object) -> None:
+    scan: SourceOptions = write(tmp_path, list(range(6, len(FRAMES))))  # type: ignore[operator]
+    with scan.open() as source, pytest.raises(DataError, match=r"Frame \d+ of .*cannot be read"):
+        prepare_projections(source, SELECTION, lambda _: None)
+
+
+def test_what_is_read_of_them(tmp_path: Path) -> None:
+    with nxtomo(tmp_path, [7]).open() as source:
+        with pytest.raises(DataError, match="cannot be read"):
+            source.read([6, 7])
+        found = read_known(source, [8, 7, 6], slice(1, 3))
+        np.testing.assert_array_equal(found[[0, 2]], FRAMES[[8, 6], 1:3])
+        assert not found[1].any() and list(source.unreadable) == [7]
+        kinds = [frame.kind for frame in source.frames()]
+        assert kinds[7] is FrameKind.INVALID and kinds[8] is FrameKind.PROJECTION

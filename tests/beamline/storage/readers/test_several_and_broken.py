@@ -1,0 +1,143 @@
+"""Several detectors in a file, links that lead nowhere, and locked files: read by a name, or told by their cause."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from beamline.core.errors import DataError
+from beamline.storage import hdf5
+from beamline.storage.readers.open import SourceOptions, open_scan
+
+N, SHAPE = 5, (4, 6)
+KEYS = np.array([2, 1, 0, 0, 0])
+ANGLES = np.array([0, 0, 0, 60, 120.0])
+
+
+def frames(of: int) -> np.ndarray:
+    return np.full((N, *SHAPE), 100 * of, np.uint16) + np.arange(N, dtype=np.uint16)[:, None, None]
+
+
+def two_detectors(path: Path) -> Path:
+    with h5py.File(path, "w") as file:
+        for k in (1, 2):
+            detector = file.create_group(f"entry/instrument/camera{k}")
+            detector["data"], detector["image_key"] = frames(k), KEYS
+            file[f"entry/plot{k}/data"] = h5py.SoftLink(f"/entry/instrument/camera{k}/data")
+        file["entry/sample/rotation_angle"] = ANGLES
+        file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+    return path
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_one_of_two_detectors_is_named_by_a_path_or_by_the_file(tmp_path: Path, k: int) -> None:
+    path = two_detectors(tmp_path / "s.nx")
+    with pytest.raises(
+        DataError, match=r"several detectors.*camera1/data \(5 x 4 x 6\).*Say which: --data-path /entry"
+    ):
+        open_scan(path)
+    for named in (f"/entry/instrument/camera{k}/data", f"entry/plot{k}/data"):
+        with open_scan(SourceOptions(path, data_path=named)) as source:
+            assert source.image_key.tolist() == KEYS.tolist() and source.quantity == "counts"
+            np.testing.assert_array_equal(source.read(slice(None)), frames(k))
+            np.testing.assert_allclose(np.degrees(source.angles), ANGLES)
+    with h5py.File(path, "r+") as file:
+        file.attrs["default"], file["entry"].attrs["default"] = "entry", f"plot{k}"
+        file[f"entry/plot{k}"].attrs["signal"] = "data"
+    with open_scan(path) as source:
+        np.testing.assert_array_equal(source.read(slice(None)), frames(k))
+
+
+def _exchange(file: h5py.File) -> None:
+    file["exchange/data"], file["exchange/theta"] = frames(1)[2:], ANGLES[2:]
+
+
+def _broken(path: Path, where: str, link: object) -> Path:
+    with h5py.File(path, "w") as file:
+        if where.startswith("exchange"):
+            _exchange(file)
+        else:
+            detector = file.create_group("entry/instrument/detector")
+            detector["data"], detector["image_key"] = frames(1), KEYS
+            file["entry/sample/rotation_angle"] = ANGLES
+            file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+        if where in file:
+            del file[where]
+        file[where] = link
+    return path
+
+
+@pytest.mark.parametrize(
+    ("link", "to"),
+    [
+        (h5py.ExternalLink("gone.h5", "/raw/data"), r"gone\.h5::/raw/data"),
+        (h5py.SoftLink("/nowhere"), "/nowhere"),
+    ],
+)
+@pytest.mark.parametrize(
+    "where",
+    [
+        "exchange/data", "exchange/data_dark", "exchange/data_white", "exchange/theta",
+        "entry/instrument/detector/data", "entry/instrument/detector/image_key",
+    ],
+)  # fmt: skip
+def test_a_link_that_leads_nowhere_is_named(tmp_path: Path, where: str, link: object, to: str) -> None:
+    path = _broken(tmp_path / "s.h5", where, link)
+    with pytest.raises(DataError, match=rf"/{where} is a link to {to}, which is not there\. Put the linked file back"):
+        open_scan(path)
+
+
+def test_a_broken_link_to_angles_or_to_a_dataset_by_its_name_is_named(tmp_path: Path) -> None:
+    gone = h5py.ExternalLink("gone.h5", "/raw/data")
+    with open_scan(_broken(tmp_path / "a.h5", "entry/sample/rotation_angle", gone)) as source:
+        assert "is a link to gone.h5::/raw/data, which is not there" in str(source.attributes["angles"])
+    path = _broken(tmp_path / "b.h5", "exchange/other", gone)
+    for data in ("exchange/other", "exchange/other/below"):
+        with pytest.raises(DataError, match=r"/exchange/other is a link to gone\.h5::/raw/data, which is not there"):
+            open_scan(SourceOptions(path, data_path=data, angles=ANGLES))
+    with pytest.raises(DataError, match="has no dataset exchange/none"):
+        open_scan(SourceOptions(path, data_path="exchange/none", angles=ANGLES))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a program of its own holds the lock, with another message there")
+def test_a_file_that_another_program_writes_is_said_to_be_locked(tmp_path: Path) -> None:
+    path = two_detectors(tmp_path / "s.nx")
+    program = f"import h5py\nwith h5py.File({str(path)!r}, 'r+'):\n    print('open', flush=True)\n    input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "open\n"
+        with pytest.raises(DataError, match=r"is locked: another program has it open.*HDF5_USE_FILE_LOCKING=FALSE"):
+            open_scan(path)
+        other.communicate("\n")
+    open_scan(SourceOptions(path, data_path="/entry/instrument/camera1/data")).close()
+
+
+@pytest.mark.parametrize("number", [37, 38, 95])
+def test_a_disk_without_locks_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    path, real = two_detectors(tmp_path / "s.nx"), h5py.File
+
+    def without_locks(*args: object, locking: object = None, **rest: object) -> h5py.File:
+        if locking is not False:
+            raise OSError(
+                f"Unable to synchronously open file (unable to lock file, errno = {number}, error message = 'x')"
+            )
+        return real(*args, locking=locking, **rest)
+
+    monkeypatch.setattr(h5py, "File", without_locks)
+    with hdf5.open_hdf5(path) as file:
+        assert "entry" in file
+
+
+def test_fewer_angles_than_views_are_refused_without_advice_to_choose_among_them(tmp_path: Path) -> None:
+    path = tmp_path / "s.h5"
+    with h5py.File(path, "w") as file:
+        _exchange(file)
+    with pytest.raises(DataError, match=r"2 angles for 3 projections, so that 1 have none\. Is it cut off") as told:
+        open_scan(SourceOptions(path, angles=ANGLES[:2]))
+    assert "--angle-rows" not in str(told.value)

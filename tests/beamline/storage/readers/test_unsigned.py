@@ -1,0 +1,81 @@
+"""Counts beyond the end of a signed type are read without its sign; what is negative for another reason is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given
+from hypothesis import strategies as st
+
+from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.readers.reference_files import load_images
+from beamline.storage.readers.wrapped import has_wrapped
+from beamline.storage.rules.validate import validate
+from drivers.base.frame import FrameKind
+from tests.beamline.scans import TwoCylinders
+
+SCAN = TwoCylinders()
+
+
+@given(
+    beam=st.floats(33_500, 65_000),
+    noise=st.floats(0, 300),
+    seed=st.integers(0, 99),
+    sign=st.sampled_from([np.int16, ">i2"]),
+)
+def test_counts_that_wrapped_are_told_at_any_level_of_light(beam: float, noise: float, seed: int, sign: object) -> None:
+    rng = np.random.default_rng(seed)
+    views = beam * np.exp(-SCAN.line_integrals()[:6]) + noise * rng.standard_normal((6, *SCAN.shape))
+    counts = views.clip(0, 65535).astype(np.uint16)
+    assert has_wrapped(counts.astype(">u2").view(">i2").astype(sign))
+    flat = np.full((2, 4, 40), beam) + noise * rng.standard_normal((2, 4, 40))
+    if np.unique(flat.astype(np.uint16)).size > 1 and flat.max() < 65535:
+        assert has_wrapped(flat.astype(np.uint16).view(np.int16))
+
+
+@given(beam=st.floats(0, 32_000), noise=st.floats(0, 300), marked=st.sampled_from([None, -1, -32768]))
+def test_counts_that_fit_are_left_as_they_are(beam: float, noise: float, marked: int | None) -> None:
+    rng = np.random.default_rng(1)
+    views = (beam * np.exp(-SCAN.line_integrals()[:6]) + noise * rng.standard_normal((6, *SCAN.shape))).clip(-3e4, 3e4)
+    counts = views.astype(np.int16)
+    if marked is not None:
+        counts = np.maximum(counts, 0)
+        counts[:, 1, 10:20] = marked
+    assert not has_wrapped(counts)
+    assert not has_wrapped(counts.astype(np.int32)) and not has_wrapped(counts.astype(np.float32))
+
+
+@pytest.mark.parametrize("kind", ["tiff", "exchange", "nxtomo"])
+def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> None:
+    counts, path = SCAN.counts(40_000), tmp_path / "s.h5"
+    flats, darks = np.full((2, *SCAN.shape), 40_100, np.uint16), np.full((2, *SCAN.shape), 100, np.uint16)
+    flats[:, 0, 0] += 5
+    if kind == "tiff":
+        path = tmp_path / "s.tif"
+        tifffile.imwrite(path, counts.view(np.int16), photometric="minisblack")
+        tifffile.imwrite(tmp_path / "f.tif", flats.view(np.int16), photometric="minisblack")
+        options = SourceOptions(path, angles=SCAN.angles, darks=darks, flats=tmp_path / "f.tif")
+        np.testing.assert_array_equal(load_images(tmp_path / "f.tif", FrameKind.FLAT), flats)
+    else:
+        with h5py.File(path, "w") as file:
+            if kind == "exchange":
+                for name, images in (("data", counts), ("data_white", flats), ("data_dark", darks)):
+                    file[f"exchange/{name}"] = images.view(np.int16)
+                file["exchange/theta"] = np.degrees(SCAN.angles)
+            else:
+                detector = file.create_group("entry/instrument/detector")
+                detector["data"] = np.concatenate([darks, flats, counts]).view(np.int16)
+                detector["image_key"] = np.repeat([2, 1, 0], [2, 2, len(counts)])
+                file["entry/sample/rotation_angle"] = np.degrees(np.concatenate([np.zeros(4), SCAN.angles]))
+                file["entry/sample/rotation_angle"].attrs["units"] = "deg"
+        options = SourceOptions(path)
+    with open_scan(options) as source:
+        assert source.dtype == np.uint16 and source.quantity == "counts"
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 0)), counts)
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 1)), flats)
+        np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], counts[-1])
+    assert any("int16 that wrapped, read as uint16" in finding.message for finding in validate(options))
