@@ -53,6 +53,9 @@ class ScanSource(ABC):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
+        in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
+            they were taken.
+        numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
     """
 
     path: Path
@@ -69,6 +72,8 @@ class ScanSource(ABC):
     axis_col: float | None = None
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
+    in_order: bool = True
+    numbers: NDArray[np.int64] | None = None
 
     @property
     def row_period(self) -> float | None:

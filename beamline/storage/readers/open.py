@@ -9,7 +9,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
@@ -18,11 +17,10 @@ from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_table import Angles, load_angles, parse_angles, select_rows
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource
 from beamline.storage.readers.overlay import OverlaidSource
-from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff import load_images
 from beamline.storage.readers.tiff_series import TiffSeriesSource
 from beamline.storage.readers.wrapped import CroppedSource, PartsSource
-from drivers.base.frame import FrameKind
 from drivers.plugins import plugins
 
 __all__ = ["FORMATS", "NotReadyError", "Quantity", "ScanSource", "SourceOptions", "open_scan"]
@@ -60,8 +58,10 @@ class SourceOptions:
         path: HDF5 file (NXtomo, Diamond NeXus, Data Exchange), multi-page TIFF, folder or .zip of TIFFs, .txrm.
         quantity: of the pixels, if the file does not state it.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
-            projection, or one for each frame.
-        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
+            projection, one for each frame where the order of all frames is known, or one for each number of a series
+            of files, from its first to its last.
+        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) are those of the
+            projections.
         darks, flats: replace the file's; they come before its frames.
         data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
@@ -125,13 +125,12 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             if table is None:
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
-        if table is not None and isinstance(base, StacksSource):
-            _refuse_all_frames(base, table, angles_from)
         if any(given is not None for given in (table, darks, flats, options.quantity)):
             base = OverlaidSource(
                 base,
                 angles=table,
                 angles_from=angles_from,
+                of_views=options.angle_rows is not None,
                 darks=None if darks is None else load_images(darks),
                 flats=None if flats is None else load_images(flats),
                 quantity=options.quantity,
@@ -140,16 +139,6 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     except BaseException:
         base.close()
         raise
-
-
-def _refuse_all_frames(base: StacksSource, table: NDArray[np.float64], name: str) -> None:
-    """DataError for angles of all frames if the order of darks and flats is unknown."""
-    n = int((base.image_key == FrameKind.PROJECTION).sum())
-    if n < base.image_key.size == table.size:
-        raise DataError(
-            f"{name} has {table.size} angles, one for each frame, and {base.path} does not say when its darks and "
-            f"flats were taken. Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
-        )
 
 
 def _of_parts(earlier: Sequence[Path], last: ScanSource) -> ScanSource:

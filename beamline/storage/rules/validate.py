@@ -18,7 +18,7 @@ from beamline.storage import hdf5
 from beamline.storage.parts import is_joined, joined_file_of, other_parts
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.finding import Finding, Severity
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
@@ -33,6 +33,7 @@ __all__ = ["Finding", "scan_findings", "source_findings", "validate"]
 Progress = Callable[[int, int], None]  # Is told how many of how many frames are done
 
 _FARTHEST = 1e6  # degrees
+_FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 SAMPLES = 4  # frames of a kind that are looked at
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
@@ -148,7 +149,7 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
 
 
 def angles_spread(source: ScanSource) -> Iterator[Finding]:
-    """The projections look from different directions, over half a turn, and degrees were not taken for radians."""
+    """The projections look from different directions, over half a turn, and their angles can be degrees."""
     angles = source.angles[source.image_key == FrameKind.PROJECTION]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
@@ -161,24 +162,37 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
         )
         return
-    span = float(np.degrees(np.ptp(angles)))
-    distinct = np.unique(np.round(np.degrees(angles), 6))
+    degrees = np.degrees(angles)
+    span = float(np.ptp(degrees))
+    distinct = np.unique(np.round(degrees, 6))
     if distinct.size == 1:
         yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
         return
     step = span / (distinct.size - 1)
+    # A plan is of our own scans, whose angles are in degrees.
+    severity: Severity = "warning" if source.plan else "error"
+    between = float(np.median(np.abs(np.diff(degrees))))
     if look_like_degrees(angles):
         yield Finding(
-            "warning",
+            severity,
             "angle-spread",
-            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: are these "
-            "degrees under a label of radians? If so, give them with --angles FILE (degrees, one a line).",
+            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: these look "
+            "like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a line).",
         )
-    elif span < 2 * 3.3 and angles.size > 30:
+    elif between >= 360:
         yield Finding(
-            "warning",
+            severity,
             "angle-spread",
-            f"{angles.size} projections span only {span:.3f} degrees: are these radians under a label of degrees?",
+            f"The projections go from {degrees.min():.6g} to {degrees.max():.6g} degrees, {between:.4g} from one to "
+            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
+            "degrees with --angles FILE (one a line); if they are right, give them less whole turns.",
+        )
+    elif (unit := _smaller_unit(distinct, angles.size)) is not None:
+        yield Finding(
+            severity,
+            "angle-spread",
+            f"{angles.size} projections span only {span:.4g} degrees: {unit} Give them in degrees with --angles FILE "
+            "(one a line).",
         )
     elif span + step < 179.5:
         yield Finding(
@@ -186,6 +200,17 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angle-spread",
             f"The projections span {span:.2f} degrees: less than half a turn (limited angle).",
         )
+
+
+def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
+    """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
+    span = float(degrees[-1] - degrees[0])
+    whole = span + span / (degrees.size - 1)
+    for unit, turn in (("radians", 2 * np.pi), ("turns", 1.0)):
+        for part, name in ((turn / 2, "half a turn"), (turn, "a turn")):
+            if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
+                return f"these look like {unit}, of which {part:.5g} are {name}."
+    return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:
