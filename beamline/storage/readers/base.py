@@ -21,6 +21,15 @@ Attributes = Mapping[str, str | float | int]
 WHOLE = slice(None)
 
 
+class NotUsed(NamedTuple):
+    """A field that a file states and that is not used: where it is, its value, why or what to do, may it matter."""
+
+    where: str
+    value: str
+    why: str
+    doubt: bool
+
+
 class EmissionCounts(NamedTuple):
     """Float32 [view, row, col] each: what was counted, and survival and background as of `recon.Emission`."""
 
@@ -53,6 +62,7 @@ class ScanSource(ABC):
         axis_col: rotation axis in 0-based pixel-centre columns.
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
+        row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
             they were taken.
         numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
@@ -72,6 +82,7 @@ class ScanSource(ABC):
     axis_col: float | None = None
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
+    row_pitch_mm: float | None = None
     in_order: bool = True
     numbers: NDArray[np.int64] | None = None
 
@@ -89,6 +100,11 @@ class ScanSource(ABC):
     def attributes(self) -> Attributes:
         """Other facts of the file, for the record."""
         return self.facts
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        """What the file states of geometry, units, order and validity, and what is not used."""
+        return ()
 
     @property
     def flags(self) -> FrameFlags | None:

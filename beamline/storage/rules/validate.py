@@ -303,6 +303,38 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "pixel-size", f"A pixel size of {source.pixel_size_mm:g} mm cannot be.")
 
 
+def stated_used(source: ScanSource) -> Iterator[Finding]:
+    """What the file states is used, or named: as a warning where it may change the volume."""
+    for field in source.not_used:
+        message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
+        yield Finding("warning" if field.doubt else "info", "not-used", message)
+
+
+def pixels_square(source: ScanSource) -> Iterator[Finding]:
+    """Pixels are as high as wide, or each row is a slice of its own."""
+    width, height = source.pixel_size_mm, source.row_pitch_mm
+    if height is None:
+        return
+    if width is None or not 0.01 < height / width < 100:
+        said = "unknown" if width is None else f"{width:g} mm"
+        yield Finding(
+            "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {said}. That cannot be."
+        )
+    elif source.cone is not None:
+        yield Finding(
+            "error",
+            "pixel-height",
+            f"The pixels are {width:g} mm wide and {height:g} mm high, in a cone beam: square pixels are expected. Bin "
+            "the columns or the rows of a copy of the file.",
+        )
+    else:
+        yield Finding(
+            "info",
+            "pixel-height",
+            f"The pixels are {width:g} mm wide and {height:g} mm high: slices will be {height:g} mm apart.",
+        )
+
+
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """A part of a scan that was resumed is not all of it."""
     if source.part_starts.size > 1:
@@ -325,6 +357,8 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     pixels_measured,
     series_complete,
     scale_known,
+    pixels_square,
+    stated_used,
     parts_joined,
 )
 
