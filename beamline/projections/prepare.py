@@ -278,7 +278,25 @@ def assemble(
         shares=None if on_disk else shares_of(slice(None), slice(0, height)),
         measured=~unknown if unknown.any() else None,
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
+        stretch=_stretch(source, geometry),
     )
+
+
+def _stretch(source: ScanSource, geometry: Geometry) -> float:
+    """Height of the source's pixels over their width.
+
+    Raises:
+        DataError: they are not square, and rows show no slices.
+    """
+    if source.row_pitch_mm is None or source.pixel_size_mm is None:
+        return 1.0
+    if not geometry.rows_show_slices:
+        raise DataError(
+            f"{source.path}: pixels are {source.pixel_size_mm:g} mm wide and {source.row_pitch_mm:g} mm high; expected "
+            "square ones where views are moved along the axis, turned, or of a cone. Bin the columns or the rows of a "
+            "copy of the file."
+        )
+    return source.row_pitch_mm / source.pixel_size_mm
 
 
 def report_defects(projections: Projections, warn: Warn) -> None:

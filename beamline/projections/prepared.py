@@ -14,7 +14,7 @@ from beamline.projections.steps.step import StepDone
 from beamline.storage.flag_legend import FrameFlags
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
 from recon.voxels.emission import Emission
@@ -45,6 +45,7 @@ class PreparedProjections:
         shares_of: `shares` of some views and rows, where line integrals lie on disk and these are made when wanted;
             None: as `shares` says.
         emission: the counts behind these views; None: the sample does not emit.
+        stretch: height of a pixel over its width. `geometry` has square pixels; slices are this much farther apart.
     """
 
     projections: Projections
@@ -65,6 +66,15 @@ class PreparedProjections:
     held_out_ids: NDArray[np.int64] | None = None
     held_out_weights: NDArray[np.float32] | None = None
     emission: Emission | None = None
+    stretch: float = 1.0
+
+    def stretched(self, volume: Volume) -> Volume:
+        """A volume of `geometry` at the heights of its slices."""
+        if self.stretch == 1:
+            return volume
+        grid, (z, y, x) = volume.grid, volume.grid.centre
+        high = replace(grid, centre=(z * self.stretch, y, x), slice_pitch=grid.spacing[0] * self.stretch)
+        return Volume(volume.data, high)
 
     @property
     def kind(self) -> VoxelKind:

@@ -159,7 +159,7 @@ def _write(
     try:
         for (name, path), density in zip(outputs.items(), made.densities, strict=True):
             record = ReconRecord(
-                volume=Volume(density, made.grid),
+                volume=first.stretched(Volume(density, made.grid)),
                 length_unit=first.length_unit,
                 raw_file=paths[0],
                 title=f"volume fraction of {name}",

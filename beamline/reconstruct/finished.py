@@ -30,6 +30,7 @@ from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext, facts_of
 from beamline.reconstruct.progress import compilation_events, corrections_done, progress_events
 from beamline.reconstruct.region import RegionOfRows, locate
+from beamline.reconstruct.remarks import partly_seen_warning
 from beamline.reconstruct.result import write_result
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs, keeping
 from beamline.reconstruct.slabs import prepare_within
@@ -92,6 +93,8 @@ def reconstruct_file(
     if wanted is not None:  # before the work
         fit_truth(wanted, Grid.matching(prepared.geometry), selection.binning)
     announce(options, prepared, sink, clock)
+    if few := partly_seen_warning(prepared.geometry):
+        warn(few)
     region = None if options.region is None else locate(options.region, selection, prepared.geometry)
     with keeping(options.partial_path) if slabs else nullcontext():
         phases.enter("compiling kernels")

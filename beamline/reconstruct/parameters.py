@@ -11,6 +11,7 @@ import numpy as np
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.steps.registry import recorded
 from beamline.reconstruct.outcome import ReconOutcome, ReportContext
+from beamline.reconstruct.remarks import partly_seen
 from beamline.storage.writers.recon_file import Value
 from recon.prep.align import AxisEstimate
 
@@ -39,6 +40,7 @@ def parameters_of(made: ReconOutcome, prepared: PreparedProjections, context: Re
         "quantity": prepared.quantity,
         **(done := recorded(selection.in_order, prepared.done)),
         **({"view_shifts_px": geometry.shifts} if "jumps" in done or geometry.shifts.any() else {}),
+        **({"slices_partly_seen": few} if (few := partly_seen(geometry)).size else {}),
         **({"view_roll_deg": np.degrees(geometry.roll)} if geometry.roll.any() else {}),
         **({"view_tilt_deg": np.degrees(geometry.tilt)} if geometry.tilt.any() else {}),
         **({} if geometry.is_straight and not geometry.shifts.any() else {"sample_pitch": geometry.sample_pitch}),

@@ -4,17 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from beamline.core.text import count
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import count, spans
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.outcome import ReconOutcome, label_of
 from recon.assess.lost_mass import Comparison
 from recon.base.geometry import Geometry
+from recon.base.volume import Grid
 from recon.methods import by_name
 from recon.splatting import needles
-from recon.voxels import odd_views, stray_mass, unexplained
+from recon.voxels import odd_views, stray_mass, unexplained, view_weights
 
 _NAMED = 5  # odd views, at most
+
+
+def partly_seen(geometry: Geometry) -> NDArray[np.intp]:
+    """Slices that views at heights of their own see over less of the half turn than others."""
+    if geometry.is_cone or not geometry.is_straight or not geometry.shifts[:, 1].any():
+        return np.zeros(0, np.intp)
+    heights = Grid.matching(geometry).coordinates()[0]
+    return np.flatnonzero(view_weights.partly_seen(geometry, heights / geometry.pixel_pitch + geometry.axis_row))
+
+
+def partly_seen_warning(geometry: Geometry) -> str:
+    """The warning that few views see some slices; empty if all are seen alike."""
+    some = partly_seen(geometry)
+    if not some.size:
+        return ""
+    return (
+        f"Slices {spans(some.tolist())} of {Grid.matching(geometry).shape[0]} are seen over less of the half turn than "
+        "the others, since views stand at heights of their own: there the volume is streaked, and too thin by FBP."
+    )
 
 
 def lost_mass_warning(made: ReconOutcome, beside_fbp: Comparison) -> str:

@@ -56,6 +56,8 @@ def write_result(
     if (region := context.region) is not None:
         volumes = {method: region.cut(volume) for method, volume in volumes.items()}
         deviation = None if deviation is None else region.cut(deviation)
+    volumes = {method: prepared.stretched(volume) for method, volume in volumes.items()}
+    deviation = None if deviation is None else prepared.stretched(deviation)
     record = ReconRecord(
         volume=volumes[made.method],
         length_unit=prepared.length_unit,

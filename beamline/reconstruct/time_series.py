@@ -224,7 +224,7 @@ def reconstruct_series(
         facts, options.selection, options.command, options.seed, warn.messages, recipe=options.recipe
     )
     record = ReconRecord(
-        volume=outcome.volume,
+        volume=prepared.stretched(outcome.volume),
         length_unit=prepared.length_unit,
         raw_file=str(facts.path.resolve()),
         title=f"{wanted.volumes} volumes in time of {facts.name}",

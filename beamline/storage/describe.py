@@ -53,8 +53,9 @@ def describe_volume(path: Path, kind: str, record: ReconRecord) -> Mapping[str, 
 def describe_source(source: ScanSource) -> Mapping[str, Any]:
     """Format, frames, angles, quantity, scale, and what the rules find; None for what is not known.
 
-    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `findings`
-    are the messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
+    Angles are in degrees. `flags` are frames by check and level, also those of views that were taken again. `not_used`
+    is what the file states and nobody uses, by its path. `findings` are the messages of errors and warnings,
+    `reconstructable` whether no error stands against a reconstruction.
     """
     kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
     findings = source_findings(source)
@@ -70,6 +71,8 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
         "quantity": source.quantity,
         **_angles(source),
         "pixel_size_mm": source.pixel_size_mm,
+        **({} if source.row_pitch_mm is None else {"pixel_height_mm": source.row_pitch_mm}),
+        **({} if source.cone is None else {"cone_mm": source.cone}),
         "energy_kev": source.energy_kev,
         "axis_col": source.axis_col,
         "exposure_s": attributes.pop("exposure_s", None),
@@ -81,6 +84,7 @@ def describe_source(source: ScanSource) -> Mapping[str, Any]:
     return {
         **facts,
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
+        "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [finding.message for finding in findings if finding.severity != "info"]
         + ([altered_said(source)] if source.altered else []),
     }

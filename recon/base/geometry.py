@@ -185,6 +185,15 @@ class Geometry:
         return self.is_straight and not (self.is_cone or self.shifts[:, 1].any())
 
     @property
+    def climbs(self) -> bool:
+        """Whether views step along the rotation axis by half the detector's rows or more, as in a helix.
+
+        By the middle half of them, which climbs half as far: single views that stand apart make no climb.
+        """
+        low, high = np.percentile(self.shifts[:, 1], (25, 75))
+        return bool(4 * (high - low) >= self.detector_shape[0])
+
+    @property
     def lean(self) -> float:
         """Largest displacement by roll and tilt, from row to row, of a point of the field: mm at the rotation axis."""
         across = np.abs(np.sin(self.roll)) + np.abs(np.sin(self.tilt))

@@ -137,7 +137,8 @@ class Grid:
 def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
     """Extent in pixels of shifted views along columns (0) or rows (1), and its middle from that of an unshifted view.
 
-    Positions seen by fewer than half as many views as the position seen most often are left out.
+    Positions seen by fewer than half as many views as the position seen most often are left out; but where views climb
+    by half the detector's rows or more, all that are seen are kept.
     """
     size = geometry.detector_shape[1 - axis]
     first = -geometry.shifts[:, axis]
@@ -145,6 +146,8 @@ def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
     within = (edges[:-1] + edges[1:]) / 2
     covered = (first[:, None] <= within) & (within < first[:, None] + size)
     enough = np.flatnonzero(2 * covered.sum(axis=0) >= covered.sum(axis=0).max())
+    if axis == 1 and geometry.climbs:
+        enough = np.flatnonzero(covered.any(axis=0))
     low, high = float(edges[enough[0]]), float(edges[enough[-1] + 1])
     return max(1, round(high - low)), (low + high - size) / 2
 

@@ -22,12 +22,12 @@ from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.problem import binned_geometry
 from recon.splatting.splat import project
-from recon.voxels.direct import direct
+from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.iterative import solve
 from recon.voxels.methods.os_sirt_tv import OsSirtTv
 from recon.voxels.projector import Projector, volume_lines
 from recon.voxels.tv import difference_weights
-from recon.voxels.view_weights import angular_weights, missing_arc
+from recon.voxels.view_weights import angular_weights
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
 MATTER = 0.05
@@ -218,7 +218,7 @@ def sweeps_of_start(geometry: Geometry, start: Start) -> float:
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:
-    return start == "tv" or (geometry.is_cone and missing_arc(geometry) > 0)
+    return start == "tv" or not has_direct_method(geometry)
 
 
 def sample_gaussians(

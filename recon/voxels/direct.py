@@ -19,7 +19,7 @@ from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import OPTIONS
 from recon.kernels.cpu.joseph import calls
 from recon.voxels.fbp import Filter, fbp, fbp_memory, ramp
-from recon.voxels.fdk import fdk
+from recon.voxels.fdk import fdk, refuse_climbing
 from recon.voxels.projector import volume_slices
 from recon.voxels.view_weights import cone_weights, missing_arc, ray_weights
 
@@ -81,6 +81,7 @@ def posed_direct(
         raise ValueError(
             f"projections have shape {projections.shape}, the geometry expects [view, row, col] {expected}"
         )
+    refuse_climbing(geometry)
     reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
     if reach >= geometry.sod:
         raise ValueError(
@@ -184,5 +185,10 @@ def direct(
 
 
 def has_direct_method(geometry: Geometry) -> bool:
-    """Whether FBP or FDK takes these views: a cone needs a full circle, or a short scan (`missing_arc`)."""
+    """Whether FBP or FDK takes these views: a cone needs a full circle, or a short scan (`missing_arc`).
+
+    Views that climb along the axis have weights of their own in each slice, which only straight parallel ones have.
+    """
+    if geometry.climbs:
+        return geometry.is_straight and not geometry.is_cone
     return not geometry.is_cone or missing_arc(geometry) == 0

@@ -24,7 +24,7 @@ from recon.base.geometry import Geometry
 from recon.base.slabs import bands_of, slices_of
 from recon.base.volume import Grid
 from recon.voxels.back_project import SLICES, by_gridding, columns_of, gridding, gridding_pays, nanoseconds, ray_by_ray
-from recon.voxels.view_weights import ray_weights
+from recon.voxels.view_weights import column_shares, ray_weights, seen_by, slice_weights
 
 _VIEWS = 32  # filtered at a time
 
@@ -81,6 +81,8 @@ class FbpPlan:
     Attributes:
         geometry, grid, filter: as given.
         share: float32 [view, 1, col], quadrature weight of each ray.
+        column_shares: of views that do not all see all slices, whose weights differ from slice to slice; None: `share`
+            holds for all slices.
         zeros: columns of zeros to add before and after these.
         rows: [z], detector rows at which an unshifted view sees the slices.
         back_project: (columns [view, 1 + col + 1, 16], out [z, y, x]).
@@ -90,6 +92,7 @@ class FbpPlan:
     grid: Grid
     filter: Filter
     share: F32
+    column_shares: F64 | None
     zeros: tuple[int, int]
     rows: F64
     back_project: Callable[[F32, F32], None]
@@ -127,8 +130,11 @@ def plan_fbp(geometry: Geometry, grid: Grid, filter: Filter = "ram-lak") -> FbpP
     if is_gridded(geometry, grid, filter):
         response = partial(ramp, pixel_pitch=1.0, filter=filter)
         back_project = partial(by_gridding, gridding(geometry.angles, axis_cols, cols, x, y, response))
-    share = weights.astype(np.float32)[:, None]
-    return FbpPlan(geometry, grid, filter, share, zeros, z + geometry.axis_row, back_project)
+    share, rows = weights.astype(np.float32)[:, None], z + geometry.axis_row
+    differ = geometry.shifts[:, 1].any() and not seen_by(geometry, rows).all()
+    return FbpPlan(
+        geometry, grid, filter, share, column_shares(geometry)[0] if differ else None, zeros, rows, back_project
+    )  # fmt: skip
 
 
 def fbp_memory(views: int, cols: int) -> int:
@@ -165,11 +171,12 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
         ValueError: values are not finite.
     """
     geometry, rows = plan.geometry, plan.rows[part]
+    share = _shares_of(plan, rows)
     columns = columns_of(geometry.n_views, geometry.detector_shape[1] + sum(plan.zeros))
     for begin in range(0, geometry.n_views, _VIEWS):
         views = slice(begin, begin + _VIEWS)
         weighed = _slab(projections[views], geometry.shifts[views, 1], rows, first, geometry.detector_shape[0])
-        weighed *= plan.share[views]
+        weighed *= share[views]
         if any(plan.zeros):
             weighed = np.pad(weighed, ((0, 0), (0, 0), plan.zeros))
         filtered = filter_projections(weighed, geometry.pixel_pitch, plan.filter)
@@ -178,6 +185,17 @@ def fbp_block(plan: FbpPlan, projections: F32, first: int, part: slice, out: F32
         columns[views, 1:-1, : rows.size] = filtered.transpose(0, 2, 1)
     columns[:, 0], columns[:, -1] = columns[:, 1], columns[:, -2]
     plan.back_project(columns, out)
+
+
+def _shares_of(plan: FbpPlan, rows: F64) -> F32:
+    """Weights of the rays of some slices, float32 [view, slice or 1, col]."""
+    if plan.column_shares is None:
+        return plan.share
+    seen = seen_by(plan.geometry, rows)
+    if seen.all():
+        return plan.share
+    weights = [slice_weights(plan.geometry, some, plan.column_shares) for some in seen.T]
+    return np.stack(weights, axis=1).astype(np.float32)
 
 
 def _rows_at(projections: F32, rows: F64, first: int, height: int) -> F32:
@@ -213,7 +231,8 @@ def fbp(
 
     Voxels take the filtered views by linear interpolation at their centres, many of them by gridding. This is within
     1e-3 of the peak (see `recon.voxels.back_project`): for voxels larger than a pixel bin the projections first. A
-    voxel that a view does not see gets nothing from that view, unless its opposite does. A full turn with the axis off
+    voxel that a view does not see gets nothing from that view, unless its opposite does; a slice that some views do not
+    see, since views are shifted along the axis, is that of the others. A full turn with the axis off
     the middle of the detector, or beside it, covers the field out to the far columns.
 
     Args:

@@ -104,6 +104,7 @@ def fdk(
     if not geometry.is_straight:
         raise ValueError("FDK takes straight views only; these are rolled or tilted: `direct` takes them")
     grid = Grid.matching(geometry) if grid is None else grid
+    refuse_climbing(geometry)
     reach = float(np.hypot(*np.abs(grid.edges[:, :2]).max(0)))
     if reach >= geometry.sod:
         raise ValueError(
@@ -128,6 +129,15 @@ def fdk(
             )  # fmt: skip
             on_block((start * y.size + part.n_views * layers.stop) // geometry.n_views, y.size)
     return volume_slices(volume)
+
+
+def refuse_climbing(geometry: Geometry) -> None:
+    """ValueError for views that climb along the axis: each voxel would miss the views that do not see it."""
+    if geometry.climbs:
+        raise ValueError(
+            f"views climb by {np.ptp(geometry.shifts[:, 1]):.4g} of {geometry.detector_shape[0]} rows. Direct methods "
+            "have weights for that in straight views of a parallel beam only: use an iterative method (fista-tv, sirt)"
+        )
 
 
 def _prepared(views: F32, geometry: Geometry, weights: F64, beyond: tuple[int, int], filter: Filter) -> F32:

@@ -12,10 +12,11 @@ from recon.base.arrays import F64
 from recon.base.geometry import Geometry
 
 _GAP_LIMIT = 8.0  # an angular gap this many times the median may be missing data, not coarse sampling
+_THINNED = 2.5  # usual steps between the views of a part of a scan, at most
 _SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
 
 
-def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
+def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[np.float64]:
     """Quadrature weight of each view: its Voronoi cell on the half circle, in radians.
 
     Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
@@ -24,6 +25,7 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
 
     Args:
         angles: [view], radians, any order and range.
+        of: angles of a scan whose views these are a part of; its usual step then tells a missing wedge.
 
     Raises:
         ValueError: for no angles, or some that are not finite.
@@ -31,8 +33,9 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
     theta = np.mod(np.asarray(angles, dtype=np.float64).ravel(), np.pi)
     if theta.size == 0 or not np.isfinite(theta).all():
         raise ValueError(f"weights need at least one angle, all finite, got {theta.size}")
+    whole = None if of is None else np.asarray(of, np.float64).ravel()
     if theta.size == 1:
-        return np.full(1, np.pi)
+        return np.full(1, np.pi if whole is None else _usual_step(whole))
     order = np.argsort(theta, kind="stable")
     ordered = theta[order]
     # Group equal angles; the circle closes, so a last group just below π may be the first one.
@@ -43,14 +46,25 @@ def angular_weights(angles: ArrayLike) -> NDArray[np.float64]:
         group[group == group[-1]] = 0
         starts = starts[:-1]
     if starts.size == 1:
-        return np.full(theta.size, np.pi / theta.size)
+        return np.full(theta.size, (np.pi if whole is None else _usual_step(whole)) / theta.size)
     gaps = np.diff(starts, append=starts[0] + np.pi)
-    typical = float(np.median(gaps))
-    gaps = np.where(gaps > _widest(gaps, math.pi), typical, gaps)
+    if whole is None:
+        typical, widest = float(np.median(gaps)), _widest(gaps, math.pi)
+    else:
+        typical = _usual_step(whole)
+        widest = _GAP_LIMIT * float(np.clip(np.median(gaps), typical, _THINNED * typical))
+    gaps = np.where(gaps > widest, typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)
     weights[order] = (cells / np.bincount(group))[group]
     return weights
+
+
+def _usual_step(angles: F64) -> float:
+    """The median step between different angles modulo π."""
+    theta = np.unique(np.mod(angles, np.pi))
+    gaps = np.diff(theta, append=theta[0] + np.pi)
+    return float(np.median(gaps[gaps > _SAME_ANGLE * np.pi / angles.size]))
 
 
 def covers_the_circle(angles: ArrayLike) -> bool:
@@ -98,13 +112,65 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     Returns:
         [view, col], and the columns of zeros to add before and after these.
     """
-    cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
-    both = np.repeat(angular_weights(geometry.angles)[:, None], cols, axis=1)
+    both = np.repeat(angular_weights(geometry.angles)[:, None], geometry.detector_shape[1], axis=1)
     if not covers_the_circle(geometry.angles):
         return both, (0, 0)
-    share, beyond = _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
-    alone = circle_weights(geometry.angles)[:, None]
-    return np.where(share <= 0.5, 2 * share * both, both + (2 * share - 1) * (alone - both)), beyond
+    share, beyond = column_shares(geometry)
+    return _weighed(share, both, circle_weights(geometry.angles)[:, None]), beyond
+
+
+def column_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
+    """Share [view, col] of each ray of a full turn in what it and its opposite measure, and columns of zeros beside."""
+    cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
+    return _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
+
+
+def seen_by(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
+    """Which straight views of a parallel beam see slices [view, slice].
+
+    Args:
+        rows: [slice], detector rows at which an unshifted view sees them.
+    """
+    at = rows + geometry.shifts[:, 1:]
+    return (at >= -0.5) & (at <= geometry.detector_shape[0] - 0.5)
+
+
+def slice_weights(geometry: Geometry, seen: NDArray[np.bool_], share: F64) -> F64:
+    """Quadrature weights [view, col] of the rays of one slice, from the views alone that see it; 0 for the others.
+
+    As `ray_weights`: views that step along the axis see each slice from angles of its own, some of them more often.
+
+    Args:
+        seen: [view].
+        share: `column_shares` of all views.
+    """
+    weights = np.zeros((geometry.n_views, geometry.detector_shape[1]))
+    if not seen.any():
+        return weights
+    angles = geometry.angles[seen]
+    both = angular_weights(angles, geometry.angles)[:, None]
+    weights[seen] = _weighed(share[seen], both, circle_weights(angles)[:, None]) if covers_the_circle(angles) else both
+    return weights
+
+
+def partly_seen(geometry: Geometry, rows: F64) -> NDArray[np.bool_]:
+    """Which slices [slice] are seen over less than half a turn, of views that see others over more.
+
+    Args:
+        rows: as of `seen_by`, of straight views of a parallel beam.
+    """
+    keys, known = list[bytes](), dict[bytes, float]()
+    for some in seen_by(geometry, rows).T:
+        keys.append(some.tobytes())
+        if keys[-1] not in known:
+            angles = geometry.angles[some]
+            known[keys[-1]] = float(angular_weights(angles, geometry.angles).sum()) if angles.size else 0.0
+    covered = np.array([known[key] for key in keys])
+    return covered < covered.max() - 1.5 * _usual_step(geometry.angles)
+
+
+def _weighed(share: F64, both: F64, alone: F64) -> F64:
+    return np.where(share <= 0.5, 2 * share * both, both + (2 * share - 1) * (alone - both))
 
 
 def fan_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:

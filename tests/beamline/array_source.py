@@ -23,6 +23,8 @@ class ArraySource:
     axis_col: float | None = None
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
+    row_pitch_mm: float | None = None
+    not_used: tuple[Any, ...] = ()
     attributes: dict[str, Any] = {}  # noqa: RUF012
     row_period: float | None = None
     flags = None

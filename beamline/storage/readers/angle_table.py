@@ -13,6 +13,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import text_in
 from beamline.plan.angles import from_text
 from beamline.storage import hdf5
+from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 
 Angles = Path | str | ArrayLike  # a text file in degrees, or an array in radians
@@ -51,23 +52,78 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
     return angles[first:last]
 
 
-def assign(image_key: NDArray[np.int32], angles: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    """Radians for each frame: one angle for each frame, or one for each projection (NaN elsewhere).
+def assign(
+    source: ScanSource, angles: NDArray[np.float64], name: str, *, of_views: bool = False
+) -> NDArray[np.float64]:
+    """Radians for each frame of a source, NaN where unknown.
 
-    DataError where the counts fit neither, with the rows that look like the projections.
+    There is one angle for each projection; or one for each number of a series of files, where some are lost; or one for
+    each frame, where the order of all frames is known. A log that holds nan for each dark and flat tells it, too. A log
+    whose steps are equal from end to end has no rows of darks and flats, for which a stage stands.
+
+    Args:
+        name: where the angles come from, for messages.
+        of_views: the angles are those of projections alone.
+
+    Raises:
+        DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
     """
-    projections = image_key == FrameKind.PROJECTION
+    key = source.image_key
+    projections = key == FrameKind.PROJECTION
     n = int(projections.sum())
-    if angles.size == image_key.size:
-        return angles
+    spread = np.full(key.size, np.nan)
     if angles.size == n:
-        spread = np.full(image_key.size, np.nan)
         spread[projections] = angles
         return spread
-    message = (
-        f"{name} has {angles.size} angles, but there are {n} projections among {image_key.size} frames. "
-        "Say with --angle-rows A:B which of them belong to the projections (from 0, B not included)"
-    )
+    numbers = source.numbers
+    if numbers is not None and _count_all(numbers, angles.size) and not of_views:
+        return np.asarray(angles[numbers - numbers.min()])
+    series = None if numbers is None else numbers[projections]
+    one_a_number = series is not None and _count_all(series, angles.size)
+    all_frames = angles.size == key.size and not of_views
+    if all_frames and source.in_order:
+        return angles
+    if series is not None and one_a_number and (not all_frames or _in_equal_steps(angles)):
+        spread[projections] = angles[series - series.min()]
+        return spread
+    if all_frames and int(np.isfinite(angles).sum()) == n:
+        spread[projections] = angles[np.isfinite(angles)]
+        return spread
+    raise DataError(_misfit(source, angles, name, series))
+
+
+def _count_all(numbers: NDArray[np.int64], n: int) -> bool:
+    """Whether the numbers of files, no two of them the same, go from the first to the last of n."""
+    return bool(numbers.min() >= 0 and np.ptp(numbers) + 1 == n and np.unique(numbers).size == numbers.size)
+
+
+def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
+    """Whether no step is half as long again, or half as short, as the typical one."""
+    steps = np.diff(angles)
+    typical = float(np.median(steps))
+    return bool((np.abs(steps - typical) < abs(typical) / 2).all())
+
+
+def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: NDArray[np.int64] | None) -> str:
+    key = source.image_key
+    n = int((key == FrameKind.PROJECTION).sum())
+    if angles.size < n:
+        message = f"{name} has {angles.size} angles for {n} projections, so that {n - angles.size} have none"
+    elif angles.size == key.size:
+        message = (
+            f"{name} has {angles.size} angles, one for each frame, and {source.path} does not say when its darks and "
+            f"flats were taken"
+        )
+    else:
+        message = f"{name} has {angles.size} angles, but there are {n} projections among {key.size} frames"
+    if series is not None and (gaps := source.attributes.get("missing_numbers")):
+        message += (
+            f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
+            f"{np.ptp(series) + 1} angles, one for each number, each image would get its own"
+        )
+    if angles.size < n:
+        return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
+    message += f". Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
     window = evenly_spaced_window(angles, n)
     if window is not None:
         low, high = np.degrees(angles[list(window)])
@@ -75,13 +131,14 @@ def assign(image_key: NDArray[np.int32], angles: NDArray[np.float64], name: str)
             f"; --angle-rows {window[0]}:{window[1] + 1} takes the {n} neighbours in the most equal steps, "
             f"from {low:.4f} to {high:.4f} degrees"
         )
-    raise DataError(message + ".")
+    return message + "."
 
 
 def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
-    """First and last row of the n neighbouring rows with the most equal steps, or None without a choice.
+    """First and last row of the n neighbouring rows with the most equal steps; None where that is no clear choice.
 
-    A scan's angle log often holds the darks and flats as well, at a standing stage.
+    A scan's angle log often holds the darks and flats as well, at a standing stage. If the steps go on beyond these
+    rows, other rows would do as well: then views were lost, and nothing tells which.
     """
     if n < 3 or angles.size <= n or not np.isfinite(angles).all():
         return None
@@ -93,4 +150,7 @@ def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int]
         return None
     uneven = np.abs(windows - medians[:, None]).max(axis=1)[moving] / np.abs(medians[moving])
     first = int(moving[np.argmin(uneven)])
+    beside = np.concatenate((steps[first - 1 : first] if first else [], steps[first + n - 1 : first + n]))
+    if (np.abs(beside - medians[first]) < np.abs(medians[first]) / 2).any():
+        return None
     return first, first + n - 1

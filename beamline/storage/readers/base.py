@@ -25,6 +25,15 @@ Attributes = Mapping[str, str | float | int]
 WHOLE = slice(None)
 
 
+class NotUsed(NamedTuple):
+    """A field that a file states and that is not used: where it is, its value, why or what to do, may it matter."""
+
+    where: str
+    value: str
+    why: str
+    doubt: bool
+
+
 class EmissionCounts(NamedTuple):
     """Float32 [view, row, col] each: what was counted, and survival and background as of `recon.Emission`."""
 
@@ -58,6 +67,10 @@ class ScanSource(ABC):
         cols: (first, end) columns of the detector that a frame has; None: all.
         cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
         unreadable: rows that `read_known` was asked for and the file does not give, and why.
+        row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
+        in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
+            they were taken.
+        numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
     """
 
     path: Path
@@ -75,6 +88,9 @@ class ScanSource(ABC):
     cols: tuple[int, int] | None = None
     cone: tuple[float, float] | None = None
     unreadable: Mapping[int, str] = MappingProxyType({})
+    row_pitch_mm: float | None = None
+    in_order: bool = True
+    numbers: NDArray[np.int64] | None = None
 
     @property
     def row_period(self) -> float | None:
@@ -90,6 +106,11 @@ class ScanSource(ABC):
     def attributes(self) -> Attributes:
         """Other facts of the file, for the record."""
         return self.facts
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        """What the file states of geometry, units, order and validity, and what is not used."""
+        return ()
 
     @property
     def flags(self) -> FrameFlags | None:

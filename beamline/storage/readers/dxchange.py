@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import h5py
@@ -10,10 +11,18 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
-from beamline.storage.readers.base import Opening, ScanFormat
+from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
+from beamline.storage.readers.nexus_geometry import differing
 from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.readers.stated import EXCHANGE, EXCHANGE_ENERGY_UNITS, EXCHANGE_LENGTH_UNITS, not_used
+from beamline.storage.readers.turned import TurnedFrames, dimensions
 from drivers.base.frame import FrameKind
 
+_USUAL = (0, 1, 2)
+_UNKNOWN = "the names are unknown; theta:y:x is taken"
+_DETECTOR = "measurement/instrument/detector"
+_ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
+_ENERGIES, _SIZES = (0.01, 1e4), (1e-6, 1.0)  # keV and mm of a detector, of numbers without a unit
 PLACES = (
     (FrameKind.DARK, "/exchange/data_dark"),
     (FrameKind.FLAT, "/exchange/data_white"),
@@ -28,20 +37,88 @@ def open_exchange(path: Path, *, own_angles: bool = True) -> StacksSource:
         for _, where in PLACES:
             hdf5.refuse_broken(file, where)
         found = ((kind, where, hdf5.dataset(file, where)) for kind, where in PLACES)
-        stacks = [FrameStack(kind, where, item) for kind, where, item in found if item is not None]
-        source = StacksSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
+        order = _order(file["exchange/data"])
+        stacks = [
+            FrameStack(kind, where, _in_order(item, _order(item) or order or _USUAL))
+            for kind, where, item in found
+            if item is not None
+        ]
+        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
         if own_angles:
             n_views = len(stacks[-1].frames)
             source.angles[-n_views:] = _theta(file, n_views)
-        pixel = file.attrs.get("pixel_size_mm")
         units = hdf5.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
-        source.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
+        source.stated = not_used(EXCHANGE, file, source)
+        _set_scale(source, file)
+        if order is None and "axes" in file["exchange/data"].attrs:
+            source.stated += (NotUsed("exchange/data@axes", ":".join(_axes(file["exchange/data"])), _UNKNOWN, True),)
         return source
     except BaseException:
         file.close()
         raise
+
+
+class ExchangeSource(StacksSource):
+    """A scan as Data Exchange; `stated` are the fields that are not used."""
+
+    stated: tuple[NotUsed, ...] = ()
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return self.stated
+
+
+def _axes(item: h5py.Dataset) -> list[str]:
+    return [axis for part in np.ravel(item.attrs.get("axes", ())) for axis in hdf5.text(part).split(":")]
+
+
+def _order(item: h5py.Dataset) -> tuple[int, int, int] | None:
+    """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
+    return dimensions(_axes(item))
+
+
+def _in_order(item: h5py.Dataset, order: tuple[int, int, int]) -> h5py.Dataset | TurnedFrames:
+    if order == _USUAL or item.ndim != 3:
+        return item
+    hdf5.require_possible(item)
+    if lost := hdf5.missing_links(item):
+        raise DataError(f"{item.file.filename} draws its frames from {lost[0]}, which is not there or differs.")
+    return TurnedFrames(item, order)
+
+
+def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
+    """Pixel size and energy; what the file says of them in a unit that cannot be joins `stated`."""
+    pixel = file.attrs.get("pixel_size_mm")
+    source.pixel_size_mm = float(pixel) if isinstance(pixel, int | float) and np.isfinite(pixel) else None
+    energy = "measurement/instrument/monochromator/energy"
+    source.energy_kev = _measured(source, file, energy, EXCHANGE_ENERGY_UNITS, _ENERGIES)
+    if source.pixel_size_mm is None:
+        lens = _positive(file, f"{_DETECTOR}/objective/magnification", _ANY) or 1.0
+        sizes = []
+        for side in "xy":
+            size = _measured(source, file, f"{_DETECTOR}/{side}_pixel_size", EXCHANGE_LENGTH_UNITS, _SIZES)
+            binning = _positive(file, f"{_DETECTOR}/{side}_binning", _ANY) or 1.0
+            sizes.append(None if size is None else size * binning / lens)
+        source.pixel_size_mm, source.row_pitch_mm = sizes[0], differing(sizes[1], sizes[0])
+
+
+def _measured(
+    source: ExchangeSource, file: h5py.File, where: str, units: Mapping[str, float], range: tuple[float, float]
+) -> float | None:
+    """A positive number. One without a unit counts in the SI's, as the format says, if it then lies in a range."""
+    value, item = _positive(file, where, units), hdf5.dataset(file, where)
+    if value is None or item is None or hdf5.attribute(item, "units") or range[0] <= value <= range[1]:
+        return value
+    said = f"{np.ravel(item[()])[0]:.6g}"
+    source.stated += (NotUsed(where, said, "it has no attribute `units`, and in the SI's it cannot be", True),)
+    return None
+
+
+def _positive(file: h5py.File, where: str, units: Mapping[str, float]) -> float | None:
+    value = hdf5.scalar(file, where, units)
+    return value if value is not None and value > 0 else None
 
 
 def _theta(file: h5py.File, n_views: int) -> NDArray[np.float64]:

@@ -32,9 +32,9 @@ def find(file: h5py.File) -> list[Places]:
     for name in file:
         top = hdf5.resolve(file, name)
         entries = [top] if isinstance(top, h5py.Group) else []
-        entries += [item for item in _groups(entries[0]) if "instrument" in item] if entries else []
+        entries += [item for item in groups(entries[0]) if "instrument" in item] if entries else []
         for entry in entries:
-            for detector in _groups(hdf5.resolve(entry, "instrument")):
+            for detector in groups(hdf5.resolve(entry, "instrument")):
                 key = hdf5.dataset(detector, "image_key")
                 data = hdf5.dataset(detector, "data")
                 for name in ("data", "image_key"):
@@ -47,7 +47,8 @@ def find(file: h5py.File) -> list[Places]:
     return found
 
 
-def _groups(parent: Any) -> list[h5py.Group]:
+def groups(parent: Any) -> list[h5py.Group]:
+    """The groups in a group; [] for anything else."""
     if not isinstance(parent, h5py.Group):
         return []
     items = (hdf5.resolve(parent, name) for name in parent)

@@ -22,6 +22,7 @@ from beamline.storage.hdf5 import require_real
 from beamline.storage.parts import require_joined
 from beamline.storage.readers.base import (
     WHOLE,
+    NotUsed,
     Opening,
     Quantity,
     ScanFormat,
@@ -30,7 +31,9 @@ from beamline.storage.readers.base import (
     frame_indices,
     read_known,
 )
+from beamline.storage.readers.nexus_geometry import differing, read_energy, read_geometry, require_order
 from beamline.storage.readers.nexus_places import choose, find
+from beamline.storage.readers.stated import NXTOMO, UPRIGHT, not_used
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import altered_rows, require_earlier
 from drivers.base.frame import Frame, FrameKind
@@ -57,17 +60,23 @@ class NXtomoSource(ScanSource):
             self.format = _format(definition, hdf5.text_at(places.entry, "program_name"))
             said = hdf5.text_at(self._file, "/entry/record/quantity")
             self.quantity = _quantity(said, self.dtype)
-            self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
-            energy = (hdf5.scalar(places.entry, f"{where}/incident_energy", hdf5.ENERGY_UNITS) for where in BEAMS)
-            self.energy_kev = next((value for value in energy if value is not None), None)
+            self._geometry = None if self._ours else read_geometry(places)
+            if self._geometry is None:
+                self.pixel_size_mm = hdf5.scalar(places.detector, "x_pixel_size", hdf5.LENGTH_UNITS)
+                self.cone = self._cone()
+            else:
+                self.pixel_size_mm, height = self._geometry.pixel_mm
+                self.row_pitch_mm = differing(height, self.pixel_size_mm)
+                self.cone = self._geometry.cone
+            self.energy_kev = read_energy(places.entry)
             # NXtomo's x_rotation_axis_pixel_position counts from the edge for some and from the middle for others.
             self.axis_col = hdf5.scalar(self._file, "/entry/record/axis_col", {"pixel": 1.0})
-            self.cone = self._cone()
             self.n = 0
             self._damaged: set[int] = set()
             self._altered: set[int] = set()
             self._own_angles = own_angles
             self.refresh()
+            self._not_used = self._find_not_used()
         except BaseException:
             self._file.close()
             raise
@@ -92,6 +101,8 @@ class NXtomoSource(ScanSource):
         hdf5.require_possible(self._places.data)
         if self._ours:
             require_joined(self._file)
+        else:
+            require_order(self._places)
         lost = hdf5.missing_links(self._places.data) + hdf5.missing_links(self._places.image_key)
         if lost:
             raise DataError(
@@ -167,9 +178,8 @@ class NXtomoSource(ScanSource):
                 said[name] = number
         if "exposure_s" not in said and np.isfinite(self.exposures).any():
             said["exposure_s"] = float(np.nanmedian(self.exposures))
-        position = hdf5.dataset(self._places.detector, "x_rotation_axis_pixel_position")
-        if position is not None:
-            said["x_rotation_axis_pixel_position"] = f"{position[()]} (not used: its origin is not defined)"
+        if self._geometry is not None:
+            said |= self._geometry.remarks
         if self._places.angle_problem:
             said["angles"] = f"unknown: {self._places.angle_problem}"
         if self._places.data.is_virtual:
@@ -180,6 +190,17 @@ class NXtomoSource(ScanSource):
             said["status"] = hdf5.text(self._file[layout.STATUS][()]) or "running"
             said["missing_triggers"] = int(self._file[layout.MISSING].shape[0])
         return said
+
+    def _find_not_used(self) -> tuple[NotUsed, ...]:
+        if self._geometry is None:
+            return ()
+        found = not_used(NXTOMO, self._places.entry, self, str(self._places.detector.name))
+        turned = self._geometry.turned
+        return (*found, NotUsed("detector/transformations", turned, UPRIGHT, True)) if turned else found
+
+    @property
+    def not_used(self) -> tuple[NotUsed, ...]:
+        return self._not_used
 
     @property
     def flags(self) -> FrameFlags | None:
@@ -226,6 +247,8 @@ class NXtomoSource(ScanSource):
         return starts.astype(np.int64)
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
+        if self._geometry is not None and any(self._geometry.mirrored):
+            return self._mirrored(frame_indices(frames, self.n), range(self.shape[0])[rows], *self._geometry.mirrored)
         indices, height = frame_indices(frames, self.n), len(range(self.shape[0])[rows])
         out = np.empty((indices.size, height, self.shape[1]), self.dtype)
         compared = 2 * height >= self.shape[0] and self.checksummed
@@ -238,6 +261,15 @@ class NXtomoSource(ScanSource):
             for view, row in zip(out, indices, strict=True):
                 self._compared(row, view)
         return out
+
+    def _mirrored(
+        self, indices: NDArray[np.int64], rows: range, upside_down: bool, left_to_right: bool
+    ) -> NDArray[Any]:
+        kept = [self.shape[0] - 1 - row for row in rows] if upside_down else list(rows)
+        first, end = (min(kept), max(kept) + 1) if kept else (0, 0)
+        block = np.empty((indices.size, end - first, self.shape[1]), self.dtype)
+        hdf5.read_frames(self._places.data, indices, slice(first, end), block)
+        return block[:, [row - first for row in kept], :: -1 if left_to_right else 1]
 
     def _whole(self, row: int) -> NDArray[Any]:
         whole = np.empty((1, *self.shape), self.dtype)
@@ -325,7 +357,6 @@ class NXtomoSource(ScanSource):
         self._file.close()
 
 
-BEAMS = ("instrument/beam", "beam", "sample/beam")
 TEXTS = {
     "sample": "sample/name",
     "title": "title",

@@ -21,7 +21,7 @@ from beamline.storage.readers.nexus_places import find
 from beamline.storage.readers.nxtomo import NXtomoSource
 from beamline.storage.readers.overlay import OverlaidSource
 from beamline.storage.readers.reference_files import Images, load_images
-from beamline.storage.readers.stacks import StacksSource, angles_at, datasets_text, open_stacks
+from beamline.storage.readers.stacks import angles_at, datasets_text, open_stacks
 from beamline.storage.readers.tiff_series import TiffSeriesSource
 from beamline.storage.readers.wrapped import CroppedSource, PartsSource, TurnedSource, UnsignedSource, has_wrapped
 from drivers.base.frame import FrameKind
@@ -63,8 +63,10 @@ class SourceOptions:
         quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
             darks of 0.
         angles: replace the file's: a text file in degrees (one a line), or an array in radians; one angle for each
-            projection, or one for each frame.
-        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) to use.
+            projection, one for each frame where the order of all frames is known, or one for each number of a series
+            of files, from its first to its last.
+        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) are those of the
+            projections.
         darks, flats: replace the file's; they come before its frames. An array, TIFFs, or an HDF5 file of their own
             (FILE::DATASET where it has several).
         data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are; of an NXtomo with several
@@ -121,7 +123,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
     try:
         if options.earlier:
             base = _of_parts(options.earlier, base)
-        series, stacked = base, isinstance(base, StacksSource)
+        series = base
         if base.dtype.str[1:] in _SHORT and any(has_wrapped(images) for images in _some_of_each_kind(base)):
             base = UnsignedSource(base)
         table = None if angles is None else load_angles(angles)
@@ -136,10 +138,6 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
             if table is None:
                 raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
             table = select_rows(table, options.angle_rows)
-        if table is not None:
-            _refuse_fewer(base, table, angles_from)
-        if table is not None and stacked:
-            _refuse_all_frames(base, table, angles_from)
         if options.quantity == "transmission":
             darks, flats = _beam_of_one(base, options)
         if any(given is not None for given in (table, darks, flats, options.quantity)):
@@ -147,6 +145,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
                 base,
                 angles=table,
                 angles_from=angles_from,
+                of_views=options.angle_rows is not None,
                 darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
                 flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
                 quantity="counts" if options.quantity == "transmission" else options.quantity,
@@ -170,16 +169,6 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
     return open_stacks(path, data, options.darks_path, options.flats_path)
 
 
-def _refuse_fewer(base: ScanSource, table: NDArray[np.float64], name: str) -> None:
-    """DataError for fewer angles than projections: some have none, whichever they are."""
-    n = int((base.image_key == FrameKind.PROJECTION).sum())
-    if table.size < n:
-        raise DataError(
-            f"{name} has {table.size} angles for {n} projections, so that {n - table.size} have none. Is it cut off, "
-            "or of another scan? Give one angle for each projection, in their order."
-        )
-
-
 def _beam_of_one(base: ScanSource, options: SourceOptions) -> tuple[NDArray[Any], NDArray[Any]]:
     """The darks and flats by which transmission was divided already: of 0 and 1. DataError for what is none."""
     if options.darks is not None or options.flats is not None:
@@ -197,16 +186,6 @@ def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
         rows = np.flatnonzero(source.image_key == kind)
         if rows.size:
             yield read_known(source, rows[np.unique(np.linspace(0, rows.size - 1, _LOOKED_AT).astype(int))])
-
-
-def _refuse_all_frames(base: ScanSource, table: NDArray[np.float64], name: str) -> None:
-    """DataError for angles of all frames if the order of darks and flats is unknown."""
-    n = int((base.image_key == FrameKind.PROJECTION).sum())
-    if n < base.image_key.size == table.size:
-        raise DataError(
-            f"{name} has {table.size} angles, one for each frame, and {base.path} does not say when its darks and "
-            f"flats were taken. Say with --angle-rows A:B which {n} belong to the projections (from 0, B not included)."
-        )
 
 
 def _of_parts(earlier: Sequence[Path], last: ScanSource) -> ScanSource:

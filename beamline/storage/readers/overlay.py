@@ -29,6 +29,7 @@ class OverlaidSource(WrappedSource):
         *,
         angles: NDArray[np.float64] | None = None,
         angles_from: str = "",
+        of_views: bool = False,
         darks: NDArray[Any] | None = None,
         flats: NDArray[Any] | None = None,
         quantity: Quantity | None = None,
@@ -36,7 +37,8 @@ class OverlaidSource(WrappedSource):
         """Lay over `base`.
 
         Args:
-            angles: radians, one for each frame or each projection of `base`; `angles_from` names them in errors.
+            angles: radians, for `base` (see `angle_table.assign`); `angles_from` names them in errors.
+            of_views: the angles are those of projections alone.
             darks, flats: [frame, row, col].
 
         DataError where shapes or counts do not fit.
@@ -55,7 +57,7 @@ class OverlaidSource(WrappedSource):
         blocks = [images.astype(self.dtype) for _, images in given]
         self._front = np.concatenate(blocks) if blocks else np.empty((0, *base.shape), self.dtype)
         self._front_key = np.repeat([int(kind) for kind, _ in given], [len(images) for _, images in given])
-        self._angles = None if angles is None else assign(base.image_key, angles, angles_from)
+        self._angles = None if angles is None else assign(base, angles, angles_from, of_views=of_views)
         self._quantity = quantity
         self._update()
 

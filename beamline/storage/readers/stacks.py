@@ -61,6 +61,7 @@ class StacksSource(ScanSource):
         self.exposures = np.full(self.image_key.size, np.nan)
         kinds = {stack.kind for stack in stacks}
         self.quantity = "counts" if {FrameKind.DARK, FrameKind.FLAT} <= kinds else "unknown"
+        self.in_order = kinds == {FrameKind.PROJECTION}
 
     def _check(self) -> None:
         views = self._stacks[-1]

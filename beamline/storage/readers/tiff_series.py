@@ -61,6 +61,7 @@ class TiffSeriesSource(ScanSource):
                 series, in_names = [series[i] for i in taken], in_names[taken]
             order = [name for kind in (FrameKind.DARK, FrameKind.FLAT) for name in images if kinds[name] is kind]
             self._files = order + series
+            self.in_order, self.numbers = not order, _numbers_of_frames(order, series)
             self.image_key = np.array([kinds[name] for name in self._files], np.int32)
             self.angles = np.full(len(self._files), np.nan)
             if in_names is not None:
@@ -191,13 +192,29 @@ def _check_one_series(path: Path, names: list[str]) -> None:
         )
 
 
+def _numbers_of_frames(references: list[str], series: list[str]) -> NDArray[np.int64] | None:
+    """Numbers of darks and flats, -1 where they do not count with the series, and of the series; None without its."""
+    together, of_series = _numbers(references + series), _numbers(series)
+    if together is not None or of_series is None:
+        return together
+    return np.concatenate([np.full(len(references), -1), of_series])
+
+
+def _numbers(names: list[str]) -> NDArray[np.int64] | None:
+    """The number at the end of each name; None where one has none, or where they are no counts (dates)."""
+    found = [re.search(r"(\d{1,18})\.\w+$", name) for name in names]
+    numbers = np.array([int(match[1]) for match in found if match is not None], np.int64)
+    if numbers.size < len(names) or np.ptp(numbers) > COUNTED * numbers.size:
+        return None
+    return numbers
+
+
 def _gaps(names: list[str]) -> str:
-    """Numbers that a series leaves out between its first and its last; none where its numbers are no counts (dates)."""
-    found = [re.search(r"(\d+)\.\w+$", name) for name in names]
-    numbers = sorted({int(match[1]) for match in found if match is not None})
-    if not numbers or numbers[-1] - numbers[0] > COUNTED * len(numbers):
+    """Numbers that a series leaves out between its first and its last."""
+    numbers = _numbers(names)
+    if numbers is None:
         return ""
-    return spans(sorted(set(range(numbers[0], numbers[-1])) - set(numbers)))
+    return spans(sorted(set(range(numbers.min(), numbers.max())) - set(numbers.tolist())))
 
 
 FORMAT = ScanFormat(

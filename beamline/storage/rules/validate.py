@@ -19,7 +19,7 @@ from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.parts import is_joined, joined_file_of, other_parts
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.finding import Finding
+from beamline.storage.rules.finding import Finding, Severity
 from beamline.storage.rules.flags import frames_flagged
 from beamline.storage.rules.nexus import nexus_findings
 from beamline.storage.rules.references import references_usable
@@ -38,6 +38,7 @@ _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
 _SAME = 0.1  # of the mean step: views so close are one
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
+_FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
@@ -161,7 +162,7 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
 
 
 def angles_spread(source: ScanSource) -> Iterator[Finding]:
-    """The projections look from different directions, over half a turn, and degrees were not taken for radians."""
+    """The projections look from different directions, over half a turn, and their angles can be degrees."""
     angles = source.angles[source.image_key == FrameKind.PROJECTION]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
@@ -174,24 +175,37 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
         )
         return
-    span = float(np.degrees(np.ptp(angles)))
-    distinct = np.unique(np.round(np.degrees(angles), 6))
+    degrees = np.degrees(angles)
+    span = float(np.ptp(degrees))
+    distinct = np.unique(np.round(degrees, 6))
     if distinct.size == 1:
         yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
         return
     step = span / (distinct.size - 1)
+    # A plan is of our own scans, whose angles are in degrees.
+    severity: Severity = "warning" if source.plan else "error"
+    between = float(np.median(np.abs(np.diff(degrees))))
     if look_like_degrees(angles):
         yield Finding(
-            "warning",
+            severity,
             "angle-spread",
-            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: are these "
-            "degrees under a label of radians? If so, give them with --angles FILE (degrees, one a line).",
+            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: these look "
+            "like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a line).",
         )
-    elif span < 2 * 3.3 and angles.size > 30:
+    elif between >= 360:
         yield Finding(
-            "warning",
+            severity,
             "angle-spread",
-            f"{angles.size} projections span only {span:.3f} degrees: are these radians under a label of degrees?",
+            f"The projections go from {degrees.min():.6g} to {degrees.max():.6g} degrees, {between:.4g} from one to "
+            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
+            "degrees with --angles FILE (one a line); if they are right, give them less whole turns.",
+        )
+    elif (unit := _smaller_unit(distinct, angles.size)) is not None:
+        yield Finding(
+            severity,
+            "angle-spread",
+            f"{angles.size} projections span only {span:.4g} degrees: {unit} Give them in degrees with --angles FILE "
+            "(one a line).",
         )
     elif (unseen := half_turn_unseen(angles)) > 0:
         said = f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
@@ -223,6 +237,15 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
         limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
     return float(largest) if largest > limit else 0.0
+def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
+    """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
+    span = float(degrees[-1] - degrees[0])
+    whole = span + span / (degrees.size - 1)
+    for unit, turn in (("radians", 2 * np.pi), ("turns", 1.0)):
+        for part, name in ((turn / 2, "half a turn"), (turn, "a turn")):
+            if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
+                return f"these look like {unit}, of which {part:.5g} are {name}."
+    return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None
 
 
 def quantity_said(source: ScanSource) -> Iterator[Finding]:
@@ -378,6 +401,38 @@ def scale_known(source: ScanSource) -> Iterator[Finding]:
         yield Finding("error", "pixel-size", f"A pixel size of {source.pixel_size_mm:g} mm cannot be.")
 
 
+def stated_used(source: ScanSource) -> Iterator[Finding]:
+    """What the file states is used, or named: as a warning where it may change the volume."""
+    for field in source.not_used:
+        message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
+        yield Finding("warning" if field.doubt else "info", "not-used", message)
+
+
+def pixels_square(source: ScanSource) -> Iterator[Finding]:
+    """Pixels are as high as wide, or each row is a slice of its own."""
+    width, height = source.pixel_size_mm, source.row_pitch_mm
+    if height is None:
+        return
+    if width is None or not 0.01 < height / width < 100:
+        said = "unknown" if width is None else f"{width:g} mm"
+        yield Finding(
+            "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {said}. That cannot be."
+        )
+    elif source.cone is not None:
+        yield Finding(
+            "error",
+            "pixel-height",
+            f"The pixels are {width:g} mm wide and {height:g} mm high, in a cone beam: square pixels are expected. Bin "
+            "the columns or the rows of a copy of the file.",
+        )
+    else:
+        yield Finding(
+            "info",
+            "pixel-height",
+            f"The pixels are {width:g} mm wide and {height:g} mm high: slices will be {height:g} mm apart.",
+        )
+
+
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """A part of a scan that was resumed is not all of it."""
     if source.part_starts.size > 1:
@@ -402,6 +457,8 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     axis_vertical,
     series_complete,
     scale_known,
+    pixels_square,
+    stated_used,
     parts_joined,
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
+from recon.voxels.direct import direct, has_direct_method
 from recon.voxels.fbp import fbp, filter_projections
+from recon.voxels.view_weights import partly_seen
 
 
 def disc_views(
@@ -176,3 +179,52 @@ def test_time_of_90_views_of_256_cubed(rng: np.random.Generator) -> None:
         seconds.append(time.perf_counter() - start)
     print(f"FBP of 90 views of 256 x 256 into 256³: {min(seconds):.3f} s")
     assert min(seconds) < 2
+
+
+@pytest.mark.parametrize("turns", [1.0, 3.0, 0.5])
+@pytest.mark.parametrize("off", [0.0, 9.0], ids=["centred", "wide field"])
+def test_a_helix_gives_the_density_in_every_slice_that_is_seen_over_half_a_turn(turns: float, off: float) -> None:
+    """A tall cylinder: each slice is seen by views of its own; ends that few see are marked."""
+    n, rows, cols = round(180 * turns), 24, 48
+    heights = np.stack([np.zeros(n), np.linspace(-12, 12, n)], 1)
+    geometry = Geometry.parallel(np.arange(n) * 2 * np.pi * turns / n, (rows, cols), shifts=heights)
+    geometry = replace(geometry, axis_col=geometry.axis_col - off)
+    views = disc_views(geometry, 12.0, (2.0, 1.0), density=0.1)
+    grid = Grid.matching(geometry)
+    assert grid.shape[0] == 48
+    volume, z = fbp(views, geometry, grid), grid.coordinates()[0]
+    marked = partly_seen(geometry, z + geometry.axis_row)
+    half = 24 * min(1, 0.5 / turns)  # rows that pass a slice during half a turn
+    gap = 1 + 8 * 24 / n  # eight steps that are missing are no wedge
+    assert marked[np.abs(z) > 24 - half + gap].all() and not marked[np.abs(z) < 24 - half - 1].any()
+    across = np.arange(grid.shape[1]) - (grid.shape[1] - 1) / 2
+    inside = (across - 2) ** 2 + (across[:, None] - 1) ** 2 < 9**2
+    means = volume[:, inside].mean(1)
+    np.testing.assert_allclose(means[~marked], 0.1, rtol=0.03)
+    assert (means[np.abs(z) > 24 - half + gap] < 0.1).all()
+
+
+@pytest.mark.parametrize("cone", [False, True])
+def test_direct_methods_refuse_a_climb_that_they_have_no_weights_for(cone: bool) -> None:
+    angles = np.linspace(0, 6 * np.pi, 90)
+    heights = np.stack([np.zeros(90), np.linspace(-5, 5, 90)], 1)
+    geometry = (
+        Geometry.cone(angles, (12, 16), 1.0, 100.0, 200.0, shifts=heights)
+        if cone
+        else Geometry.parallel(angles, (12, 16), shifts=heights, roll=0.05)
+    )
+    assert not has_direct_method(geometry)
+    with pytest.raises(ValueError, match=r"views climb by 10 of 12 rows.*use an iterative method"):
+        direct(np.zeros((90, 12, 16), np.float32), geometry, Grid.matching(geometry))
+    assert has_direct_method(replace(geometry, shifts=heights / 4))
+
+
+def test_a_jitter_along_the_axis_changes_no_slice_that_all_views_see(rng: np.random.Generator) -> None:
+    shifts = np.stack([np.zeros(60), rng.uniform(-1, 1, 60)], 1)
+    geometry = Geometry.parallel(half_turn(60), (12, 32), shifts=shifts)
+    views = disc_views(geometry, 9.0, (2.0, 1.0), density=0.1)
+    volume = fbp(views, geometry)
+    assert not geometry.climbs and volume.shape == (12, 32, 32)
+    means = volume[:, 12:20, 12:20].mean((1, 2))
+    np.testing.assert_allclose(means[2:-2], means[6], rtol=1e-5)
+    np.testing.assert_allclose(means, 0.1, rtol=0.03)  # the first and the last, which half of the views miss

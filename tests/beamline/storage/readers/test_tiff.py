@@ -14,6 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.image_names import kind_of
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.reference_files import load_images
+from beamline.storage.rules.validate import validate
 from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)
@@ -148,11 +149,28 @@ def test_an_encrypted_archive_is_refused(series: tuple[Path, np.ndarray]) -> Non
         open_scan(path)
 
 
-def test_a_gap_in_the_numbers_is_told(series: tuple[Path, np.ndarray]) -> None:
-    folder, _ = series
+def test_a_gap_in_the_numbers_is_told_and_moves_no_angle(series: tuple[Path, np.ndarray]) -> None:
+    folder, images = series
     (folder / "tiffs" / "raw_5.tiff").unlink()
-    with open_scan(SourceOptions(folder, angle_rows="0:11")) as source:
-        assert source.attributes["missing_numbers"] == "5"
+    there = np.delete(np.arange(12), 5)
+    for rows in (None, "0:12"):
+        with open_scan(SourceOptions(folder, angle_rows=rows)) as source:
+            assert source.attributes["missing_numbers"] == "5"
+            np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12))[there])
+            np.testing.assert_array_equal(source.read(np.arange(3, 14)), images[there])
+    assert any("leaves out the numbers 5" in finding.message for finding in validate(folder))
+
+
+@pytest.mark.parametrize("log", ["before", "around", "after"])
+def test_an_angle_log_of_darks_and_flats_too_is_refused(series: tuple[Path, np.ndarray], log: str) -> None:
+    folder, _ = series
+    scan = list(np.linspace(0, 165, 12))
+    table = {"before": [0.0] * 3 + scan, "around": [0.0, *scan, 165.0, 165.0], "after": scan + [0.0] * 3}[log]
+    np.savetxt(folder / "angles.txt", table)
+    first = {"before": 3, "around": 1, "after": 0}[log]
+    said = rf"15 angles, one for each frame, and .* does not say when .*--angle-rows {first}:{first + 12} "
+    with pytest.raises(DataError, match=said):
+        open_scan(folder)
 
 
 def test_an_image_of_another_shape_or_a_broken_one_is_named(series: tuple[Path, np.ndarray]) -> None:

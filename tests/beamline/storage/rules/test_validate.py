@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from beamline.monitor.digest import digest
 from beamline.storage.describe import describe
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.validate import change_of_rows, half_turn_unseen, source_findings, validate
+from beamline.storage.readers.stacks import FrameStack, StacksSource
+from beamline.storage.rules.validate import angles_spread, change_of_rows, half_turn_unseen, source_findings, validate
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.scans import seal
@@ -245,9 +246,9 @@ def test_degrees_that_are_radians(tmp_path: Path, clock: StandingClock, frames: 
 @pytest.mark.parametrize(
     ("theta", "severity", "said"),
     [
-        (np.arange(0, 180, 3.0), "warning", "28.2 turns, or 177 in radians: are these degrees"),
-        (np.linspace(-90, 90, 61), "warning", "28.6 turns, or 180 in radians"),
-        (np.arange(0, 360, 360 / 61), "warning", "under a label of radians"),
+        (np.arange(0, 180, 3.0), "error", "28.2 turns, or 177 in radians: these look like degrees"),
+        (np.linspace(-90, 90, 61), "error", "28.6 turns, or 180 in radians"),
+        (np.arange(0, 360, 360 / 61), "error", "under a label of radians"),
         (2.399963229728653 * np.arange(200), "", ""),  # golden angles
         (np.radians(np.arange(0, 7200, 1.8)), "", ""),  # twenty turns
         (np.linspace(0, 1.8e4, 60), "error", "up to 1.03e+06 degrees; expected at most 1e+06"),
@@ -262,6 +263,70 @@ def test_radians_that_are_degrees(tmp_path: Path, theta: np.ndarray, severity: s
     hits = [finding for finding in validate(tmp_path / "s.h5") if finding.rule == "angle-spread"]
     assert [hit.severity for hit in hits] == [severity] * bool(severity)
     assert not hits or said in hits[0].message
+
+
+DEGREES = np.arange(0, 180, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("theta", "said"),
+    [
+        (
+            DEGREES * 1000,
+            "0 to 178000 degrees, 2000 from one to the next, which is a turn or more: these look like",
+        ),
+        (-DEGREES * 1000 + 7e4, "-108000 to 70000 degrees, 2000 from one"),
+        (DEGREES[np.random.default_rng(0).permutation(90)] * 1000, "look like counts of an encoder"),
+        (DEGREES * 65536 / 360, "0 to 32403.9 degrees, 364.1 from one"),
+        (np.arange(90) * 360.0, "0 to 32040 degrees, 360 from one"),
+        (np.radians(DEGREES), "span only 3.107 degrees: these look like radians, of which 3.1416 are half a turn"),
+        (np.radians(2 * DEGREES), "radians, of which 6.2832 are a turn"),
+        (np.radians(np.linspace(-90, 90, 9)), "radians, of which 3.1416 are half a turn"),
+        (DEGREES / 360, "span only 0.4944 degrees: these look like turns, of which 0.5 are half a turn"),
+        (DEGREES / 180, "turns, of which 1 are a turn"),
+        (np.radians(DEGREES) * 0.7, "these look like radians or turns"),
+    ],
+)
+def test_angles_that_cannot_be_degrees(tmp_path: Path, theta: np.ndarray, said: str) -> None:
+    path = tmp_path / "s.h5"
+    with h5py.File(path, "w") as file:
+        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, 5)).astype(np.uint16)
+        file["exchange/theta"] = np.full(theta.size, np.nan)
+    (tmp_path / "a.txt").write_text("\n".join(map(str, theta)))
+    hits = [hit for hit in validate(SourceOptions(path, angles=tmp_path / "a.txt")) if hit.rule == "angle-spread"]
+    assert [hit.severity for hit in hits] == ["error"]
+    assert said in hits[0].message
+    assert "--angles FILE" in hits[0].message
+
+
+class Nothing:
+    def close(self) -> None:
+        pass
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    views=st.integers(6, 400),
+    turns=st.sampled_from([0.25, 0.5, 1.0, 2.0, 20.0]),
+    start=st.floats(-400, 400),
+    sign=st.sampled_from([-1, 1]),
+    order=st.sampled_from(["even", "golden", "random"]),
+)
+def test_angles_of_any_plan_are_no_counts_and_no_radians(
+    views: int, turns: float, start: float, sign: int, order: str
+) -> None:
+    share = {
+        "even": np.arange(views) / views,
+        "golden": np.mod(0.618034 * np.arange(views), 1),
+        "random": np.random.default_rng(views).random(views),
+    }[order]
+    source = StacksSource(
+        Path("none"), Nothing(), [FrameStack(FrameKind.PROJECTION, "views", np.ones((views, 2, 2)))],
+        format="", facts={},
+    )  # fmt: skip
+    turns = min(turns, views / 2 if order == "even" else 1.0)  # no stage turns on by whole turns
+    source.angles[:] = np.radians(start + sign * 360 * turns * share)
+    assert all(hit.severity != "error" for hit in angles_spread(source))
 
 
 def test_float_frames_that_are_all_nan(tmp_path: Path) -> None:

@@ -1,0 +1,272 @@
+"""Fields of foreign files that bear on geometry, units, order and validity, and what we do with each.
+
+`NXTOMO` and `EXCHANGE` are the lists behind docs/scan_files.md. A reader asks `not_used` for those that its file states
+and that nobody uses; `info` shows them, and `validate` warns where such a value may change the volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.text import printable
+from beamline.storage import hdf5
+from beamline.storage.readers.base import NotUsed, ScanSource
+from drivers.base.frame import FrameKind
+
+Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
+"""Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
+
+EXCHANGE_LENGTH_UNITS = {**hdf5.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
+EXCHANGE_ENERGY_UNITS = {
+    **hdf5.ENERGY_UNITS,
+    "j": 1 / 1.602176634e-16,
+    "joule": 1 / 1.602176634e-16,
+    "": 1 / 1.602176634e-16,
+}
+_HALF_PIXEL = 0.5  # what moves by less is not seen
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a file format.
+
+    Attributes:
+        where: its path below the entry, or below the root of Data Exchange; "detector/" is the detector that is read.
+        use: what we do with it, or, if `used` is False, why its value changes nothing or what to do about it.
+        used: it is read.
+        units: of a number that is used: those that are known.
+        matters: of one that is not used: whether its value may change the volume; None: it cannot.
+    """
+
+    where: str
+    use: str
+    used: bool = True
+    matters: Matters | None = None
+    units: Mapping[str, float] | None = None
+
+
+def not_used(fields: Sequence[Field], root: h5py.Group, source: ScanSource, detector: str = "") -> tuple[NotUsed, ...]:
+    """The fields that a file states and that are not used; a value that may change the volume is a doubt.
+
+    Numbers that would be used, were their unit known, are among them.
+    """
+    found = []
+    for field in fields:
+        item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
+        if item is None or item.size == 0:
+            continue
+        value, unit = np.asarray(item[()]), hdf5.attribute(item, "units")
+        if not field.used:
+            doubt = field.matters is not None and field.matters(value, item, source)
+            found.append(NotUsed(field.where, _text(value, unit), field.use, doubt))
+        elif field.units is not None and unit.lower() not in field.units and _true(value, item, source):
+            why = f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
+            found.append(NotUsed(field.where, _text(value, unit), why, True))
+    return tuple(found)
+
+
+def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:
+    if where.startswith("detector/"):
+        where = f"{detector}/{where.removeprefix('detector/')}"
+    return hdf5.dataset(root, where)
+
+
+def _text(value: NDArray[Any], units: str) -> str:
+    if value.size == 1:
+        first = value.reshape(-1)[0]
+        said = f"{first:.6g}" if value.dtype.kind == "f" else hdf5.text(first)
+    elif value.dtype.kind in "uif" and value.size and value.ndim == 1:
+        said = f"{np.nanmin(value):.6g} to {np.nanmax(value):.6g}" if np.isfinite(value).any() else "nan"
+    else:
+        said = " x ".join(map(str, value.shape)) + " values"
+    return printable(f"{said} {units}".strip())
+
+
+def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    return value.dtype.kind in "uifb" and bool(np.nan_to_num(value.astype(np.float64)).any())
+
+
+def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
+    factor = hdf5.LENGTH_UNITS.get(hdf5.attribute(item, "units").lower())
+    if value.dtype.kind not in "uif" or value.size != source.image_key.size:
+        return False
+    places = value.reshape(-1)[source.image_key == FrameKind.PROJECTION].astype(np.float64)
+    span = float(np.ptp(places)) if places.size and np.isfinite(places).all() else 0.0
+    if factor is None or source.pixel_size_mm is None:
+        return span > 0
+    return span * factor > _HALF_PIXEL * source.pixel_size_mm
+
+
+def _shifts(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    return value.dtype.kind in "uif" and value.size > 0 and float(np.ptp(value.astype(np.float64))) > _HALF_PIXEL
+
+
+def _off_middle(along: int) -> Matters:
+    def matters(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+        """A central ray of a cone more than a twentieth of the detector beside its middle."""
+        if source.cone is None or value.size != 1 or hdf5.attribute(item, "units").lower() not in ("", "pixel", "px"):
+            return False
+        n = source.shape[along]
+        return abs(float(value.reshape(-1)[0]) - (n - 1) / 2) > 0.05 * n
+
+    return matters
+
+
+def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
+    """More than 1 % from 1: an optical magnification that nothing in the file's pixel sizes tells apart."""
+    return value.dtype.kind in "uif" and value.size == 1 and abs(float(value.reshape(-1)[0]) - 1) > 0.01
+
+
+_POSES = "give the shifts of views with --poses"
+UPRIGHT = "the detector is taken to stand upright to the beam"
+_DONE = "frames are corrected as if raw; if they are corrected, say --quantity line-integrals or give the raw ones"
+
+NXTOMO: tuple[Field, ...] = (
+    Field("definition", "tells the kind of the file; the structure decides, not the name"),
+    Field("detector/data", "frames [frame, row, col]; the attribute `axes` of NXdata must not name another order"),
+    Field("detector/image_key", "kind of each frame; codes that nobody defined are invalid frames"),
+    Field("detector/image_key_control", "as image_key, with -1 for alignment; it goes before"),
+    Field("detector/count_time", "exposure of each frame", units=hdf5.TIME_UNITS),
+    Field(
+        "detector/x_pixel_size",
+        "width of a pixel: at the sample for a parallel beam, on the detector for a cone",
+        units=hdf5.LENGTH_UNITS,
+    ),
+    Field(
+        "detector/y_pixel_size",
+        "height of a pixel; slices of a parallel beam are as far apart, others are refused",
+        units=hdf5.LENGTH_UNITS,
+    ),
+    Field("sample/x_pixel_size", "width of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS),
+    Field(
+        "sample/y_pixel_size", "height of a pixel at the sample; goes before the detector's", units=hdf5.LENGTH_UNITS
+    ),
+    Field(
+        "detector/distance",
+        "from the sample to the detector: phase, and the magnification of a cone",
+        units=hdf5.LENGTH_UNITS,
+    ),
+    Field(
+        "instrument/source/distance",
+        "from the source to the sample, of either sign, also of an NXsource of another name: a cone beam, unless it "
+        "magnifies by less than 1 % and a ray leaves its parallel by less than half a pixel in the whole field",
+        units=hdf5.LENGTH_UNITS,
+    ),
+    Field("detector/x_flipped", "frames are mirrored left to right as they are read"),
+    Field("detector/y_flipped", "frames are mirrored upside down as they are read"),
+    Field(
+        "detector/transformations",
+        "half turns about the axes, by the direction of `gravity`, mirror the frames; other turns are named",
+    ),
+    Field("sample/rotation_angle", "angle of each frame by its `units`; without units it is refused"),
+    Field("sample/name", "name in reports"),
+    Field("title", "name in reports"),
+    Field("start_time", "shown"),
+    Field("end_time", "shown"),
+    Field("instrument/name", "shown"),
+    Field("control/data", "ring current of each frame, or another monitor of the beam"),
+    Field("instrument/beam/incident_energy", "energy; also in beam/ and sample/beam/", units=hdf5.ENERGY_UNITS),
+    Field("instrument/beam/incident_wavelength", "energy, where no energy is stated; also in beam/ and sample/beam/"),
+    Field("instrument/monochromator/energy", "energy, where the beam states none", units=hdf5.ENERGY_UNITS),
+    Field("instrument/monochromator/wavelength", "energy, where no energy is stated"),
+    Field(
+        "detector/x_rotation_axis_pixel_position", "its origin is not defined; the axis is searched, or --axis", False
+    ),
+    Field("detector/y_rotation_axis_pixel_position", "its origin is not defined", False),
+    Field("detector/estimated_cor_from_motor", "its origin is not defined; the axis is searched, or --axis", False),
+    Field("detector/field_of_view", "the views show whether the field is half", False),
+    Field("detector/half_acquisition", "the views show whether the field is half", False),
+    Field("detector/beam_center_x", "the central ray meets the middle of the columns", False, _off_middle(1)),
+    Field("detector/beam_center_y", "the central ray meets the middle of the rows", False, _off_middle(0)),
+    Field("detector/x_pixel_offset", "pixels are taken to be evenly spaced", False),
+    Field("detector/y_pixel_offset", "pixels are taken to be evenly spaced", False),
+    Field("detector/magnification", "pixel sizes are taken as they are; give --pixel-size-um", False, _disagrees),
+    Field("detector/polar_angle", UPRIGHT, False, _true),
+    Field("detector/azimuthal_angle", UPRIGHT, False, _true),
+    Field("detector/x_translation", _POSES, False, _moves),
+    Field("detector/y_translation", _POSES, False, _moves),
+    Field("sample/x_translation", f"{_POSES}, unless the stage moved the axis, too", False, _moves),
+    Field("sample/y_translation", f"{_POSES}, unless the stage moved the axis, too", False, _moves),
+    Field("sample/z_translation", _POSES, False, _moves),
+    Field("sample/distance", "the sample is taken to be at the rotation axis", False),
+    Field("sample/propagation_distance", "follows from the distances of source and detector", False),
+    Field("sample/polar_angle", "the rotation axis is taken to stand along the columns", False, _true),
+    Field("detector/flatfield_applied", _DONE, False, _true),
+    Field("detector/pixel_mask_applied", "defective pixels are searched", False),
+    Field("detector/pixel_mask", "defective pixels are searched", False),
+    Field("detector/flatfield", "flats are the frames whose image_key is 1", False),
+    Field("detector/angular_calibration_applied", "frames are taken as they are", False, _true),
+    Field("detector/countrate_correction_applied", "frames are taken as they are", False),
+    Field("detector/saturation_value", "saturation is judged by the frames", False),
+    Field("detector/underload_value", "frames are taken as they are", False),
+    Field("detector/bit_depth_readout", "saturation is judged by the frames", False),
+    Field("detector/sequence_number", "frames are taken in the order of the file", False),
+    Field("detector/frame_start_number", "frames are taken in the order of the file", False),
+    Field("detector/real_x_pixel_size", "x_pixel_size is used", False),
+    Field("detector/real_y_pixel_size", "y_pixel_size is used", False),
+)
+
+EXCHANGE: tuple[Field, ...] = (
+    Field("implements", "shown"),
+    Field("exchange/data", "projections; the attribute `axes` tells the order of its dimensions, theta:y:x without it"),
+    Field("exchange/data_white", "flats, in the order that its `axes` tells, or that of data"),
+    Field("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
+    Field("exchange/theta", "angle of each projection, by its `units`; degrees without them"),
+    Field("exchange/title", "name in reports"),
+    Field("measurement/sample/name", "name in reports"),
+    Field(
+        "measurement/instrument/monochromator/energy",
+        "energy by its `units`; without them joule, as the format says",
+        units=EXCHANGE_ENERGY_UNITS,
+    ),
+    Field(
+        "measurement/instrument/detector/x_pixel_size",
+        "width of a pixel by its `units`; without them metre, as the format says. It is on the detector: times "
+        "x_binning, over objective/magnification",
+        units=EXCHANGE_LENGTH_UNITS,
+    ),
+    Field(
+        "measurement/instrument/detector/y_pixel_size",
+        "height of a pixel, as x_pixel_size",
+        units=EXCHANGE_LENGTH_UNITS,
+    ),
+    Field("measurement/instrument/detector/x_binning", "pixels of the detector in a column of the data"),
+    Field("measurement/instrument/detector/y_binning", "pixels of the detector in a row of the data"),
+    Field("measurement/instrument/detector/objective/magnification", "pixel size at the sample"),
+    Field("exchange/theta_white", "the order of flats among the views is not used", False),
+    Field("exchange/theta_dark", "the order of darks among the views is not used", False),
+    Field("exchange/data_shift_x", _POSES, False, _shifts),
+    Field("exchange/data_shift_y", _POSES, False, _shifts),
+    Field("exchange/x", "pixels are taken to be evenly spaced; x_pixel_size is used", False),
+    Field("exchange/y", "pixels are taken to be evenly spaced; y_pixel_size is used", False),
+    Field("measurement/instrument/source/energy", "the energy of the ring, not of the photons", False),
+    Field("measurement/instrument/source/current", "one value for the whole scan", False),
+    Field(
+        "measurement/instrument/detector/exposure_time", "flats and darks are taken to be exposed as the views", False
+    ),
+    Field("measurement/instrument/detector/roi/x1", "columns count from the first in the data", False),
+    Field("measurement/instrument/detector/roi/y1", "rows count from the first in the data", False),
+    Field("measurement/instrument/detector/geometry/translation/distances", UPRIGHT, False),
+    Field("measurement/instrument/detector/geometry/orientation/value", UPRIGHT, False),
+    Field("measurement/sample/geometry/translation/distances", _POSES, False),
+    Field(
+        "measurement/sample/geometry/orientation/value", "the rotation axis is taken to stand along the columns", False
+    ),
+    Field(
+        "measurement/instrument/interferometer/number_of_grid_steps", "phase steps are not combined", False, _disagrees
+    ),
+    Field(
+        "measurement/instrument/detection_system/objective/resolution",
+        "not in the format; give it as --pixel-size-um",
+        False,
+    ),
+    Field("process/acquisition/rotation/start", "theta is used", False),
+    Field("process/acquisition/rotation/step", "theta is used", False),
+)
