@@ -69,6 +69,8 @@ class ReferenceFrame:
         saturated: fraction of the pixels at or above the saturation value.
         blocks: float32, means of blocks of pixels; a part of the preview where that is large.
         block: pixels a side of a block.
+        invalid: fraction of the pixels that are not finite.
+        cells: float32, means of larger blocks that cover the frame; None: not needed.
     """
 
     row: int
@@ -77,6 +79,8 @@ class ReferenceFrame:
     saturated: float
     blocks: NDArray[np.float32]
     block: int
+    invalid: float = 0.0
+    cells: NDArray[np.float32] | None = None
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
@@ -99,6 +103,9 @@ class FaultKind(StrEnum):
     UNEVEN = auto()
     MOSTLY_UNLIT = auto()
     LIGHT_IN_DARKS = auto()
+    UNWRITTEN = auto()  # frames of one value
+    NOT_FINITE = auto()
+    SAMPLE_IN = auto()  # flats that look like views
 
 
 @dataclass(frozen=True)

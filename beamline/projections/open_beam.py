@@ -27,7 +27,7 @@ from beamline.projections.steps.flats import Flats
 from beamline.projections.steps.references import ReferenceCheck
 from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ReferenceGroups, reference_groups
+from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
@@ -74,8 +74,8 @@ class OpenBeam:
             DataError: references that cannot be used.
         """
         factor = current_scale(source) if use_current(selection) else None
-        n, groups = count_references(source), reference_groups(source)
-        used = groups if selection.step(ReferenceCheck).accepted else groups.good()
+        n, accepted = count_references(source), selection.step(ReferenceCheck).accepted
+        used = groups_taken(source) if accepted else reference_groups(source).good()
         references = read_references(source, used, read, selection)
         if selection.step(Flats).fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
