@@ -55,6 +55,7 @@ def without_odd(
     darks = _split(darks, lambda: _lit_darks(darks, flats), odd)
     flats = _split(flats, lambda: _unusable(flats, darks, limits), odd)
     flats = _split(flats, lambda: _changed(flats, darks, limits), odd)
+    views = lit_views(views, darks)
     if views:
         flats = _split(flats, lambda: _with_sample(flats, darks, views, single=True), odd)
         flats = _split(flats, lambda: _with_sample(flats, darks, views, single=False), odd)
@@ -66,6 +67,7 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
 
     In a true scan nothing outshines the flats in places, though a view may be empty where a sample leaves the field.
     """
+    views = lit_views(views, darks)
     if len(views) < 3 or not flats:
         return None
     base = _base(darks)
@@ -87,6 +89,14 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
         f"of line integral (limit {limit:.2g}), though a sample only takes light: the sample was in the beam."
     )
     return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+
+
+def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
+    """Those of the views that hold more than the light of a closed shutter, or than one value."""
+    base = _base(darks)
+    light = [float(np.percentile(_cells(view, base), BRIGHT)) for view in views]
+    least = UNLIT * max(light, default=0.0)
+    return [view for view, bright in zip(views, light, strict=True) if bright > least and _varies(view)]
 
 
 @dataclass(frozen=True)
@@ -228,11 +238,10 @@ def _with_sample(
     means = [np.mean(group, axis=0) for group in light]
     found = []
     for at, group in enumerate(flats):
-        if single:
-            own = light[at]
-            compared = [(each, [np.median(own[:i] + own[i + 1 :], axis=0)]) for i, each in enumerate(own)]
-            if len(own) < 3:  # of two, each is the other one's only witness
-                compared = [(each, own[:i] + own[i + 1 :]) for i, each in enumerate(own)]
+        if single:  # of two flats each is the other one's only witness
+            own, n = light[at], len(group)
+            rest = [own[:i] + own[i + 1 :] for i in range(n)]
+            compared = [(own[i], [np.median(rest[i], axis=0)] if n > 2 else rest[i]) for i in range(n)]
         else:
             compared = [(means[at], means[:at] + means[at + 1 :])]
         for i, (image, others) in enumerate(compared):

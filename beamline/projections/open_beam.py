@@ -50,6 +50,7 @@ class OpenBeam:
         photons: how pixels count photons; None: logarithms are taken.
         current_factor: float64 [frame], by how much its light grows to the median ring current; None: not asked for.
         n_references: darks and flats that the file had.
+        used: those that are used.
         done: results of its steps, by name of the step.
     """
 
@@ -58,6 +59,7 @@ class OpenBeam:
     photons: Photons | None
     current_factor: NDArray[np.float64] | None
     n_references: int
+    used: ReferenceGroups
     done: dict[str, StepDone]
 
     @classmethod
@@ -93,7 +95,7 @@ class OpenBeam:
             "flats": StepDone(flats, {"flats": flats or selection.step(Flats).fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
-        return cls(references, settings, photons, factor, n, done)
+        return cls(references, settings, photons, factor, n, used, done)
 
     def correction(self, rows: slice, shadow: Mask | None) -> Correction:
         """The correction of some of the rows read, binned.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.calibrate import Calibrated
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.emission import prepare_emission
 from beamline.projections.flags import UsableViews, checked_views
 from beamline.projections.poses import poses_of, require_known
@@ -116,8 +117,16 @@ def prepare_projections(
         projections = correction.at_once(wanted, progress=phases.progress)
     else:
         projections = correction.in_batches(wanted, spill.views, spill.batch, spill.progress)
+    if 2 * projections.view_ids.size < wanted.size:
+        raise DataError(
+            f"{source.path}: only {projections.view_ids.size} of {wanted.size} views can be used; the others have no "
+            "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
+            "those that can be used with --views, or repeat the others."
+        )
     phases.enter("background, rings, views held out, hardening", "corrections")
-    others = correction.at_once(others_ids) if rest.size else None
+    others = None
+    with suppress(NoViewError):  # those held out may all be without light
+        others = correction.at_once(others_ids) if rest.size else None
     ids = projections.view_ids
     on_disk, column = spill is not None, places.axis_col
     found = assemble(source, selection, projections, places.of(ids), (column, axis), usable, warn, on_disk)

@@ -75,14 +75,14 @@ def groups_taken(source: ScanSource) -> ReferenceGroups:
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
     """The references of a scan of counts, judged frame by frame and as groups; flats beside those of their part."""
     taken = groups_taken(source)
-    groups = [[_reference(source, int(row)) for row in group] for group in (*taken.darks, *taken.flats)]
+    groups = [[reference_frame(source, int(row)) for row in group] for group in (*taken.darks, *taken.flats)]
     left, odd = without_odd(groups, limits, views := _views_beside(source, taken.flats))
     dark, lit = ([group for group in left if group[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
     exposed = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
     found = [*judge([*dark, *lit], limits)[: len(dark)]]
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
         own, seen = [group for group in lit if start <= group[0].row < end], exposed[(exposed >= start) & (exposed < end)]
-        witnesses = [_reference(source, int(row)) for row in _some(seen, SAMPLES)] if seen.size and own else []
+        witnesses = [reference_frame(source, int(row)) for row in some_of(seen, SAMPLES)] if seen.size and own else []
         found += judge([*dark, *own], limits, witnesses)[len(dark) :]
     if lit and not any(group.faults for group in found[len(dark) :]) and (fault := flats_like_views(lit, dark, views)):
         found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
@@ -97,14 +97,14 @@ def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
     views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
     if not views.size:
         return []
-    chosen = set(_some(views, VIEWS).tolist())
+    chosen = set(some_of(views, VIEWS).tolist())
     for group in flats:
         at = int(np.searchsorted(views, group[0]))
         chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
         angle = source.angles[group[0]]
         if np.isfinite(angle) and np.isfinite(source.angles[views]).any():
             chosen.add(int(views[np.nanargmin(np.abs(source.angles[views] - angle))]))
-    return [_reference(source, row) for row in sorted(chosen)]
+    return [reference_frame(source, row) for row in sorted(chosen)]
 
 
 def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
@@ -139,7 +139,8 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
             yield Finding("warning", "bad-references", f"{message} The other {name} are used instead.")
 
 
-def _some(group: Frames, most: int) -> Frames:
+def some_of(group: Frames, most: int) -> Frames:
+    """At most so many, evenly spread."""
     return group[np.unique(np.linspace(0, group.size - 1, most).astype(int))]
 
 
@@ -147,15 +148,17 @@ def _some(group: Frames, most: int) -> Frames:
 _seen: WeakKeyDictionary[ScanSource, dict[int, ReferenceFrame]] = WeakKeyDictionary()
 
 
-def _reference(source: ScanSource, row: int) -> ReferenceFrame:
+def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
+    """Statistics of a frame of any kind, with its cells; it is read once."""
     seen = _seen.setdefault(source, {})
     if row not in seen:
-        seen[row] = _look_at(source.read([row])[0], row)
+        seen[row] = look_at(source.read([row])[0], row)
     kind = FrameKind(int(source.image_key[row]))
     return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
 
 
-def _look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
+def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
+    """Statistics of an image, with its cells."""
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
     side = max(BLOCK, image.shape[1] // CELLS)
     about = row, FrameKind.INVALID, np.nan
