@@ -32,7 +32,8 @@ BLOCK_SIGMAS = 3.0  # noises of a block that the level of a dark may move beside
 INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best frame: dead pixels are in all frames
 LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
 CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
-BRIGHTER = 0.3  # of the depth of the views, by which places must be brighter than in flats with the sample in
+SAME = 0.1  # noises of a place: two frames of one scene differ by more, however alike they are
+BRIGHTER = 0.5  # of the depth of the views, by which places must be brighter than in flats with the sample in
 
 Places = NDArray[np.float32]
 
@@ -73,16 +74,17 @@ def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Grou
     base = _base(darks)
     light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
     lit = _lit_places(light)
-    through = [_log(_cells(view, base), light, lit) for view in views]
+    through = [_without_drift(_log(_cells(view, base), light, lit), lit) for view in views]
     spreads = np.array([_spread(each) for each in through])
     nearest = int(np.argmin(spreads))
     if not spreads[nearest] < LIKER * np.median(spreads):
         return None
-    level, noise = np.median(through[nearest]), _noise_of(through[nearest])
+    level, noise = np.median(through[nearest]), float(np.median([_noise_of(each) for each in through]))
     brighter = float(np.median([np.percentile(each, WORST) - level for each in through]))
     darker = float(np.median([level - np.percentile(each, 100 - WORST) for each in through]))
     limit = max(BRIGHTER * darker, CHANGE_SIGMAS / 2 * noise)
-    if not brighter > limit > 0:
+    same = spreads[nearest] < SAME * noise
+    if not (same or brighter > limit > 0):
         return None
     said = (
         f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by {brighter:.2g} "
@@ -190,19 +192,19 @@ def _changed(
     """Flats with other light than most of their group; where half of the group differs, it has no right light."""
     found = []
     offset = _offset(darks)
-    for group in flats:
-        light = [(frame.blocks - offset) / _seconds(frame) for frame in group]
-        most = max(float(np.nanpercentile(each, BRIGHT)) for each in light)
-        if len(group) < 2 or not most > 0:
-            continue
+    of_all = [[(frame.blocks - offset) / _seconds(frame) for frame in group] for group in flats]
+    bright = [max(float(np.nanpercentile(each, BRIGHT)) for each in light) for light in of_all]
+    for group, light, most in zip(flats, of_all, bright, strict=True):
+        if len(group) < 2 or not most > UNLIT * max(0.0, *bright):
+            continue  # a group without light is a fault that `judge` tells
         unlit = [float(np.nanpercentile(each, BRIGHT)) < UNLIT * most for each in light]
         usual = np.median([each for each, dark in zip(light, unlit, strict=True) if not dark], axis=0)
         lit = usual > UNLIT * np.nanpercentile(usual, BRIGHT)
         ratio = np.stack([each[lit] / usual[lit] for each in light])
         levels = np.nanmedian(ratio, axis=1)
-        local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)
-        place = np.nanpercentile(local, WORST, axis=1)
-        noise = NORMAL * float(np.nanmedian(np.nanmedian(local, axis=1)))
+        local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)  # 1 where there is no light
+        place = np.nan_to_num(np.nanpercentile(local, WORST, axis=1))
+        noise = NORMAL * float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1)))
         uneven = float(np.ptp(levels)) > limits.uneven
         far = np.abs(levels - np.median(levels)) > limits.uneven / 2
         flickers, changed = [], []
@@ -288,6 +290,13 @@ def _log(image: Places, other: Places, lit: NDArray[np.bool_]) -> Places:
     least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
     least = max(least, 1e-30)
     return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
+
+
+def _without_drift(values: Places, lit: NDArray[np.bool_]) -> Places:
+    """Less a polynomial of the second order in row and column: so a beam drifts, and a sample has more detail."""
+    row, col = (axis[lit] / max(n, 1) for axis, n in zip(np.indices(lit.shape), lit.shape, strict=True))
+    terms = np.stack([np.ones_like(row), row, col, row * row, row * col, col * col], axis=1)
+    return np.asarray(values - terms @ np.linalg.lstsq(terms, values.astype(np.float64), rcond=None)[0], np.float32)
 
 
 def _spread(values: Places) -> float:

@@ -86,10 +86,15 @@ class OpenBeam:
         photons = photons_of(source, used, references, rows, selection)
         defects = selection.step(Defects)
         settings = CorrectionSettings(
-            defects.floor, defects.hot_threshold, defects.zinger_threshold, selection.step(Air).columns
+            defects.floor,
+            defects.hot_threshold,
+            defects.zinger_threshold,
+            selection.step(Air).columns,
+            selection.step(Air).sample_from,
         )
         flats, noise = _flats_said(source, references, factor), _noise_said(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
+        del recorded["sample_from"]  # follows from --air
         done = {
             "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
             "flats": StepDone(flats, {"flats": flats or selection.step(Flats).fields}),

@@ -25,6 +25,7 @@ from beamline.projections.steps.poses import stated_poses
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
+from beamline.projections.truncation import cut_said, cut_sides
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -254,6 +255,8 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
+    if sides := cut_sides(projections.data, geometry):
+        warn(cut_said(sides))
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")
