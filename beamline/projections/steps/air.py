@@ -92,6 +92,8 @@ class Air:
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
+        import numpy as np
+
         from beamline.projections.background import without_background
         from beamline.projections.truncation import cut_sides
         from recon.base.masks import areas
@@ -99,8 +101,13 @@ class Air:
         if self.surface == "auto" and cut_sides(views.projections.data, views.geometry):
             return StepDone("", {"surface": self.surface, "background": "none taken off: the sample fills the field"})
 
+        air = views.projections.air
+        levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0
         said, terms = without_background(
-            views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked)
-        )
-        parameters: dict[str, Any] = {"surface": self.surface, "background": said or "none taken off"}
+            views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked),
+            levelled,
+        )  # fmt: skip
+        line = any(views.projections.air_columns)
+        nothing = "no surface taken off, a line through the air at the edges" if line else "none taken off"
+        parameters: dict[str, Any] = {"surface": self.surface, "background": said or nothing}
         return StepDone(said, parameters if terms is None else {**parameters, "background_terms": terms})
