@@ -70,6 +70,8 @@ class ReferenceFrame:
         blocks: float32, means of blocks of pixels; a part of the preview where that is large.
         block: pixels a side of a block.
         rounding: noise that the pixels' type may hide; 0 of real numbers.
+        invalid: fraction of the pixels that are not finite.
+        cells: float32, means of larger blocks that cover the frame; None: not needed.
     """
 
     row: int
@@ -79,6 +81,8 @@ class ReferenceFrame:
     blocks: NDArray[np.float32]
     block: int
     rounding: float = LEAST_NOISE
+    invalid: float = 0.0
+    cells: NDArray[np.float32] | None = None
 
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> ReferenceFrame:
@@ -101,6 +105,9 @@ class FaultKind(StrEnum):
     UNEVEN = auto()
     MOSTLY_UNLIT = auto()
     LIGHT_IN_DARKS = auto()
+    UNWRITTEN = auto()  # frames of one value
+    NOT_FINITE = auto()
+    SAMPLE_IN = auto()  # flats that look like views
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import noise_level
 from recon.base.volume import Grid
-from recon.prep.background import AirSums, Background, matter
+from recon.prep.background import LEAST_SIZE, AirSums, Background, matter
 from recon.splatting.initialise import first_volume
 from recon.voxels.fbp import fbp_memory
 from recon.voxels.projector import Projector
@@ -67,6 +67,7 @@ def without_background(
     wanted: Surface,
     others: tuple[F32, Geometry] | None = None,
     unknown: Mask | None = None,
+    levelled: float = 0.0,
 ) -> tuple[str, F64 | None]:
     """Take the background of the beam off views [view, row, col], in place.
 
@@ -76,6 +77,7 @@ def without_background(
         wanted: "auto": where the views confirm it; a number: polynomials of this order.
         others: further views and their geometry, which lose their background, too.
         unknown: bool [row, col], pixels that were not measured.
+        levelled: line integral of the air at the edges that was taken off already, the mean of the views.
 
     Raises:
         DataError: polynomials were asked for, and too few rays miss the sample.
@@ -93,14 +95,18 @@ def without_background(
         )
     if order is None and not found.confirmed(noise_level(views.binned(_spread(len(data), _NOISE_VIEWS)))):
         return "", None
+    before = ""
+    if abs(levelled) >= LEAST_SIZE:
+        before = f"a line through the air at the edges was taken off ({levelled:+.3f} of line integral); then "
     seen = (
-        f"the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by the "
+        f"{before}the air of the views is a surface from {found.lowest:+.3f} to {found.highest:+.3f} of line integral, by the "
         f"{found.air:.0%} of the rays that miss the sample (order {found.order})"
     )
-    if order is None and found.may_be_matter:
+    # With the line, the views are brighter than their flats where matter would be: then it is the beam that changed.
+    if order is None and found.may_be_matter and found.level + levelled > 0:
         return (
-            f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: none "
-            f"taken off. If that is air, give --air surface:{found.order}."
+            f"Background of the beam: {seen}. It is positive, as weak matter all around the sample would be: the "
+            f"surface is not taken off. If that is air, give --air surface:{found.order}."
         ), None
     if others is not None:
         more = _Views(*others, unknown)

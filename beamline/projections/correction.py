@@ -12,7 +12,9 @@ from scipy import ndimage
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
+from beamline.core.text import count, spans
 from beamline.projections.filters import ViewFilters
+from beamline.projections.flags import gap_said
 from beamline.projections.open_beam import OpenBeam, count_references
 from beamline.projections.read import current_scale, read_binned, reading_memory, tell_damaged, use_current
 from beamline.projections.selection import Selection
@@ -20,6 +22,7 @@ from beamline.projections.steps.counts import CountModel
 from beamline.projections.steps.flags import Flags
 from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.unlit import ViewLight
 from beamline.storage.rules.validate import altered_said
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, Projections, Transmission, UnlitViewsError, merge_and_empty
@@ -27,6 +30,10 @@ from recon.prep.counts import Photons
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of zingers
+
+
+class NoViewError(DataError):
+    """None of the views asked for can be used."""
 
 
 class ScanCorrection:
@@ -60,6 +67,8 @@ class ScanCorrection:
             raise ConfigError(f"--noise counts: {source.path} holds line integrals, not counts. Leave it out.")
         elif use_current(selection):
             current_scale(source)  # refuses a file without any
+        self._told: set[int] = set()  # views without light that were named
+        self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
         self._stream: Correction | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
 
@@ -86,7 +95,10 @@ class ScanCorrection:
         """
         self._look_for_shadow(frames)
         steps = 1 if self._beam is None else _STEPS
+        asked = frames
         data, frames = self._read(frames, rows, lambda n, of: progress(n // steps, of))
+        if rows is None:  # in a band it says nothing of the views
+            self._tell_unlit(asked, frames)
         if not frames.size:
             raise self._no_view()
         return self._corrected(self._correction(rows), data, frames, last=True, rows=rows, progress=progress)
@@ -134,6 +146,7 @@ class ScanCorrection:
             at += n
             kept.append(replace(corrected, data=np.empty((0, *out.shape[1:]), np.float32)))
             progress(begun + min((done + 1) * batch, frames.size), passes * frames.size)
+        self._tell_unlit(frames, np.concatenate([part.view_ids for part in kept]) if kept else frames[:0])
         if not at:
             raise self._no_view()
         masked = np.logical_and.reduce([part.masked for part in kept])
@@ -149,7 +162,9 @@ class ScanCorrection:
         Raises:
             DataError: as `at_once`.
         """
+        asked = frames
         data, frames = self._read(frames, None)
+        self._tell_unlit(asked, frames)
         if self._stream is None:
             self._stream = self._correction(None)
         if not frames.size and not (last and self._stream is not None and self._stream.waiting):
@@ -207,12 +222,31 @@ class ScanCorrection:
                     f"{dark.size} of {len(frames)} views hold no finite pixel (first: frame {dark[0]}): left out."
                 )
             data, frames = data[alive], frames[alive]
+        lit = np.ones(len(frames), np.bool_)
+        part, beam = self._filters.within(rows), self._beam
+        references = (None, None) if beam is None else (beam.references.dark[part], beam.references.flats[0][1][part])
+        for at in np.flatnonzero(self._light.suspect(data, *references)):
+            lit[at] = not self._light.unlit(int(frames[at]))
+        if not lit.all():
+            data, frames = data[lit], frames[lit]
         return data, frames
 
-    def _no_view(self) -> DataError:
-        return DataError(
-            f"{self._source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, or differ "
-            "from their checksums."
+    def _no_view(self) -> NoViewError:
+        return NoViewError(
+            f"{self._source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
+            "light, or differ from their checksums."
+        )
+
+    def _tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
+        """Name the views without light among those asked for, once, and the gap that they leave."""
+        unlit = np.array([row for row in asked.tolist() if self._light.known.get(row) is False], np.int64)
+        if (news := np.setdiff1d(unlit, sorted(self._told))).size == 0:
+            return
+        gap = f", and{said}" if (said := gap_said(self._source, asked, lit)) else ""
+        self._told.update(news.tolist())
+        self._warn(
+            f"{count(news.size, 'view')} of {asked.size} (frames {spans(news.tolist())}) have no light: the shutter "
+            f"was closed, the beam was gone, or the file was never written there. They are left out{gap}."
         )
 
     def _look_for_shadow(self, views: NDArray[np.int64]) -> None:

@@ -163,12 +163,17 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
         return UsableViews(rows, flags=flags, jumps=treated.jumps)
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
-    period = np.pi if source.cone is None else 2 * np.pi
-    before, after = (_widest_gap(source.angles[some], period) for some in (rows, good))
-    gap = f" They leave {np.degrees(after):.3g}° without a view." if after >= WIDE * before else ""
-    said = f"{treated.said}{gap} --flags ignore takes all alike."
+    gap = gap_said(source, rows, good)
+    said = f"{treated.said}{gap and f' They{gap}.'} --flags ignore takes all alike."
     regions = regions_of(treated.flags, source.shape)
     return UsableViews(good, weights, int(treated.left_out.sum()), said, flags, regions, treated.jumps)
+
+
+def gap_said(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
+    """" leave 12° without a view" where the views left have such a gap, which those before had not; else empty."""
+    period = np.pi if source.cone is None else 2 * np.pi
+    narrow, wide = (_widest_gap(source.angles[some], period) for some in (before, after))
+    return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""
 
 
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:

@@ -28,7 +28,7 @@ from beamline.projections.steps.flats import Flats
 from beamline.projections.steps.references import ReferenceCheck
 from beamline.projections.steps.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ReferenceGroups, reference_groups
+from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups
 from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
@@ -51,6 +51,7 @@ class OpenBeam:
         photons: how pixels count photons; None: logarithms are taken.
         current_factor: float64 [frame], by how much its light grows to the median ring current; None: not asked for.
         n_references: darks and flats that the file had.
+        used: those that are used.
         done: results of its steps, by name of the step.
     """
 
@@ -59,6 +60,7 @@ class OpenBeam:
     photons: Photons | None
     current_factor: NDArray[np.float64] | None
     n_references: int
+    used: ReferenceGroups
     done: dict[str, StepDone]
 
     @classmethod
@@ -75,8 +77,8 @@ class OpenBeam:
             DataError: references that cannot be used.
         """
         factor = current_scale(source) if use_current(selection) else None
-        n, groups = count_references(source), reference_groups(source)
-        used = groups if selection.step(ReferenceCheck).accepted else groups.good()
+        n, accepted = count_references(source), selection.step(ReferenceCheck).accepted
+        used = groups_taken(source) if accepted else reference_groups(source).good()
         references = read_references(source, used, read, selection)
         if selection.step(Flats).fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
@@ -85,16 +87,21 @@ class OpenBeam:
         photons = photons_of(source, used, references, rows, selection)
         defects = selection.step(Defects)
         settings = CorrectionSettings(
-            defects.floor, defects.hot_threshold, defects.zinger_threshold, selection.step(Air).columns
+            defects.floor,
+            defects.hot_threshold,
+            defects.zinger_threshold,
+            selection.step(Air).columns,
+            selection.step(Air).sample_from,
         )
         flats, noise = _flats_said(source, references, factor), _noise_said(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
+        del recorded["sample_from"]  # follows from --air
         done = {
             "defects": StepDone(parameters={f"correction_{name}": value for name, value in recorded.items()}),
             "flats": StepDone(flats, {"flats": flats or selection.step(Flats).fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
-        return cls(references, settings, photons, factor, n, done)
+        return cls(references, settings, photons, factor, n, used, done)
 
     def correction(self, rows: slice, shadow: Mask | None) -> Correction:
         """The correction of some of the rows read, binned.

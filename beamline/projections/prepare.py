@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from beamline.core.phases import Phases
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.calibrate import Calibrated
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import NoViewError, ScanCorrection
 from beamline.projections.emission import prepare_emission
 from beamline.projections.flags import UsableViews, checked_views
 from beamline.projections.poses import poses_of, require_known
@@ -24,6 +25,7 @@ from beamline.projections.steps.poses import stated_poses
 from beamline.projections.steps.resampling import TiltAndLens
 from beamline.projections.steps.step import PlaceStep, RayStep, ScanStep, StepDone, ViewPlaces
 from beamline.projections.tilt import spread, warn_of_tilt, with_tilt
+from beamline.projections.truncation import cut_said, cut_sides
 from beamline.storage.readers.base import ScanSource
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -116,8 +118,16 @@ def prepare_projections(
         projections = correction.at_once(wanted, progress=phases.progress)
     else:
         projections = correction.in_batches(wanted, spill.views, spill.batch, spill.progress)
+    if 2 * projections.view_ids.size < wanted.size:
+        raise DataError(
+            f"{source.path}: only {projections.view_ids.size} of {wanted.size} views can be used; the others have no "
+            "light, no finite pixel, or not the pixels that were written. So few are not taken for the scan: choose "
+            "those that can be used with --views, or repeat the others."
+        )
     phases.enter("background, rings, views held out, hardening", "corrections")
-    others = correction.at_once(others_ids) if rest.size else None
+    others = None
+    with suppress(NoViewError):  # those held out may all be without light
+        others = correction.at_once(others_ids) if rest.size else None
     ids = projections.view_ids
     on_disk, column = spill is not None, places.axis_col
     found = assemble(source, selection, projections, places.of(ids), (column, axis), usable, warn, on_disk)
@@ -245,6 +255,8 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     report_defects(projections, warn)
+    if sides := cut_sides(projections.data, geometry):
+        warn(cut_said(sides))
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the views chosen can be used, 2 are needed.")

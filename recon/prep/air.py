@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 
 _MAD = 1.4826  # median absolute deviation to standard deviation of a normal distribution
+_NEXT = 5  # views next to flats
 _BANDS = 8  # of rows, at most
 
 
@@ -47,6 +51,20 @@ def air_columns(profiles: F32, cols: int, tolerance: float = 0.03) -> tuple[int,
         levels.append(float(np.median(level)))
     left, right = (n if level > 0.9 * max(levels) else 0 for n, level in zip(counts, levels, strict=True))
     return left, right
+
+
+def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[float], columns: tuple[int, int]) -> float:
+    """Line integral at the edges with air, in the views nearest to a group of flats; the least of all groups.
+
+    Args:
+        profiles: as of `edge_profiles`; positions: [view], of the views in the scan.
+        flats: positions of the groups.
+        columns: that show air, left and right.
+    """
+    sides = [side for side, n in enumerate(columns) if n]
+    light = np.median(profiles[:, sides, :, :3], axis=(1, 2, 3))
+    beside = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
+    return min(float(-np.log(max(np.median(light[views]), 1e-30))) for views in beside)
 
 
 def air_light(transmission: F32, left: int, right: int) -> F32:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import Mask
 from recon.base.masks import Image, fill, plan_fill
-from recon.prep.air import air_columns, air_light, edge_profiles
+from recon.prep.air import air_columns, air_light, edge_depth, edge_profiles
 from recon.prep.counts import Photons, of_view
 from recon.prep.defects import dead_pixels, zingers
 from recon.prep.references import References as References
@@ -34,12 +34,15 @@ class CorrectionSettings:
             itself in the neighbouring views, to be replaced; inf replaces none.
         air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
         divided by their level, or by the line through the levels of both sides.
+        sample_from: line integral at the edges from which "auto" takes them for sample. It is that of the views next to
+            flats: a beam drifts away from its flats, and a sample that is wider than the field is there at once.
     """
 
     floor: float = 1e-4
     hot_threshold: float = 10.0
     zinger_threshold: float = 8.0
     air: Literal["none", "auto"] | tuple[int, int] = "auto"
+    sample_from: float = np.inf
 
     def __post_init__(self) -> None:
         if not 0 < self.floor < 1:
@@ -139,6 +142,7 @@ class Correction:
             ]
         self._part_starts = references.part_starts
         self._profiles: list[NDArray[np.float32]] = []
+        self._surveyed: list[NDArray[np.int64]] = []
         self._before: Image | None = None  # the last returned view, before the logarithm
         self._waiting: tuple[Transmission, NDArray[np.float32]] | None = None  # the newest view, and its air
 
@@ -163,8 +167,24 @@ class Correction:
         """(left, right) columns of air by the views surveyed so far; (0, 0): no columns."""
         air = self._settings.air
         if air == "auto":
-            return air_columns(np.concatenate(self._profiles), self._dark.shape[1]) if self._profiles else (0, 0)
+            return self._air_found()[0]
         return (0, 0) if air == "none" else air
+
+    @property
+    def cut_off(self) -> float:
+        """Line integral at edges that look like air and count as sample, see `CorrectionSettings`; 0: none do."""
+        return self._air_found()[1] if self._settings.air == "auto" else 0.0
+
+    def _air_found(self) -> tuple[tuple[int, int], float]:
+        """Columns of air by the views surveyed, and the line integral at the edges if that makes them sample."""
+        if not self._profiles:
+            return (0, 0), 0.0
+        profiles, ids = np.concatenate(self._profiles), np.concatenate(self._surveyed)
+        columns = air_columns(profiles, self._dark.shape[1])
+        if not any(columns) or not np.isfinite(self._settings.sample_from):
+            return columns, 0.0
+        depth = edge_depth(profiles, ids, [position for position, _ in self._flats], columns)
+        return ((0, 0), depth) if depth > self._settings.sample_from else (columns, 0.0)
 
     def transmission(
         self,
@@ -221,6 +241,7 @@ class Correction:
         """Let the views take part in finding the air columns."""
         if self._settings.air == "auto":
             self._profiles.append(edge_profiles(views.data))
+            self._surveyed.append(views.view_ids)
 
     def line_integrals(
         self, views: Transmission | None, last: bool = True, progress: Callable[[int], None] = lambda done: None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
 Columns = Literal["none", "auto"] | tuple[int, int]
 Surface = Literal["auto", "none"] | int
 """The surface that is taken off as the background of the beam: by its order, or "auto" where the views confirm it."""
+
+EDGE = 0.1
+"""Line integral at the edges up to which a sample is inside the field, as of the monitor's check `field`: more than
+phase fringes and scattered light leave there."""
 
 _MODELS: dict[str, tuple[Columns, Surface]] = {
     "auto": ("auto", "auto"), "columns": ("auto", "none"), "none": ("none", "none"),
@@ -70,6 +75,11 @@ class Air:
         return _parts(self.model)[0]
 
     @property
+    def sample_from(self) -> float:
+        """Line integral at the edges from which they are sample; columns that were asked for are air."""
+        return EDGE if self.model == "auto" else math.inf
+
+    @property
     def surface(self) -> Surface:
         """See `beamline.projections.background`."""
         return _parts(self.model)[1]
@@ -82,11 +92,22 @@ class Air:
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
     ) -> StepDone:
+        import numpy as np
+
         from beamline.projections.background import without_background
+        from beamline.projections.truncation import cut_sides
         from recon.base.masks import areas
 
+        if self.surface == "auto" and cut_sides(views.projections.data, views.geometry):
+            return StepDone("", {"surface": self.surface, "background": "none taken off: the sample fills the field"})
+
+        air = views.projections.air
+        levelled = float(np.mean(-np.log(air[air > 0]))) if (air > 0).any() else 0.0
         said, terms = without_background(
-            views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked)
-        )
-        parameters: dict[str, Any] = {"surface": self.surface, "background": said or "none taken off"}
+            views.projections.data, views.geometry, self.surface, views.held_out, areas(views.projections.masked),
+            levelled,
+        )  # fmt: skip
+        line = any(views.projections.air_columns)
+        nothing = "no surface taken off, a line through the air at the edges" if line else "none taken off"
+        parameters: dict[str, Any] = {"surface": self.surface, "background": said or nothing}
         return StepDone(said, parameters if terms is None else {**parameters, "background_terms": terms})

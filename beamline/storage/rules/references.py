@@ -5,19 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
 from beamline.monitor.digest import block_means, digest
-from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
+from beamline.monitor.odd_references import flats_like_views, without_odd
+from beamline.monitor.references import Group, JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 
-SAMPLES = 4  # frames of a group, and views, that are looked at
+SAMPLES = 4  # views beside whose light flats are judged
+VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
 BLOCK = 4  # pixels a side
+CELLS = 48  # across the frame, about, by which flats are compared with views
 
 Frames = NDArray[np.int64]
 
@@ -27,7 +32,8 @@ class ReferenceGroups:
     """Darks and flats of a scan, by groups.
 
     Attributes:
-        darks, flats: rows of each group, in the order of the file.
+        darks, flats: rows of each group, in the order of the file. Frames of a group that are none (see
+            `beamline.monitor.odd_references`) are groups of their own.
         judged: the verdict on each group, the darks first.
     """
 
@@ -61,18 +67,44 @@ def groups_of(source: ScanSource, kind: FrameKind) -> tuple[Frames, ...]:
     return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
 
 
+def groups_taken(source: ScanSource) -> ReferenceGroups:
+    """The references of a scan as they were taken, whatever is wrong with them."""
+    return ReferenceGroups(groups_of(source, FrameKind.DARK), groups_of(source, FrameKind.FLAT), ())
+
+
 def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) -> ReferenceGroups:
-    """The references of a scan of counts, judged by a few frames of each group; flats beside those of their part."""
-    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
-    dark, lit = ([_readable(source, _some(group)) for group in of] for of in (darks, flats))
-    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
-    found = judge([*dark, *lit], limits)[: len(darks)]
+    """The references of a scan of counts, judged frame by frame and as groups; flats beside those of their part."""
+    taken = groups_taken(source)
+    groups = [_readable(source, group) for group in (*taken.darks, *taken.flats)]
+    left, odd = without_odd(groups, limits, views := _views_beside(source, taken.flats))
+    dark, lit = ([group for group in left if group[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
+    exposed = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & (source.exposures > 0))
+    found = [*judge([*dark, *lit], limits)[: len(dark)]]
     for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
-        own, seen = [group for group in lit if start <= group[0].row < end], views[(views >= start) & (views < end)]
-        witnesses = _readable(source, _some(seen)) if seen.size and own else []
-        found += judge([*dark, *own], limits, witnesses)[len(darks) :]
-    whole = [JudgedGroup(j.kind, tuple(g.tolist()), j.faults) for j, g in zip(found, (*darks, *flats), strict=True)]
-    return ReferenceGroups(darks, flats, tuple(whole))
+        own, seen = [group for group in lit if start <= group[0].row < end], exposed[(exposed >= start) & (exposed < end)]
+        witnesses = _readable(source, some_of(seen, SAMPLES)) if seen.size and own else []
+        found += judge([*dark, *own], limits, witnesses)[len(dark) :]
+    if lit and not any(group.faults for group in found[len(dark) :]) and (fault := flats_like_views(lit, dark, views)):
+        found = [replace(group, faults=(fault,)) if group.kind is FrameKind.FLAT else group for group in found]
+    judged = sorted([*found, *odd], key=lambda group: (group.kind is FrameKind.FLAT, group.rows[0]))
+    rows = [np.array(group.rows, np.int64) for group in judged]
+    n = sum(group.kind is FrameKind.DARK for group in judged)
+    return ReferenceGroups(tuple(rows[:n]), tuple(rows[n:]), tuple(judged))
+
+
+def _views_beside(source: ScanSource, flats: tuple[Frames, ...]) -> Group:
+    """Views of the whole scan, those taken next to flats, and those at the angles of flats, with their cells."""
+    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    if not views.size:
+        return []
+    chosen = set(some_of(views, VIEWS).tolist())
+    for group in flats:
+        at = int(np.searchsorted(views, group[0]))
+        chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
+        angle = source.angles[group[0]]
+        if np.isfinite(angle) and np.isfinite(source.angles[views]).any():
+            chosen.add(int(views[np.nanargmin(np.abs(source.angles[views] - angle))]))
+    return _readable(source, np.array(sorted(chosen), np.int64))
 
 
 def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
@@ -107,22 +139,41 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
             yield Finding("warning", "bad-references", f"{message} The other {name} are used instead.")
 
 
-def _some(group: Frames) -> Frames:
-    return group[np.unique(np.linspace(0, group.size - 1, SAMPLES).astype(int))]
+def some_of(group: Frames, most: int) -> Frames:
+    """At most so many, evenly spread."""
+    return group[np.unique(np.linspace(0, group.size - 1, most).astype(int))]
 
 
 def _readable(source: ScanSource, rows: Frames) -> list[ReferenceFrame]:
     """Those of some frames that the file gives; all, where it gives none."""
-    read = [_reference(source, int(row)) for row in rows]
+    read = [reference_frame(source, int(row)) for row in rows]
     return [reference for reference in read if reference.row not in source.unreadable] or read
 
 
-def _reference(source: ScanSource, row: int) -> ReferenceFrame:
-    image = read_known(source, [row])[0]
+# What was seen of frames, whose pixels do not change while the scan is open, by their rows.
+_seen: WeakKeyDictionary[ScanSource, dict[int, ReferenceFrame]] = WeakKeyDictionary()
+
+
+def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
+    """Statistics of a frame of any kind, with its cells; it is read once."""
+    seen = _seen.setdefault(source, {})
+    if row not in seen:
+        seen[row] = look_at(read_known(source, [row])[0], row)
+    kind = FrameKind(int(source.image_key[row]))
+    return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
+
+
+def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
+    """Statistics of an image, with its cells."""
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
-    about = row, FrameKind(int(source.image_key[row])), float(source.exposures[row])
+    side = max(BLOCK, image.shape[1] // CELLS)
+    about = row, FrameKind.INVALID, np.nan
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
-        return ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
-    seen = ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)
-    return seen if image.dtype.kind in "ui" else replace(seen, rounding=0.0)  # transmission: flats of 1, darks of 0
+        frame = ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
+        return replace(frame, cells=block_means(image, side))
+    known = digest(image, saturation, BLOCK)
+    frame = ReferenceFrame.of(*about, known, BLOCK)
+    cells = known.preview if side == BLOCK else digest(image, None, side).preview
+    frame = replace(frame, invalid=known.invalid_fraction, cells=np.array(cells))
+    return frame if image.dtype.kind in "ui" else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0

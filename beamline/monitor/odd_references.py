@@ -1,0 +1,331 @@
+"""Single darks and flats that are none: lit, unlit, saturated, never written, or with the sample in the beam.
+
+`beamline.monitor.references` judges groups as they are; here each frame is compared with its group, with the other
+groups, and with the views. A frame that is none would spoil the mean of its group, however good the others are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.references import (
+    BRIGHT,
+    CHANGE_SIGMAS,
+    NORMAL,
+    UNLIT,
+    WORST,
+    FaultKind,
+    Group,
+    JudgedGroup,
+    ReferenceFault,
+    ReferenceFrame,
+    ReferenceLimits,
+)
+from drivers.base.frame import FrameKind
+
+LIT = 0.02  # share of the flats' light from which a dark is lit: 0.02 of transmission, if it were the only dark
+BLOCK_SIGMAS = 3.0  # noises of a block that the level of a dark may move beside that: readout drifts with its noise
+INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best frame: dead pixels are in all frames
+LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
+CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
+SAME = 0.1  # noises of a place: two frames of one scene differ by more, however alike they are
+BRIGHTER = 0.5  # of the depth of the views, by which places must be brighter than in flats with the sample in
+
+Places = NDArray[np.float32]
+
+
+def without_odd(
+    groups: Sequence[Group], limits: ReferenceLimits | None = None, views: Group = ()
+) -> tuple[list[list[ReferenceFrame]], list[JudgedGroup]]:
+    """The groups without the frames that are none (without a group where none is left), and what these are.
+
+    A group with no good frame at all stays whole where its kind has no other: `judge` tells its fault.
+
+    Args:
+        groups: of one kind each, none empty, in the order of the file.
+        views: some projections, by which a flat with the sample in the beam is known; they need `cells`.
+    """
+    limits = limits or ReferenceLimits()
+    darks, flats = ([list(g) for g in groups if g[0].kind is kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
+    odd: list[JudgedGroup] = []
+    darks = _split(darks, lambda: _unusable(darks, None, limits), odd)
+    darks = _split(darks, lambda: _lit_darks(darks, flats), odd)
+    flats = _split(flats, lambda: _unusable(flats, darks, limits), odd)
+    flats = _split(flats, lambda: _changed(flats, darks, limits), odd)
+    views = lit_views(views, darks)
+    if views:
+        flats = _split(flats, lambda: _with_sample(flats, darks, views, single=True), odd)
+        flats = _split(flats, lambda: _with_sample(flats, darks, views, single=False), odd)
+    return [*darks, *flats], odd
+
+
+def flats_like_views(flats: Sequence[Group], darks: Sequence[Group], views: Group) -> ReferenceFault | None:
+    """The fault of flats that all have the sample in the beam: they look like one view, and others outshine them.
+
+    In a true scan nothing outshines the flats in places, though a view may be empty where a sample leaves the field.
+    """
+    views = lit_views(views, darks)
+    if len(views) < 3 or not flats:
+        return None
+    base = _base(darks)
+    light = np.mean([_cells(frame, base) for group in flats for frame in group], axis=0)
+    lit = _lit_places(light)
+    through = [_without_drift(_log(_cells(view, base), light, lit), lit) for view in views]
+    spreads = np.array([_spread(each) for each in through])
+    nearest = int(np.argmin(spreads))
+    if not spreads[nearest] < LIKER * np.median(spreads):
+        return None
+    level, noise = np.median(through[nearest]), float(np.median([_noise_of(each) for each in through]))
+    brighter = float(np.median([np.percentile(each, WORST) - level for each in through]))
+    darker = float(np.median([level - np.percentile(each, 100 - WORST) for each in through]))
+    limit = max(BRIGHTER * darker, CHANGE_SIGMAS / 2 * noise)
+    same = spreads[nearest] < SAME * noise
+    if not (same or brighter > limit > 0):
+        return None
+    said = (
+        f"they look like the view in frame {views[nearest].row}, and in places the views are brighter by {brighter:.2g} "
+        f"of line integral (limit {limit:.2g}), though a sample only takes light: the sample was in the beam."
+    )
+    return ReferenceFault(FaultKind.SAMPLE_IN, brighter, limit, said)
+
+
+def lit_views(views: Group, darks: Sequence[Group]) -> list[ReferenceFrame]:
+    """Those of the views that hold more than the light of a closed shutter, or than one value."""
+    base = _base(darks)
+    light = [float(np.percentile(_cells(view, base), BRIGHT)) for view in views]
+    least = UNLIT * max(light, default=0.0)
+    return [view for view, bright in zip(views, light, strict=True) if bright > least and _varies(view)]
+
+
+@dataclass(frozen=True)
+class _Odd:
+    """A frame that is none: the fault it has, its figure, the limit, and a sentence with {figures}."""
+
+    frame: ReferenceFrame
+    kind: FaultKind
+    score: float
+    limit: float
+    said: str
+
+
+def _split(
+    groups: list[list[ReferenceFrame]], find: Callable[[], list[_Odd]], odd: list[JudgedGroup]
+) -> list[list[ReferenceFrame]]:
+    """The groups without the odd frames, which are added to the others; all of them, where none would be left."""
+    found = find()
+    rows = {each.frame.row for each in found}
+    left = [[frame for frame in group if frame.row not in rows] for group in groups]
+    if not found or not any(left):
+        return groups
+    for group in groups:
+        for kind in FaultKind:
+            own = [each for each in found if each.kind is kind and each.frame in group]
+            if own:
+                scores = sorted(each.score for each in own)
+                figures = f"{scores[0]:.3g}" if scores[0] == scores[-1] else f"{scores[0]:.3g} to {scores[-1]:.3g}"
+                fault = ReferenceFault(kind, scores[-1], own[0].limit, own[0].said.format(figures=figures))
+                odd.append(JudgedGroup(group[0].kind, tuple(each.frame.row for each in own), (fault,)))
+    return [group for group in left if group]
+
+
+def _unusable(
+    groups: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]] | None, limits: ReferenceLimits
+) -> list[_Odd]:
+    """Darks of zeros, and frames that hold numbers that are not finite, or are saturated, unlike the others."""
+    frames = [frame for group in groups for frame in group]
+    if not frames:
+        return []
+    found: list[_Odd] = []
+    zero = [frame for frame in frames if not np.any(frame.blocks)] if darks is None else []
+    if 2 * sum(_varies(frame) for frame in frames) > len(frames):
+        said = "every pixel is 0: never written, or no frame of the camera."
+        found += [_Odd(frame, FaultKind.UNWRITTEN, 0.0, 0.0, said) for frame in zero]
+    for group in groups:
+        least = min(frame.invalid for frame in group)
+        hot = 0.0 if not darks else float(np.median([dark.saturated for each in darks for dark in each]))
+        some = min(frame.saturated for frame in group) - hot <= limits.saturated  # else `judge` has the fault of all
+        for frame in group:
+            if frame.invalid > least + INVALID:
+                said = f"a share of {{figures}} of the pixels is not finite (limit {least + INVALID:.3g})."
+                found.append(_Odd(frame, FaultKind.NOT_FINITE, frame.invalid, least + INVALID, said))
+            elif darks is not None and some and frame.saturated - hot > limits.saturated:
+                said = f"a share of {{figures}} of the pixels is saturated (limit {limits.saturated:g})."
+                found.append(_Odd(frame, FaultKind.SATURATED, frame.saturated - hot, limits.saturated, said))
+    rows: set[int] = set()
+    return [each for each in found if each.frame.row not in rows and not rows.add(each.frame.row)]  # type: ignore[func-returns-value]
+
+
+def _varies(frame: ReferenceFrame) -> bool:
+    known = frame.blocks[np.isfinite(frame.blocks)]
+    return known.size > 0 and bool(np.ptp(known) > 0)
+
+
+def _lit_darks(darks: list[list[ReferenceFrame]], flats: list[list[ReferenceFrame]]) -> list[_Odd]:
+    """Darks above the darkest of their exposure: light only adds to counts."""
+    found = []
+    exposures = {_exposure(frame) for group in darks for frame in group}
+    for exposure in exposures:
+        same = [frame for group in darks for frame in group if _exposure(frame) == exposure]
+        base = min(same, key=_level)
+        lowest = _level(base)
+        levels = [_level(frame) for group in flats for frame in group]
+        light = (max(levels) if levels else max(map(_level, same))) - lowest
+        limit = max(LIT * light, BLOCK_SIGMAS * _noise_of(base.blocks))
+        for frame in same:
+            above = _level(frame) - lowest
+            if above > limit:
+                said = (
+                    f"there is light in them, or their offset moved: {{figures}} counts above the darkest dark, frame "
+                    f"{base.row} with {lowest:.6g} (limit {limit:.3g}, by the {light:.6g} of light in the flats)."
+                )
+                found.append(_Odd(frame, FaultKind.LIGHT_IN_DARKS, above, limit, said))
+    return found
+
+
+def _changed(
+    flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], limits: ReferenceLimits
+) -> list[_Odd]:
+    """Flats with other light than most of their group; where half of the group differs, it has no right light."""
+    found = []
+    offset = _offset(darks)
+    of_all = [[(frame.blocks - offset) / _seconds(frame) for frame in group] for group in flats]
+    bright = [max(float(np.nanpercentile(each, BRIGHT)) for each in light) for light in of_all]
+    for group, light, most in zip(flats, of_all, bright, strict=True):
+        if len(group) < 2 or not most > UNLIT * max(0.0, *bright):
+            continue  # a group without light is a fault that `judge` tells
+        unlit = [float(np.nanpercentile(each, BRIGHT)) < UNLIT * most for each in light]
+        usual = np.median([each for each, dark in zip(light, unlit, strict=True) if not dark], axis=0)
+        lit = usual > UNLIT * np.nanpercentile(usual, BRIGHT)
+        ratio = np.stack([each[lit] / usual[lit] for each in light])
+        levels = np.nanmedian(ratio, axis=1)
+        local = np.abs(ratio / np.where(levels > 0, levels, np.inf)[:, None] - 1)  # 1 where there is no light
+        place = np.nan_to_num(np.nanpercentile(local, WORST, axis=1))
+        noise = NORMAL * float(np.median(np.nanmedian(local[~np.array(unlit)], axis=1)))
+        uneven = float(np.ptp(levels)) > limits.uneven
+        far = np.abs(levels - np.median(levels)) > limits.uneven / 2
+        flickers, changed = [], []
+        for frame, dark, level, off, other in zip(group, unlit, levels, far, place, strict=True):
+            if dark:
+                said = f"{{figures}} of the light of the group's brightest (limit {UNLIT:g}): no beam in them."
+                changed.append(_Odd(frame, FaultKind.NO_BEAM, max(float(level), 0.0), UNLIT, said))
+            elif uneven and off:
+                said = f"{{figures}} times the light of the usual flat of their group (limit 1 +- {limits.uneven:g})."
+                flickers.append(_Odd(frame, FaultKind.UNEVEN, float(level), 1 + limits.uneven, said))
+            elif other > (limit := max(limits.uneven, CHANGE_SIGMAS * noise)):
+                said = (
+                    "in places their light differs from the usual flat of their group by a share of {figures} (limit "
+                    f"{limit:.3g}): something was in the beam. Is the sample out?"
+                )
+                flickers.append(_Odd(frame, FaultKind.UNEVEN, float(other), limit, said))
+        kept = len(group) - len(changed)
+        found += changed + (flickers if 2 * len(flickers) < kept else [])
+    return found
+
+
+def _with_sample(
+    flats: list[list[ReferenceFrame]], darks: list[list[ReferenceFrame]], views: Group, *, single: bool
+) -> list[_Odd]:
+    """Flats that differ less from a view than from other flats.
+
+    Args:
+        single: each flat beside those of its group; else each group beside the other groups.
+    """
+    base = _base(darks)
+    seen = [_cells(view, base) for view in views]
+    light = [[_cells(flat, base) for flat in group] for group in flats]
+    means = [np.mean(group, axis=0) for group in light]
+    found = []
+    for at, group in enumerate(flats):
+        if single:  # of two flats each is the other one's only witness
+            own, n = light[at], len(group)
+            rest = [own[:i] + own[i + 1 :] for i in range(n)]
+            compared = [(own[i], [np.median(rest[i], axis=0)] if n > 2 else rest[i]) for i in range(n)]
+        else:
+            compared = [(means[at], means[:at] + means[at + 1 :])]
+        for i, (image, others) in enumerate(compared):
+            if not others:
+                continue
+            lit = _lit_places(np.maximum.reduce([image, *others]))
+            changes = [_log(image, other, lit) for other in others]
+            change = min(changes, key=_spread)
+            off, noise = _spread(change), _noise_of(change)
+            if not off > BLOCK_SIGMAS * max(noise, 1e-6):
+                continue
+            like = [_spread(_log(image, view, lit)) for view in seen]
+            nearest = int(np.argmin(like))
+            if like[nearest] < LIKER * off:
+                said = (
+                    f"they differ from the {'others of their group' if single else 'other flats'} by {{figures}} of "
+                    f"line integral, and by {like[nearest]:.2g} only from the view in frame {views[nearest].row}: the "
+                    "sample was in the beam."
+                )
+                frames = [group[i]] if single else group
+                found += [_Odd(frame, FaultKind.SAMPLE_IN, off, like[nearest] / LIKER, said) for frame in frames]
+    return found
+
+
+def _base(darks: list[list[ReferenceFrame]] | Sequence[Group]) -> Places | float:
+    frames = [_whole(frame) for group in darks for frame in group]
+    return 0.0 if not frames else np.asarray(np.mean(frames, axis=0), np.float32)
+
+
+def _whole(frame: ReferenceFrame) -> Places:
+    return frame.blocks if frame.cells is None else frame.cells
+
+
+def _cells(frame: ReferenceFrame, base: Places | float) -> Places:
+    return np.asarray(np.nan_to_num(_whole(frame) - base), np.float32)
+
+
+def _lit_places(light: Places) -> NDArray[np.bool_]:
+    return light > UNLIT * max(float(np.percentile(light, BRIGHT)), 1e-30)
+
+
+def _log(image: Places, other: Places, lit: NDArray[np.bool_]) -> Places:
+    """Logarithm of the one over the other where there is light; what has none counts as a thousandth."""
+    least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
+    least = max(least, 1e-30)
+    return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
+
+
+def _without_drift(values: Places, lit: NDArray[np.bool_]) -> Places:
+    """Less a polynomial of the second order in row and column: so a beam drifts, and a sample has more detail."""
+    row, col = (axis[lit] / max(n, 1) for axis, n in zip(np.indices(lit.shape), lit.shape, strict=True))
+    terms = np.stack([np.ones_like(row), row, col, row * row, row * col, col * col], axis=1)
+    return np.asarray(values - terms @ np.linalg.lstsq(terms, values.astype(np.float64), rcond=None)[0], np.float32)
+
+
+def _spread(values: Places) -> float:
+    """Standard deviation without the outermost values."""
+    if not values.size:
+        return 0.0
+    low, high = np.percentile(values, (CLIPPED, 100 - CLIPPED))
+    return float(np.clip(values, low, high).std())
+
+
+def _noise_of(values: Places) -> float:
+    """Standard deviation of a place by its neighbour along the row: matter and beam change more slowly."""
+    change = np.diff(values, axis=-1)
+    change = change[np.isfinite(change)]
+    return NORMAL * float(np.median(np.abs(change))) / 2**0.5 if change.size else 0.0
+
+
+def _level(frame: ReferenceFrame) -> float:
+    return float(np.nanpercentile(frame.blocks, BRIGHT))
+
+
+def _offset(darks: list[list[ReferenceFrame]]) -> Places | float:
+    frames = [frame.blocks for group in darks for frame in group]
+    return 0.0 if not frames else np.asarray(np.mean(frames, axis=0), np.float32)
+
+
+def _exposure(frame: ReferenceFrame) -> float:
+    return round(frame.exposure, 6) if frame.exposure > 0 else 0.0
+
+
+def _seconds(frame: ReferenceFrame) -> float:
+    return frame.exposure if frame.exposure > 0 else 1.0

@@ -1,0 +1,45 @@
+"""Truncation: a sample that goes on beyond the edges of the field, which no view sees whole."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from beamline.projections.steps.air import EDGE
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.voxels.view_weights import covers_the_circle
+
+_VIEWS, _COLUMNS, _SHARE = 32, 3, 0.1  # views and columns looked at; share of the depth in the middle
+
+
+def cut_sides(data: F32, geometry: Geometry) -> dict[str, float]:
+    """Line integral at each edge ("left", "right") beyond which the sample goes on; empty where it is in the field.
+
+    The median over views and rows is asked, so that a holder or a corner at some angles does not count. It must be
+    more than `EDGE`, and than a tenth of what is in the middle, as in the monitor's check `field`. A full turn about
+    an axis off the middle is cut at the side near the axis on purpose; the other half turn sees what is there.
+
+    Args:
+        data: line integrals [view, row, col].
+    """
+    n, cols = len(data), data.shape[2]
+    if n == 0 or cols < 2 * _COLUMNS:
+        return {}
+    some = np.asarray(data[np.unique(np.linspace(0, n - 1, min(n, _VIEWS)).round().astype(int))])
+    edges = {"left": some[:, :, :_COLUMNS], "right": some[:, :, -_COLUMNS:]}
+    if geometry.is_off_middle and covers_the_circle(geometry.angles):
+        far = "right" if geometry.axis_col < (cols - 1) / 2 else "left"
+        edges = {far: edges[far]}
+    depth = float(np.median(some.max(axis=2)))
+    levels = {side: float(np.median(values)) for side, values in edges.items()}
+    return {side: level for side, level in levels.items() if level > max(EDGE, _SHARE * depth)}
+
+
+def cut_said(sides: dict[str, float]) -> str:
+    """A warning for `cut_sides`."""
+    return (
+        f"The sample goes on beyond the {' and '.join(sides)} edge of the field (line integral "
+        f"{max(sides.values()):.2f} there). What lies outside is not seen by all views: values inside are relative, "
+        "not absolute, and those at the rim are uncertain. FBP takes views to fade out beyond the edge; the edges are "
+        "not taken for air. If they are air, and the beam is weaker than its flats, give --air columns."
+    )

@@ -1,0 +1,115 @@
+"""Views without light: the shutter was closed, the beam was gone, or the file was never written there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.monitor.references import BRIGHT, NORMAL, UNLIT, ReferenceFrame
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.references import VIEWS, Frames, ReferenceGroups, look_at, reference_frame, some_of
+from drivers.base.frame import FrameKind
+from recon.base.arrays import F32
+
+LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
+_SUSPECT = 0.1  # share of the flats' light from which a view is not looked at more closely
+_ACROSS = 16  # cells a side, at most
+_TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
+
+
+@dataclass(frozen=True, eq=False)
+class ViewLight:
+    """The light of whole views beside that of the flats; no band of rows, in which a sample may be opaque.
+
+    Attributes:
+        dark, flat: float32 [cell row, cell col], means; a scan of line integrals has none.
+        usual: brightness of the brightest of some views, see `brightness`; 1 where there is none yet.
+        known: frames that were looked at, and whether they have light.
+    """
+
+    source: ScanSource
+    dark: F32 | None
+    flat: F32 | None
+    usual: float
+    known: dict[int, bool] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, source: ScanSource, used: ReferenceGroups | None) -> ViewLight:
+        """By these darks and flats, and some views; None: the scan holds line integrals."""
+        views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+        if used is None:
+            return cls(source, None, None, 1.0)
+        dark, flat = (_mean_cells(source, groups) for groups in (used.darks, used.flats))
+        seen = [brightness(_cells(source, row), dark, flat) for row in some_of(views, VIEWS).tolist()]
+        return cls(source, dark, flat, float(np.percentile(seen, BRIGHT)) if seen else 1.0)
+
+    def suspect(self, data: NDArray[np.generic], dark: F32 | None, flat: F32 | None) -> NDArray[np.bool_]:
+        """bool [view]: views whose pixels read, maybe in a band of rows, are dark or all the same.
+
+        Args:
+            data: [view, row, col], as read.
+            dark, flat: [row, col], of the same pixels; None: line integrals.
+        """
+        least = np.array([view.min() == view.max() for view in data], np.bool_)
+        if dark is None or flat is None:
+            return least
+        small = [_binned(image) for image in (dark, flat)]
+        bright = np.array([brightness(_binned(view), *small) for view in data])
+        return least | (bright < _SUSPECT * max(self.usual, 0.0))
+
+    def unlit(self, frame: int) -> bool:
+        """A whole view has no light, or is of one value where the flats are not."""
+        if frame not in self.known:
+            self.known[frame] = not self._unlit(frame)
+        return not self.known[frame]
+
+    def _unlit(self, frame: int) -> bool:
+        image = self.source.read([frame])[0]
+        if not np.isfinite(image).any():
+            return True
+        same = bool(image.min() == image.max())
+        if self.dark is None or self.flat is None:
+            return same
+        bright = brightness(_of(look_at(image, frame)), self.dark, self.flat)
+        return bright < LEAST * self.usual or (same and bool(np.ptp(self.flat) > 0))
+
+
+def brightness(view: F32, dark: F32, flat: F32) -> float:
+    """Share of the flats' light in a view's bright part, without what noise alone brings there; of images of cells."""
+    light = flat - dark
+    lit = light > UNLIT * max(float(np.percentile(light, BRIGHT)), 0.0)
+    if not lit.any():
+        return 1.0
+    share = np.where(lit, (view - dark) / np.where(lit, light, 1), np.nan)
+    change = np.diff(share, axis=1)
+    change = change[np.isfinite(change)]
+    noise = NORMAL * float(np.median(np.abs(change))) / 2**0.5 if change.size else 0.0
+    known = share[np.isfinite(share)]
+    if not known.size:
+        return 0.0
+    return max(float(np.median(known)), float(np.percentile(known, BRIGHT)) - _TAIL * noise)
+
+
+def _binned(image: NDArray[np.generic]) -> F32:
+    """Means [cell row, cell col] of an image; cells at the lower and right edge may be smaller."""
+    starts = [np.arange(0, n, -(-n // _ACROSS)) for n in image.shape]
+    sums = np.nan_to_num(image).astype(np.float64, copy=False)
+    for axis, at in enumerate(starts):
+        sums = np.add.reduceat(sums, at, axis=axis)
+    each = [np.diff(np.append(at, n)) for at, n in zip(starts, image.shape, strict=True)]
+    return np.asarray(sums / np.multiply.outer(*each), np.float32)
+
+
+def _cells(source: ScanSource, row: int) -> F32:
+    return _of(reference_frame(source, row))
+
+
+def _mean_cells(source: ScanSource, groups: tuple[Frames, ...]) -> F32:
+    return np.asarray(np.mean([_cells(source, row) for group in groups for row in group.tolist()], axis=0), np.float32)
+
+
+def _of(frame: ReferenceFrame) -> F32:
+    assert frame.cells is not None
+    return frame.cells
