@@ -177,6 +177,7 @@ class FrameFlagged(Event, event="flag"):
     advice: str
     region: Sequence[int] | None
     first: int | None
+    from_region: Sequence[int] | None = None
 
 
 class RuleBroken(Event, event="flag"):

@@ -52,7 +52,10 @@ class Flag:
         advice: what it means and what to do.
         region: where in the frame; None: everywhere, or nowhere in particular.
         first: the first frame that it holds for, where that is not `frame`: some findings need several views. All are
-            of its kind, without another between.
+            of its kind, without another between. Where a finding takes still more views, `frame` itself is earlier
+            than the one at which it is found.
+        from_region: where in the frame `first`; what it is of moved straight to `region`. None: `region` in `frame`
+            alone is known.
     """
 
     check: str
@@ -63,11 +66,21 @@ class Flag:
     advice: str
     region: PixelBox | None = None
     first: int | None = None
+    from_region: PixelBox | None = None
 
     @property
     def frames(self) -> range:
         """Frames of the file that it holds for."""
         return range(self.frame if self.first is None else self.first, self.frame + 1)
+
+    def regions(self) -> dict[int, PixelBox]:
+        """Where it is in each of its frames in which that is known."""
+        if self.region is None:
+            return {}
+        if self.from_region is None:
+            return {self.frame: self.region}
+        boxes = np.rint(np.linspace(self.from_region, self.region, len(self.frames))).astype(int).tolist()
+        return {frame: tuple(box) for frame, box in zip(self.frames, boxes, strict=True)}
 
 
 @dataclass(frozen=True, eq=False)

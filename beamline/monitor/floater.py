@@ -1,201 +1,185 @@
-"""Floater: a particle that crosses the field in some views, faster than anything that turns with the sample.
+"""Floater: a crumb that crosses the field in some views, on a way that nothing in the turning sample takes.
 
-It is found by filters that suppress everything that turns within the field (beamline.monitor.fan). It shows as peaks of
-absorption that follow a straight line in the same rows through several views (beamline.monitor.trail). A particle of
-the sample obeys col = a cos + b sin + c with sqrt(a² + b²) within the sample; a floater's line is steeper than any of
-these at its place.
+Its track is found by the sum over all views that show it (beamline.monitor.track), and held against the sample: a point
+of it moves on a sinusoid about the axis, no farther from it than the sample reaches. A crumb absorbs the same in every
+view; edges and textures of the sample, which may lie on a line by chance, do not.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
-import scipy
 from pydantic import Field
 
-from beamline.core.jit import njit
+from beamline.monitor.change import MOST_STEPS
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.fan import Clutter, Filters, correlate, filters, window
-from beamline.monitor.trail import Peaks, Rules, best_trail, no_peaks
-from beamline.monitor.view import CellGrid, CellValues, CellView
+from beamline.monitor.track import Octave, Sample, Track, tracks_of, with_view
+from beamline.monitor.view import CellGrid, PixelBox
 from drivers.base.frame import Frame
 
-LAGS = (-5, -4, -3, -2, -1, 0, 1, 2, 3)
-LATER = LAGS[-1]  # views after the one that is judged
-SPAN = LATER - LAGS[0] + 1
-SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
-SPEEDS = (1.4, 2.0, 3.0, 4.5)  # of the sample's fastest point; faster ones are in only one view of the window
-STRUCTURE, COMMON = 1.0, 0.02**2  # line integrals of about 1; a beam that changes by 2 %
+OCTAVES = 4  # steps of 1, 2, 4 and 8 views
+FASTEST_RIM = 4.0  # cells a step that the rim moves: with more the sample changes wholly from step to step
+EVEN = 0.5  # of a step: the next view comes as many steps, or up to MOST_STEPS, after the last
+COARSEST = math.radians(20)  # a view: more is no motion that could be followed
 WIDER = 2.2  # times the field's width: how wide a sample may be that the field cuts off
-MARGIN = 1.15  # the axis may be off the middle, and the sample a little wider than the field
-FASTER = 1.25  # times as fast as the sample's point at the same place
-RULES = Rules(span=12, least=4, share=0.4, total=30.0, rows=1.0, cols=1.0, slack=0.03)
-SPIKE = 4.0  # standard deviations by which a cell may be brighter than in the views before and after: a zinger
-CROWD = 12  # peaks in one view: with more the sample jumped, or it is a band
-MEMORY = 0.1  # weight of the newest view in a place's usual output
-VELOCITY_NOISE = 1.7  # of a change's residual over that of a view: sqrt(1 + (4/3)² + (1/3)²), see change
-LEAST_NOISE = 2e-3  # line integral
-LEAST_LIGHT = 1e-3  # transmission
-UNEVEN = 0.2  # relative change of the angle's step for which the filters are made anew
+MARGIN = 1.1  # the sample may be a little wider than the field
+OFF_MIDDLE = 0.05  # of the field: where the axis may be if it is not stated
+UNLIKELY = 36.0  # least difference of the squares of score and rival: 6 standard deviations, beyond what a search finds
+RIVAL = 0.85  # of the score, at most: both grow with the depth, and so does what either misses
+UNEVEN = 2.5  # mean square deviation from one depth, at most; of noise 1, in a few steps up to 2
+NEAR = 3.0  # cells between two tracks of the same crumb
 BOX = 3.0  # cells from the middle of a floater to the edges of its region
-NOISIER = (0.7, 30.0)  # noise of a cell over that of the cells that the filters are made for, at least and at most
-FASTEST = 1e3  # cells a view: what moves faster is in one view only
+HALF = 0.5  # of the depth, above which a row belongs to the crumb
+HIGHEST = 8  # cells above and below the track in which its rows are sought
+
+
+@dataclass(frozen=True, eq=False)
+class Crumb:
+    """A crumb that was found.
+
+    Attributes:
+        first, last: rows in the file of the views that show it, so far.
+        time, col, speed: where it was last, in views and cells, and its speed in cells a view.
+        top, below: cells, first row and row after the last.
+    """
+
+    first: int
+    last: int
+    time: float
+    col: float
+    speed: float
+    top: int
+    below: int
 
 
 @dataclass(frozen=True, eq=False)
 class FloaterState:
-    raw: tuple[CellView, ...] = ()  # the last two views
-    indices: tuple[int, ...] = ()  # rows in the file of the SPAN views before the last
-    # depths: their line integrals, without zingers and smoothed along the columns; oldest first
-    depths: tuple[CellValues, ...] = ()
-    # filters: for `step` radians a view, a sample of the radius `rim` in cells, and the noise of cells of the weight
-    # `light`
-    filters: Filters | None = None
+    """The views since a gap: the last one's time in views, the angles of the first and the last, their step in rad."""
+
+    octaves: tuple[Octave, ...] = ()
+    time: float = 0.0
+    start: float = math.nan
+    angle: float = math.nan
     step: float = math.nan
-    rim: float = math.nan
-    light: float = 1.0
-    # usual: usual output of the filters at each cell: the sample's sharpest edges are not suppressed completely
-    usual: CellValues | None = None
-    peaks: Peaks = field(default_factory=no_peaks)  # of the last views
+    crumbs: tuple[Crumb, ...] = ()
 
 
 @dataclass(frozen=True)
 class FloaterCheck:
-    """Score: mean of the filters' outputs along the trail, in standard deviations of what they usually give there."""
+    """Score: the sum along the track in standard deviations."""
 
     name: ClassVar[str] = "floater"
     bit: ClassVar[int] = 10
     unit: ClassVar[str] = "standard deviations"
-    meaning: ClassVar[str] = "matter crosses the field faster than the turning sample carries anything"
+    meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
     policy: ClassVar[Policy] = Policy.LOG
 
-    peak: Annotated[float, Field(ge=0, description="standard deviations of a peak that may be part of a trail")] = 4.5
+    warn: Annotated[float, Field(ge=0, description="standard deviations of the sum of a crumb's views")] = 7.0
 
     start = FloaterState
 
     def look(self, state: FloaterState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FloaterState]:
-        view, change, grid = context.view, context.change, context.grid
+        view, grid = context.view, context.grid
         if view is None or grid is None:
             return Look(state)
-        if change is None:  # the first views, or after a gap, or at uneven steps
-            kept = state.filters, state.step, state.rim, state.light
-            return Look(FloaterState((view,), (view.index,), (_smooth(view.depth),), *kept))
-        noise = max(change.noise / VELOCITY_NOISE, LEAST_NOISE)
-        state = _with_view(state, view, noise)
-        if len(state.depths) < SPAN:
+        state = _after(state, view.angle, context.follows)
+        if not state.step < COARSEST:
             return Look(state)
-        step = abs(view.angle - state.raw[0].angle)
-        rim = grid.shape[1] / 2 * (WIDER if context.truncated else 1.0)
-        if state.filters is None or not abs(step / state.step - 1) < UNEVEN or rim != state.rim:
-            lit = view.weight[view.weight > 0]
-            light = max(float(np.median(lit)) if lit.size else 1.0, LEAST_LIGHT)
-            made = _designed(rim * step, noise / math.sqrt(light))
-            state = replace(state, filters=made, step=step, rim=rim, light=light, usual=None)
-        assert state.filters is not None
-        outputs = np.empty((len(state.filters.speeds), *grid.shape), np.float32)
-        correlate(np.stack(state.depths), state.filters.weights, outputs)
-        usual = np.zeros(grid.shape, np.float32) if state.usual is None else state.usual.copy()
-        peaks = np.empty((CROWD + 1, 4))
-        n = _peaks(
-            outputs, view.weight, state.light, usual, MEMORY if state.usual is not None else 1.0, self.peak, peaks
-        )
-        state = replace(state, usual=usual)
-        if n > CROWD:
-            return Look(replace(state, peaks=no_peaks()))
-        return self._linked(state, frame.index, peaks[:n], grid)
+        half = grid.shape[1] / 2
+        octaves, found = [], list[Track]()
+        for before in state.octaves:
+            octave = before
+            if octave.views == 1 or half * state.step * octave.views <= FASTEST_RIM:
+                octave = with_view(before, view.index, state.time, view.depth, view.weight)
+                if octave.n > before.n:
+                    found += tracks_of(octave, _sample(grid, context, state.step), self.warn)
+            octaves.append(octave)
+        state = replace(state, octaves=tuple(octaves))
+        sure = [track for track in found if _is_crumb(track)]
+        return self._flagged(state, max(sure, key=lambda track: track.score), grid) if sure else Look(state)
 
-    def _linked(self, state: FloaterState, now: int, new: Peaks, grid: CellGrid) -> Look[FloaterState]:
-        """Link the peaks of the view that is judged with those of the views before."""
-        judged = state.indices[-1 - LATER]
-        new[:, 0] = judged
-        old = state.peaks[state.peaks[:, 0] >= judged - RULES.span]
-        trail = best_trail(old, new, RULES, (grid.shape[1] - 1) / 2, FASTER * state.step, state.rim)
-        state = replace(state, peaks=np.concatenate([old, new]))
-        if trail is None:
-            return Look(state)
-        region = grid.region(trail.row, trail.col, 2 * BOX, 2 * BOX)
+    def _flagged(self, state: FloaterState, track: Track, grid: CellGrid) -> Look[FloaterState]:
+        """The flag for the views that show the crumb, since the last flag for it."""
+        newest, oldest = track.steps[0], track.steps[-1]
+        top, below = _rows(track)
+        crumb = Crumb(oldest.rows[0], newest.rows[1], newest.time, float(track.cols[0]), track.speed, top, below)
+        known = [each for each in state.crumbs if _same(each, crumb)]
+        others = tuple(each for each in state.crumbs if each not in known and crumb.last - each.last <= grid.shape[1])
+        after = replace(state, crumbs=(*others, crumb))
+        if known:
+            first = min(each.first for each in known)
+            after = replace(after, crumbs=(*others, replace(crumb, first=min(first, crumb.first))))
+        begin = max([crumb.first, *(each.last + 1 for each in known if crumb.first >= each.first)])
+        if begin > crumb.last:
+            return Look(after)
+        span = max(newest.time - oldest.time, 1.0)
+        share = (crumb.last - begin) / max(crumb.last - crumb.first, 1)
+        where = [_region(grid, crumb, col) for col in (crumb.col, crumb.col - track.speed * span * share)]
+        cell = grid.cell
         advice = (
-            f"Something crosses the field at {abs(trail.speed) * grid.cell:.1f} px a view, faster than the sample's "
-            f"turning carries anything there (seen in frames {trail.first:.0f} ... {trail.last:.0f}): a floating "
-            "particle in the beam or on the holder. Look for it, blow it off, and repeat these views."
+            f"A crumb crosses the field: rows {top * cell} ... {below * cell - 1}, frames {after.crumbs[-1].first} ... "
+            f"{crumb.last} so far, {abs(track.speed) * cell:.1f} px a view to the "
+            f"{'right' if track.speed > 0 else 'left'}. No point of the turning sample moves so: it falls, floats, or "
+            "sits on the holder. Find it and blow it off; scan again if its streaks disturb, recon gives its rays "
+            "less weight."
         )
-        flag = Flag(self.name, Level.WARN, now, trail.score, self.peak, advice, region, int(trail.first))
-        return Look(state, flag)
+        flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
+        return Look(after, flag)
 
 
-def _with_view(state: FloaterState, view: CellView, noise: float) -> FloaterState:
-    """The state with the second newest view, without its zingers, which are in neither of its neighbours."""
-    if len(state.raw) < 2:
-        return replace(state, raw=(*state.raw, view))
-    before, middle = state.raw
-    spikeless = np.maximum(middle.depth, np.minimum(before.depth, view.depth) - np.float32(SPIKE * noise))
-    return replace(
-        state,
-        raw=(middle, view),
-        indices=(*state.indices, middle.index)[-SPAN:],
-        depths=(*state.depths, _smooth(spikeless))[-SPAN:],
-    )
+def _after(state: FloaterState, angle: float, follows: bool) -> FloaterState:
+    """The state at the next view; tracks begin anew where it is no neighbour of the last one, or at uneven steps."""
+    steps = 1.0
+    if state.time > 0 and state.step != 0:
+        steps = (angle - state.angle) / math.copysign(state.step, state.angle - state.start)
+    elif state.time > 0:
+        steps = 1.0 if angle == state.angle else math.nan
+    if not state.octaves or not follows or not EVEN < steps < MOST_STEPS + EVEN:
+        return FloaterState(tuple(Octave(2**i) for i in range(OCTAVES)), 0.0, angle, angle)
+    time = state.time + max(round(steps), 1)
+    return replace(state, time=time, angle=angle, step=abs(angle - state.start) / time)
 
 
-def _designed(rim: float, noise: float) -> Filters:
-    """The filters for a sample whose rim moves `rim` cells a view, and cells with this noise."""
-    rim = min(rim, FASTEST)
-    speeds = np.array([sign * factor * rim for factor in SPEEDS for sign in (-1, 1)] + [1e3])
-    views, cols = window(LAGS)
-    signals = np.exp(-0.5 * ((cols - speeds[:, None] * views) / SIZE) ** 2)
-    return filters(LAGS, Clutter(MARGIN * rim, STRUCTURE, COMMON, noise**2), signals, speeds)
+def _sample(grid: CellGrid, context: ScanContext, step: float) -> Sample:
+    cols = grid.shape[1]
+    if context.axis_col is None:
+        middle = (cols - 1) / 2
+        axes: tuple[float, ...] = (middle - OFF_MIDDLE * cols, middle, middle + OFF_MIDDLE * cols)
+    else:
+        axes = ((context.axis_col + 0.5) / grid.cell - 0.5,)
+    return Sample(step, axes, cols / 2 * (WIDER if context.truncated else MARGIN))
 
 
-def _smooth(depth: CellValues) -> CellValues:
-    """Matched along the columns to SIZE; white noise keeps its variance."""
-    kernel = np.exp(-0.5 * (np.arange(-3, 4) / SIZE) ** 2)
-    return scipy.ndimage.convolve1d(
-        depth, (kernel / np.sqrt((kernel**2).sum())).astype(np.float32), axis=0, mode="constant"
-    )
+def _is_crumb(track: Track) -> bool:
+    unlike = track.score**2 - track.rival**2 >= UNLIKELY and track.rival <= RIVAL * track.score
+    return unlike and track.uneven <= UNEVEN
 
 
-@njit(nogil=True, cache=True)
-def _peaks(outputs, weight, light, usual, memory, least, peaks):
-    """Fills `peaks` with (nothing, row, col, score) of the local maxima above `least`, until it is full: their number.
+def _same(known: Crumb, crumb: Crumb) -> bool:
+    """Whether it goes on where the known one was going."""
+    apart = abs(known.col + known.speed * (crumb.time - known.time) - crumb.col)
+    rows = known.top - 1 <= crumb.below and crumb.top - 1 <= known.below
+    return rows and apart <= NEAR + 0.2 * abs(known.speed * (crumb.time - known.time))
 
-    `usual` becomes its mean with this view's, whose weight is `memory`.
-    """
-    signals, rows, cols = outputs.shape
-    score = np.empty((rows, cols), np.float32)
-    for row in range(rows):
-        for col in range(cols):
-            most, squares = outputs[0, row, col], np.float32(0)
-            for signal in range(signals):
-                y = outputs[signal, row, col]
-                most = max(most, y)
-                if signal < signals - 1:
-                    squares += y * y
-            now = np.sqrt(squares / (signals - 1))
-            if memory == 1.0:
-                usual[row, col] = now
-            noise = np.sqrt(light / max(weight[row, col], np.float32(1e-3)))
-            score[row, col] = (
-                most / max(usual[row, col], min(max(noise, NOISIER[0]), NOISIER[1])) if weight[row, col] > 0 else 0.0
-            )
-            usual[row, col] += memory * (now - usual[row, col])
-    n = 0
-    for row in range(rows):
-        for col in range(cols):
-            own = score[row, col]
-            if own <= least:
-                continue
-            highest = True
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(col - 2, 0), min(col + 3, cols)):
-                    if score[r, c] > own:
-                        highest = False
-            if highest:
-                peaks[n, 1], peaks[n, 2], peaks[n, 3] = row, col, own
-                n += 1
-                if n == peaks.shape[0]:
-                    return n
-    return n
+
+def _rows(track: Track) -> tuple[int, int]:
+    """First row of cells of the crumb, and the row after the last."""
+    rows, cols = track.steps[0].change.shape
+    at = np.clip(np.floor(track.cols + 0.5).astype(int), 0, cols - 1)
+    depth = np.mean([step.change[:, col] for step, col in zip(track.steps, at, strict=True)], axis=0)
+    deep = depth > HALF * depth[track.row]
+    top = below = track.row
+    while top > max(0, track.row - HIGHEST) and deep[top - 1]:
+        top -= 1
+    while below < min(rows, track.row + HIGHEST) and deep[below]:
+        below += 1
+    return top, max(below, top + 1)
+
+
+def _region(grid: CellGrid, crumb: Crumb, col: float) -> PixelBox:
+    height = crumb.below - crumb.top + 2
+    return grid.region((crumb.top + crumb.below - 1) / 2, col, height, 2 * BOX)

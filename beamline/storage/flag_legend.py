@@ -68,6 +68,11 @@ def mark_of(flags: Iterable[Flag]) -> Mark:
     return Mark(bitmask(flags), scores, regions)
 
 
+def place_of(flag: Flag) -> int:
+    """The check's place in the legend, and in scores and regions."""
+    return _PLACES[flag.check]
+
+
 _PLACES = {check.name: i for i, check in enumerate(CHECKS)}
 UNMARKED = mark_of(())  # The value of a frame that no check flagged
 
@@ -100,11 +105,16 @@ class FrameFlags:
 
     @classmethod
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """[row] the findings of the checks in each frame of a file; a flag that holds for earlier rows marks them."""
-        flags = cls.of_marks([mark_of(each) for each in found])
+        """[row] what the checks found at each frame of a file; a flag that holds for earlier rows marks them."""
+        flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
+        assert flags.scores is not None and flags.regions is not None
         for flag in chain.from_iterable(found):
-            rows = flag.frames
+            rows, at = flag.frames, place_of(flag)
             flags.bits[rows.start : rows.stop] |= np.uint64(bitmask([flag]))
+            if flag.level is not Level.INFO:
+                flags.scores[flag.frame, at] = flag.score
+                for row, box in flag.regions().items():
+                    flags.regions[row, at] = box
         return flags
 
     def mark(self, frame: int) -> Mark:

@@ -23,7 +23,7 @@ from beamline.monitor.check import Flag
 from beamline.monitor.checks import bitmask
 from beamline.monitor.digest import FrameDigest, preview_shape
 from beamline.storage import hdf5
-from beamline.storage.flag_legend import mark_of
+from beamline.storage.flag_legend import mark_of, place_of
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from beamline.storage.writers.exchange_view import with_exchange_view
@@ -123,14 +123,15 @@ class NXtomoWriter:
         """
         self._check(frame, digest)
         record = Record(
-            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time, mark_of(flags),
-            frame.replaces,
+            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time,
+            mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces,
         )  # fmt: skip
         try:
             self._table.write(self._rows, frame.counts, digest, record)
             for flag in flags:
-                if len(flag.frames) > 1:
-                    self._table.add_flags(flag.frames, bitmask([flag]))
+                if flag.frames != range(frame.index, frame.index + 1) and (bits := bitmask([flag])):
+                    self._table.add_flags(flag.frames, bits)
+                    self._table.add_place(place_of(flag), flag.frame, flag.score, flag.regions())
             self._rows += 1
             if self._rows - self._committed >= self._flush_every:
                 self.flush()

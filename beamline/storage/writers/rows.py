@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -159,6 +159,12 @@ class Rows:
         if (marked != flags).any():
             self._columns[FLAGS][rows.start : rows.stop] = marked
             self._columns[VALID][rows.start : rows.stop] = marked & np.uint64(ALARMS) == 0
+
+    def add_place(self, check: int, frame: int, score: float, regions: Mapping[int, Sequence[int]]) -> None:
+        """The score of a flag in its frame, and its regions, in rows that exist; `check`: its place in the legend."""
+        self._columns[SCORES][frame, check] = score
+        for row, box in regions.items():
+            self._columns[REGIONS][row, check] = box
 
     @staticmethod
     def _grow(dataset: h5py.Dataset, n: int) -> None:

@@ -1,0 +1,350 @@
+"""Track: the way of a small absorber through the field, found by the sum over all views that show it.
+
+Each view less the mean of its two neighbours leaves noise, and what moves by its own size from view to view. Summed
+along a line in (view, column) and divided by the sum's standard deviation, an absorber grows as the root of the number
+of views, and noise does not (track before detect; Barniv 1985, IEEE Trans. AES 21:144). A line ends where its score is
+largest: in the field, too. What moves less than its size in a view shows in means of 2, 4, 8 ... views, an *octave* each.
+
+A track is none of the sample's if no point that turns with the stage within the sample's radius explains it: the
+difference of the squares of two scores is twice the logarithm of the ratio of their likelihoods (Wilks 1938).
+
+Lengths are cells, times are views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from beamline.core.jit import njit
+from beamline.monitor.view import CellValues
+
+SEED = 4  # steps of an octave whose sum shows where a track may go on
+SLOWEST = 2.5  # cells a step: what moves less is mostly taken off with the neighbours
+APART = 0.75  # cells a step between the speeds tried: the end of a seed is off by one cell at most
+MEMORY = 48  # steps: SLOWEST crosses 120 cells in them
+PROMISING = 4.0  # standard deviations of a seed: of noise a few in a view
+MOST_SEEDS = 8  # of a step, the highest: more take time, and are noise, or a sample that jumped
+CLIP = 5.0  # standard deviations that one step may add
+SIZE = 0.75  # cells: standard deviation of a ball of 6 px at 512 columns, 128 cells
+KERNEL = np.exp(-0.5 * (np.arange(-3, 4) / SIZE) ** 2).astype(np.float32)
+KERNEL_ROWS = KERNEL[2:5]
+SPIKE = 6.0  # standard deviations between the neighbours: the brighter one has a zinger, or an edge passes
+COMMON = 8  # cells of a row or column that give its common change
+OUTLIER = 3.0  # standard deviations that a cell may add to the common change of its row, and to its usual deviation
+FORGET = 0.1  # weight of the newest step in the usual square
+LEAST_NOISE = 2e-3  # line integral: flats and the steps of the stage are not better known
+LIT = 1e-3  # weight of a cell that has as good as no light
+FINE = 0.5  # cells between the places tried for either end of a track
+REACH = 6.0  # cells that a rival may be beside the newest place
+LONGER = 1.5  # times as many steps in each round of a fit
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step of an octave: the mean of some views, against its neighbours.
+
+    Attributes:
+        rows: of its first and last view in the file.
+        time: of its middle, in views.
+        change: float32 [row, col], deviation from the mean of the neighbours, smoothed to SIZE.
+        noise: float32 [row, col], its usual standard deviation there.
+    """
+
+    rows: tuple[int, int]
+    time: float
+    change: CellValues
+    noise: CellValues
+
+
+class Mean(NamedTuple):
+    """Mean of the views of a step: their rows in the file, their middle in views, line integrals, weights."""
+
+    rows: tuple[int, int]
+    time: float
+    depth: CellValues
+    weight: CellValues
+
+
+@dataclass(frozen=True, eq=False)
+class Octave:
+    """Steps of `views` views each.
+
+    Attributes:
+        waiting: views of the step that is not complete.
+        means: of the last two steps, older first.
+        steps: the last MEMORY ones with both neighbours, newest first.
+        n: steps so far.
+        usual: float32 [row, col], usual square of the change; None before the first step.
+    """
+
+    views: int
+    waiting: tuple[Mean, ...] = ()
+    means: tuple[Mean, ...] = ()
+    steps: tuple[Step, ...] = ()
+    n: int = 0
+    usual: CellValues | None = None
+
+
+class Sample(NamedTuple):
+    """The sample's motion: rad a view, columns where the axis may be, its largest radius in cells."""
+
+    turn: float
+    axes: tuple[float, ...]
+    radius: float
+
+
+class Track(NamedTuple):
+    """A way through the field that ends in an octave's newest step.
+
+    Attributes:
+        score: sum of the changes along it, in standard deviations of that sum.
+        rival: the largest score of a point of the sample in the same views.
+        uneven: mean square deviation of the changes from their mean, in units of noise and a share of the mean.
+        row: cell.
+        cols: column of each step, newest first.
+        steps: of the track, newest first.
+    """
+
+    score: float
+    rival: float
+    uneven: float
+    row: int
+    cols: NDArray[np.float64]
+    steps: tuple[Step, ...]
+
+    @property
+    def speed(self) -> float:
+        """Mean, in cells a view."""
+        return float((self.cols[0] - self.cols[-1]) / (self.steps[0].time - self.steps[-1].time))
+
+
+def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: CellValues) -> Octave:
+    """The octave after the next view, which is in this row of the file."""
+    waiting = (*octave.waiting, Mean((row, row), time, depth, weight))
+    if len(waiting) < octave.views:
+        return replace(octave, waiting=waiting)
+    if octave.views == 1:
+        mean = waiting[0]
+    else:
+        parts = [np.mean([view[i] for view in waiting], axis=0, dtype=np.float32) for i in (2, 3)]
+        middle = 0.5 * (waiting[0].time + time)
+        mean = Mean((waiting[0].rows[0], row), middle, parts[0], parts[1])
+    if len(octave.means) < 2:
+        return replace(octave, waiting=(), means=(*octave.means, mean))
+    before, own = octave.means
+    change, least = _change(before.depth, own.depth, mean.depth, own.weight)
+    noise, usual = _noise(change, least, octave.usual, max(FORGET, 1 / (octave.n + 1)))
+    steps = (Step(own.rows, own.time, change, noise), *octave.steps)[:MEMORY]
+    return Octave(octave.views, (), (own, mean), steps, octave.n + 1, usual)
+
+
+def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, CellValues]:
+    """What the neighbours do not explain, smoothed, without what rows and columns have in common; and the variance of
+    its noise."""
+    change, root = np.empty_like(own), np.sqrt(weight)
+    _second(before, own, after, weight, np.float32(np.inf), change)
+    lit = (change * root)[weight > LIT][::3]
+    noise = max(1.4826 * float(np.median(np.abs(lit))) if lit.size else 1.0, LEAST_NOISE)
+    _second(before, own, after, weight, np.float32((SPIKE * noise) ** 2), change)
+    bounded = np.clip(change * root, -OUTLIER * noise, OUTLIER * noise) * root
+    for axis in (0, 1):
+        if change.shape[axis] >= COMMON:
+            common = bounded.sum(axis=axis, keepdims=True) / np.maximum(weight.sum(axis=axis, keepdims=True), LIT)
+            change -= common
+            bounded -= common * weight
+    change[weight <= LIT] = 0
+    change = _smooth(change, KERNEL, 1)
+    if change.shape[0] >= KERNEL_ROWS.size:
+        change = _smooth(change, KERNEL_ROWS, 0)
+    return change, np.float32(noise**2) / np.maximum(weight, np.float32(LIT))
+
+
+def _smooth(values: CellValues, kernel: CellValues, axis: int) -> CellValues:
+    """White noise keeps its variance."""
+    return scipy.ndimage.convolve1d(values, kernel / np.sqrt((kernel**2).sum()), axis=axis, mode="constant")
+
+
+def _noise(
+    change: CellValues, least: CellValues, usual: CellValues | None, newest: float
+) -> tuple[CellValues, CellValues]:
+    """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass deviate
+    usually, there and beside."""
+    square = change**2
+    if usual is None:
+        usual = np.maximum(least, scipy.ndimage.uniform_filter(square, 5, mode="nearest"))
+    else:
+        usual = usual + np.float32(newest) * (np.minimum(square, np.float32(OUTLIER**2) * usual) - usual)
+    around = scipy.ndimage.uniform_filter(usual, 3, mode="nearest")
+    highest = scipy.ndimage.maximum_filter1d(np.maximum(around, usual), 3, axis=1)
+    return np.sqrt(np.maximum(highest, np.float32(0.25) * least)), usual
+
+
+def tracks_of(octave: Octave, sample: Sample, least: float) -> list[Track]:
+    """Tracks through the newest step with a score above `least`, the highest first."""
+    if len(octave.steps) < SEED:
+        return []
+    newest = np.stack([step.change / step.noise for step in octave.steps[:SEED]])
+    rows, cols = newest.shape[1:]
+    fastest = 2 * SLOWEST if octave.views > 1 else max(cols / SEED, 2 * SLOWEST)
+    speeds = np.arange(SLOWEST, fastest + APART, APART)
+    speeds = np.concatenate([speeds, -speeds])
+    offsets = np.rint(speeds[:, None] * np.arange(SEED)).astype(np.int64)
+    best, which, seeds = np.empty((rows, cols), np.float32), np.empty((rows, cols), np.int32), np.empty((512, 4))
+    n = _seeds(np.minimum(newest, np.float32(CLIP)), offsets, np.float32(PROMISING), best, which, seeds)
+    highest = seeds[:n][np.argsort(-seeds[:n, 3])[:MOST_SEEDS]]
+    found = [_track(octave, int(row), col, speeds[int(at)] / octave.views, sample, least) for row, col, at, _ in highest]
+    return sorted((track for track in found if track is not None), key=lambda track: -track.score)
+
+
+def _track(octave: Octave, row: int, col: float, speed: float, sample: Sample, least: float) -> Track | None:
+    """The best track through a seed; None where its score is not above `least`."""
+    times = np.array([octave.steps[0].time - step.time for step in octave.steps])
+    change = np.stack([step.change[row] for step in octave.steps])
+    noise = np.stack([step.noise[row] for step in octave.steps])
+    middle = sum(sample.axes) / len(sample.axes)
+    fits = []
+    for turn in (0.0, sample.turn):  # a straight line, or a point that turns with the stage far from the axis
+        fit = np.zeros(4)
+        _grow(change, noise, times, (col, speed), (turn, middle), fit)
+        fits.append((*fit.tolist(), turn))
+    score, x, v, n, turn = max(fits)
+    if score <= least:
+        return None
+    kept = slice(0, int(n))
+    rival = max(_rival(change[kept], noise[kept], times[kept], x, sample.turn, axis, sample.radius) for axis in sample.axes)
+    cols = np.array([_place(x, v, time, turn, middle) for time in times[kept]])
+    return Track(score, rival, _uneven(change[kept], noise[kept], cols), row, cols, octave.steps[kept])
+
+
+UNEVEN = 0.3  # share of the depth by which it may vary: a crumb is not whole in the field, or between two cells
+
+
+def _uneven(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> float:
+    """Mean square deviation of the changes along a track from their mean, over that of noise and of UNEVEN."""
+    at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
+    depth, weight = change[at].astype(float), noise[at].astype(float) ** -2
+    mean = float((depth * weight).sum() / weight.sum())
+    return float(np.mean((depth - mean) ** 2 / (1 / weight + (UNEVEN * mean) ** 2)))
+
+
+@njit(nogil=True, cache=True)
+def _second(before, own, after, weight, spike, change):
+    """Fills `change`: own less the mean of the neighbours, or less the darker one where their squares of the difference
+    are above `spike` over the weight."""
+    for row in range(own.shape[0]):
+        for col in range(own.shape[1]):
+            a, b = before[row, col], after[row, col]
+            if (a - b) * (a - b) * weight[row, col] > spike:
+                change[row, col] = own[row, col] - max(a, b)
+            else:
+                change[row, col] = own[row, col] - np.float32(0.5) * (a + b)
+
+
+@njit(nogil=True, cache=True)
+def _seeds(steps, offsets, least, best, which, seeds):
+    """Fills `seeds` with (row, col, speed's number, score) of the local maxima above `least`: their number."""
+    _, rows, cols = steps.shape
+    for row in range(rows):
+        line, at = best[row], which[row]
+        one, two, three, four = steps[0, row], steps[1, row], steps[2, row], steps[3, row]
+        for col in range(cols):
+            line[col], at[col] = 0.0, 0
+        for k in range(offsets.shape[0]):
+            second, third, fourth = offsets[k, 1], offsets[k, 2], offsets[k, 3]
+            for col in range(max(0, fourth), min(cols, cols + fourth)):
+                total = one[col] + two[col - second] + three[col - third] + four[col - fourth]
+                if total > line[col]:
+                    line[col], at[col] = total, k
+    n = 0
+    for row in range(rows):
+        for col in range(cols):
+            own = best[row, col]
+            if own <= 2 * least:
+                continue
+            highest = True
+            for r in range(max(row - 1, 0), min(row + 2, rows)):
+                for c in range(max(col - 2, 0), min(col + 3, cols)):
+                    if best[r, c] > own:
+                        highest = False
+            if highest and n < seeds.shape[0]:
+                seeds[n, 0], seeds[n, 1], seeds[n, 2], seeds[n, 3] = row, col, which[row, col], own / 2
+                n += 1
+    return n
+
+
+@njit(nogil=True, cache=True)
+def _place(x, v, time, turn, axis):
+    """Column `time` views before it was at x and moved v a view; on a straight line where `turn` is 0."""
+    if turn == 0.0:
+        return x - v * time
+    return axis + (x - axis) * np.cos(turn * time) - v / turn * np.sin(turn * time)
+
+
+@njit(nogil=True, cache=True)
+def _longest(change, noise, times, x, v, motion, most):
+    """Score and number of steps of the part of a track, from its newest step on, that has the largest score."""
+    total, weight, best, steps = 0.0, 0.0, 0.0, 0
+    cols = change.shape[1]
+    for k in range(most):
+        c = int(np.floor(_place(x, v, times[k], motion[0], motion[1]) + 0.5))
+        if c < 0 or c >= cols:
+            break
+        s = noise[k, c]
+        total += min(change[k, c] / s, CLIP) / s
+        weight += 1 / (s * s)
+        score = total / np.sqrt(weight)
+        if k >= SEED and score > best:
+            best, steps = score, k + 1
+    return best, steps
+
+
+@njit(nogil=True, cache=True)
+def _grow(change, noise, times, seed, motion, fit):
+    """Fills `fit` with the score, place, speed and number of steps of the track that grows from a seed."""
+    x, v = seed
+    most = min(SEED + 2, times.size)
+    while True:
+        span = times[most - 1]
+        for _ in range(2):
+            from_x, from_v, best = x, v, -1.0
+            for i in range(-2, 3):
+                for j in range(-3, 4):
+                    new_x, new_v = from_x + FINE * i, from_v + 1.5 * FINE * j / span
+                    score, steps = _longest(change, noise, times, new_x, new_v, motion, most)
+                    if score > best:
+                        best, x, v = score, new_x, new_v
+                        fit[0], fit[1], fit[2], fit[3] = score, x, v, steps
+        if most == times.size:
+            break
+        most = min(int(most * LONGER), times.size)
+
+
+@njit(nogil=True, cache=True)
+def _rival(change, noise, times, newest, turn, axis, radius):
+    """The largest score, over all these steps, of a point that turns within the radius and is near `newest` at last."""
+    cols, best = change.shape[1], 0.0
+    span = times[-1]
+    for i in range(int(2 * REACH / FINE) + 1):
+        x = newest - REACH + FINE * i
+        room = radius * radius - (x - axis) * (x - axis)
+        if room < 0:
+            continue
+        fastest = min(turn * np.sqrt(room), float(cols))
+        n = int(fastest * span / FINE) + 1
+        for j in range(-n, n + 1):
+            total, weight = 0.0, 0.0
+            for k in range(times.size):
+                c = int(np.floor(_place(x, fastest * j / n, times[k], turn, axis) + 0.5))
+                if c >= 0 and c < cols:
+                    s = noise[k, c]
+                    total += min(change[k, c] / s, CLIP) / s
+                    weight += 1 / (s * s)
+            # Where it is beside the field it says nothing of the light.
+            if weight > 0 and total > 0:
+                best = max(best, total / np.sqrt(weight))
+    return best
