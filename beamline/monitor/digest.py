@@ -9,7 +9,7 @@ ignored: they never spread into a mean or into a neighbour's preview block.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from zlib_ng import zlib_ng
 
 from beamline.core.jit import njit
 
+BLOCK = 4  # pixels a side of the blocks that the checks see, whatever preview a file holds
 ENTROPY_BINS = 256
 ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
@@ -99,6 +100,24 @@ def digest(
             image.flags.writeable = False
         numbers = _from_reals(image, saturation, preview_bin, no_data, preview, peaks)
     return FrameDigest(*numbers, checksum, preview, peaks)
+
+
+def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: int) -> tuple[FrameDigest, FrameDigest]:
+    """The digest of a frame for the checks, with blocks of BLOCK pixels, and that for a file, with blocks of
+    `preview_bin`: each to the bit as `digest` makes it.
+
+    So what the checks find depends on the frames alone, and their file gives the same findings later. Where
+    `preview_bin` is a multiple of BLOCK, blocks are joined; else the pixels are read a second time.
+    """
+    seen = digest(image, saturation, BLOCK)
+    if preview_bin == BLOCK:
+        return seen, seen
+    if preview_bin % BLOCK:
+        return seen, digest(image, saturation, preview_bin)
+    preview = np.empty(preview_shape((image.shape[0], image.shape[1]), preview_bin), np.float32)
+    peaks = np.empty_like(preview)
+    _join(seen.preview, seen.peaks, image.shape[0], image.shape[1], preview_bin // BLOCK, preview, peaks)
+    return seen, replace(seen, preview=preview, peaks=peaks)
 
 
 def block_means(image: NDArray[np.uint16], side: int) -> NDArray[np.float32]:
@@ -235,6 +254,25 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):
                 for col in range(cols):
                     saturated += image[row, col] >= full
     return least, int(high), total, squares, saturated, histogram
+
+
+@njit(nogil=True, cache=True)
+def _join(means, tops, n_rows, n_cols, times, preview, peaks):
+    """Fills the preview and peaks of `times` x `times` blocks of BLOCK pixels; sums of counts, whole numbers, are
+    exact."""
+    for row in range(preview.shape[0]):
+        top, bottom = row * times, min((row + 1) * times, means.shape[0])
+        high = min(bottom * BLOCK, n_rows) - top * BLOCK
+        for col in range(preview.shape[1]):
+            left, right = col * times, min((col + 1) * times, means.shape[1])
+            wide = min(right * BLOCK, n_cols) - left * BLOCK
+            total, most = 0.0, np.float32(0)
+            for r in range(top, bottom):
+                lines = min((r + 1) * BLOCK, n_rows) - r * BLOCK
+                for c in range(left, right):
+                    total += round(means[r, c] * np.float64(lines * (min((c + 1) * BLOCK, n_cols) - c * BLOCK)))
+                    most = max(most, tops[r, c])
+            preview[row, col], peaks[row, col] = total / (high * wide), most
 
 
 @njit(nogil=True, cache=True)

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.monitor.digest import block_means, digest
+from beamline.monitor.digest import BLOCK, block_means, digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
 from drivers.base.frame import FrameKind
 
 SAMPLES = 4  # frames of a group, and views, that are looked at
-BLOCK = 4  # pixels a side
 
 Frames = NDArray[np.int64]
 
