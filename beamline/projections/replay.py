@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.monitor.aside import Aside
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
-from beamline.monitor.digest import BLOCK, digest
+from beamline.monitor.digest import check_block, digest
 from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
@@ -120,7 +120,7 @@ def replay(
     """
     monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
-        seen = digest(frame.counts, monitor.context.saturation, BLOCK)
+        seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags = look(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
         yield Judged(frame.index, frame.kind, flags, n, aside)
@@ -216,7 +216,7 @@ def context_of(source: ScanSource) -> ScanContext:
     )
     if source.quantity != "line_integrals":
         return context
-    preview = digest(np.zeros(source.shape, np.uint16), preview_bin=BLOCK).preview
+    preview = digest(np.zeros(source.shape, np.uint16), preview_bin=check_block(source.shape)).preview
     return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0)
 
 

@@ -26,7 +26,7 @@ from beamline.core.events import FrameFlagged, FrameStored, Sink, Warned
 from beamline.core.stop import PauseRequest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
-from beamline.monitor.digest import BLOCK, FrameDigest, digests
+from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
@@ -110,7 +110,7 @@ class Recorder:
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
         self.retaken, self._retaking = 0, False
-        self.references = ReferenceLog(BLOCK)
+        self.references = ReferenceLog()
         self._failure: Exception | None = None
         self._work = Workload()
         most = room(timeline)
@@ -294,8 +294,8 @@ class Recorder:
         if frame.kind is FrameKind.INVALID or (frame.replaces >= 0 and not self._retaking):
             self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
         self._report(frame, flags)
-        if (stored := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
-            self._sink(stored)
+        if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
+            self._sink(event)
 
     def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...]:
         """The monitor's flags. An error costs no frame: a check that raises is switched off, with a warning."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.monitor.digest import BLOCK, block_means, digest
+from beamline.monitor.digest import block_means, check_block, digest
 from beamline.monitor.references import JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.finding import Finding
@@ -114,7 +114,8 @@ def _reference(source: ScanSource, row: int) -> ReferenceFrame:
     image = source.read([row])[0]
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
     about = row, FrameKind(int(source.image_key[row])), float(source.exposures[row])
+    block = check_block(image.shape)
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
-        return ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
-    return ReferenceFrame.of(*about, digest(image, saturation, BLOCK), BLOCK)
+        return ReferenceFrame.seen(*about, saturated, block_means(image, block), block)
+    return ReferenceFrame.of(*about, digest(image, saturation, block), block)

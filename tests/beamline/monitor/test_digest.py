@@ -13,11 +13,11 @@ from hypothesis.extra import numpy as hnp
 from scipy.stats import entropy as scipy_entropy
 
 from beamline.monitor.digest import (
-    BLOCK,
     ENOUGH,
     ENTROPY_BINS,
     _count_greys,
     block_means,
+    check_block,
     digest,
     digests,
     preview_shape,
@@ -47,9 +47,12 @@ def naive_peaks(image: np.ndarray, valid: np.ndarray, bin_: int) -> np.ndarray:
 
 
 @settings(max_examples=60, deadline=None)
-@given(image=counts, preview_bin=st.sampled_from([1, 3, 4, 8, 12, 20]))
+@given(
+    image=hnp.arrays(np.uint16, st.tuples(st.integers(1, 17), st.sampled_from([1, 7, 16, 17, 1024, 1027]))),
+    preview_bin=st.sampled_from([1, 3, 4, 8, 12, 20]),
+)
 def test_the_checks_see_the_same_blocks_whatever_the_preview_of_the_file(image: np.ndarray, preview_bin: int) -> None:
-    for found, side in zip(digests(image, 65535, preview_bin), (BLOCK, preview_bin), strict=True):
+    for found, side in zip(digests(image, 65535, preview_bin), (check_block(image.shape), preview_bin), strict=True):
         for name, value in vars(digest(image, 65535, side)).items():
             np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 

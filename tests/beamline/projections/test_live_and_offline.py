@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -98,7 +99,7 @@ class Busy(NXtomoWriter):
 
     pauses: tuple[float, ...] = ()
 
-    def append(self, frame: Frame, digest: FrameDigest, flags: tuple[Flag, ...] = ()) -> None:  # type: ignore[override]
+    def append(self, frame: Frame, digest: FrameDigest, flags: Sequence[Flag] = ()) -> None:
         time.sleep(self.pauses[frame.index % len(self.pauses)] if self.pauses else 0.0)
         super().append(frame, digest, flags)
 
