@@ -40,6 +40,7 @@ class Judged:
         flags: what the checks found.
         n: frames in the file so far.
         aside: which checks left out views so far.
+        drift: of the light so far, in words; "" where it is within its limit.
     """
 
     row: int
@@ -47,6 +48,7 @@ class Judged:
     flags: tuple[Flag, ...]
     n: int
     aside: Aside
+    drift: str = ""
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class ScanVerdict:
         references: what is wrong with darks and flats, a text for each group.
         altered: what of the file is not as it was written; "" where all is.
         aside: which checks could not look at which views.
+        drift: of the light over the scan, in words; "" where it is within its limit.
     """
 
     n_frames: int
@@ -85,6 +88,7 @@ class ScanVerdict:
     references: tuple[str, ...]
     altered: str
     aside: tuple[str, ...]
+    drift: str = ""
 
     @property
     def flags(self) -> Mapping[str, Mapping[str, int]]:
@@ -123,7 +127,7 @@ def replay(
         seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags = look(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield Judged(frame.index, frame.kind, flags, n, aside)
+        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift())
 
 
 def frames_of(
@@ -174,6 +178,7 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
         references=tuple(group.described() for group in groups if group.faults),
         altered=altered_said(source) if source.altered else "",
         aside=tuple(judged[-1].aside.said()) if judged else (),
+        drift=judged[-1].drift if judged else "",
     )
 
 

@@ -167,6 +167,11 @@ class Recorder:
         return found
 
     @property
+    def drift(self) -> str:
+        """What became of the light over the frames so far, in words; "" where it stayed within its limit."""
+        return self._monitor.drift()
+
+    @property
     def alarmed_frames(self) -> int:
         """Frames so far with an alarm of any check, without those that were taken again."""
         return len(self._alarmed)
