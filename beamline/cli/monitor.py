@@ -108,7 +108,7 @@ def monitor(
         done = {
             "file": file, "n_frames": n, "alarmed_frames": len(alarmed), "retaken": len(again),
             "flags": said_of.flags, "references": references,
-            "aside": said_of.aside, "returned": [vars(view) for view in returned],
+            "aside": said_of.aside, "drift": said_of.drift, "returned": [vars(view) for view in returned],
             "kinds": [{**asdict(kind.worst), "frames": kind.frames} for kind in said_of.kinds],
         }  # fmt: skip
         sink(Done(done, time=clock.now()))
@@ -117,7 +117,8 @@ def monitor(
         end += f"; {len(again)} views were taken again: frames {spans(again)} do not count" if again else ""
         left_out = [f"Not looked at: {'; '.join(said_of.aside)}."] if said_of.aside else []
         back = [f"On the way back: {view.said()}." for view in returned]
-        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *left_out, *back, end]))
+        drift = [said_of.drift] if said_of.drift else []
+        click.echo("\n".join([*table(said_of.kinds), *references, *altered, *drift, *left_out, *back, end]))
     if stopped():
         raise ScanStopped(f"{file}: stopped after {n} frames.")
     if alarmed or references:

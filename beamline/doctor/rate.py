@@ -24,7 +24,7 @@ from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.core.text import size
 from beamline.monitor.check import Check, Flag, ScanContext
 from beamline.monitor.checks import CHECKS
-from beamline.monitor.digest import FrameDigest, digest
+from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import look, start
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.scan.recorder import Recorder, frames_in_memory
@@ -78,10 +78,12 @@ class Load:
 
     @cached_property
     def digests(self) -> Sequence[FrameDigest]:
-        return [self.digest(image) for image in self.images]
+        """For the file."""
+        return [self.digested(image)[1] for image in self.images]
 
-    def digest(self, image: NDArray[np.uint16]) -> FrameDigest:
-        return digest(image, SATURATION, self.preview_bin)
+    def digested(self, image: NDArray[np.uint16]) -> tuple[FrameDigest, FrameDigest]:
+        """For the checks, and for the file."""
+        return digests(image, SATURATION, self.preview_bin)
 
     def slot(self, row: int) -> int:
         """Which of the images a row of the file shows."""
@@ -185,9 +187,9 @@ def _with_monitor(load: Load, folder: Path, n: int, clock: Clock) -> int:
 
     def step(frame: Frame) -> tuple[FrameDigest, tuple[Flag, ...]]:
         nonlocal monitor
-        found = load.digest(frame.counts)
-        monitor, flags = look(monitor, frame, found)
-        return found, flags
+        seen, stored = load.digested(frame.counts)
+        monitor, flags = look(monitor, frame, seen)
+        return stored, flags
 
     return _written(load, folder, n, clock, step)
 
@@ -219,7 +221,7 @@ STAGES: dict[str, Callable[[Load, Path, int, Clock], int]] = {
         load, folder, n, clock, lambda frame: (load.digests[load.slot(frame.index)], ())
     ),
     "writer + digest": lambda load, folder, n, clock: _written(
-        load, folder, n, clock, lambda frame: (load.digest(frame.counts), ())
+        load, folder, n, clock, lambda frame: (load.digested(frame.counts)[1], ())
     ),
     "writer + digest + monitor": _with_monitor,
     "whole pipeline": _pipeline,

@@ -1,9 +1,9 @@
 """Beam: drift of the light against the flats, and its dips and flashes.
 
-The drift against the flats is judged in air: the brightest place of a view. It is reported once, and again only after
-it has gone. A dip is judged by the change from view to view (beamline.monitor.change), which needs no
-air. These changes have errors of one sign where dense particles turn fast; these would sum up to a dip. A change counts
-only where the light of the whole view moved with it.
+The drift against the flats is judged in air: the brightest place of a view. It is reported when it begins, as a fact
+each time it has doubled, and as a whole after the last view. A dip is judged by the change from view to view
+(beamline.monitor.change), which needs no air. These changes have errors of one sign where dense particles turn fast;
+these would sum up to a dip. A change counts only where the light of the whole view moved with it.
 """
 
 from __future__ import annotations
@@ -19,12 +19,15 @@ from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, light, more_light
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.scatter import FrameScatter
-from beamline.monitor.view import CellGrid, CellValues, CellView
+from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brightest_place
 from drivers.base.frame import Frame, FrameKind
 
-PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
-COVERED = 0.1  # loss of light at the brightest place: with more there is no air, or the beam fell earlier
 LASTS = 5  # views that a drift must last
+GROWN = 2.0  # times what was told of a drift: it is told again
+REMEDY = (
+    "`beamline recon` takes it off where there is air beside the sample (--air auto); flats before and after the views "
+    "(scan.flats.at: both) tell it, too."
+)
 GONE = 0.5  # share of the limit below which a drift has gone
 PATIENCE = 20  # views after which a dip is the new normal
 MEMORY = 0.05  # weight of the newest view in the usual light
@@ -34,8 +37,8 @@ SIGMAS = 6.0  # standard deviations of the changes that a dip must have
 
 @dataclass(frozen=True)
 class BeamState:
-    drifting: int = 0  # views in a row beyond the limit; after `said`, views in a row within it
-    said: bool = False  # the drift was flagged
+    drifting: int = 0  # views in a row that would change what was told
+    told: float = 0.0  # the drift that was flagged last; 0: none, or it has gone
     covered: bool = False  # the missing air was reported
     level: float = 0.0  # logarithm of the light over that of the first view, from its confirmed changes
     usual: float = 0.0  # the normal level
@@ -44,6 +47,50 @@ class BeamState:
     # changes: of the light from view to view, none larger than half of `alarm`. So one dip is no scatter, and the limit
     # is at most 3.8 times `alarm`
     changes: FrameScatter = field(default_factory=FrameScatter)
+
+
+@dataclass(frozen=True)
+class LightOverScan:
+    """Light of the views in air, as logarithm of what the beam has lost since the flats.
+
+    Attributes:
+        views: with air so far.
+        first: mean of the first LASTS of them.
+        recent: the last LASTS of them, oldest first.
+        least, most: of the means of LASTS.
+        rows: of the file, of the first and the last of them.
+    """
+
+    views: int = 0
+    first: float = 0.0
+    recent: tuple[float, ...] = ()
+    least: float = math.inf
+    most: float = -math.inf
+    rows: tuple[int, int] = (0, 0)
+
+    def with_view(self, row: int, air: float) -> LightOverScan:
+        """After the next view, see in_air."""
+        if math.isnan(air):
+            return self
+        recent = (*self.recent, air)[-LASTS:]
+        mean = sum(recent) / len(recent)
+        least, most = (min(self.least, mean), max(self.most, mean)) if len(recent) == LASTS else (self.least, self.most)
+        first = mean if self.views < LASTS else self.first
+        return LightOverScan(self.views + 1, first, recent, least, most, (self.rows[0] if self.views else row, row))
+
+    def said(self, limit: float) -> str:
+        """The drift over the scan in words; "" where it is within the limit, a fraction of the light."""
+        if self.views < 2 * LASTS:
+            return ""
+        change = math.expm1(self.first - sum(self.recent) / LASTS)
+        between = -math.expm1(self.least - self.most)
+        if max(abs(change), between) <= limit:
+            return ""
+        rows = f"frames {self.rows[0]} ... {self.rows[1]}, where there is air"
+        way = f"{'fell' if change < 0 else 'rose'} by {abs(change):.1%} over the scan ({rows})"
+        if between > abs(change) + limit:
+            way += f"; {between:.1%} lie between its least and its most"
+        return f"The light {way}. {REMEDY}"
 
 
 @dataclass(frozen=True)
@@ -75,13 +122,13 @@ class BeamCheck:
         state, flag = self._dip(state, frame.index, context.change, _whole(context.view, context.grid))
         if flag is not None or not context.grid.flats or state.dipping:
             return Look(state, flag)
-        return self._drift(state, frame.index, context.view, context.grid)
+        return self._drift(state, frame.index, brightest_place(context.view, context.grid), in_air(context))
 
     def _flat(self, row: int, score: float) -> Flag | None:
         if abs(score) <= self.drift:
             return None
         level, limit = (Level.ALARM, self.dip) if abs(score) > self.dip else (Level.WARN, self.drift)
-        advice = f"{_size(score)} light than in the flats before. Take flats more often."
+        advice = f"{_size(score)} light than in the flats before. {REMEDY}"
         return Flag(self.name, level, row, score, limit, advice)
 
     def _dip(
@@ -105,9 +152,9 @@ class BeamCheck:
         )
         return replace(state, dipping=state.dipping + 1), Flag(self.name, Level.ALARM, row, score, limit, advice)
 
-    def _drift(self, state: BeamState, row: int, view: CellView, grid: CellGrid) -> Look[BeamState]:
-        score = -math.expm1(-_air(view, grid))
-        if score > COVERED:
+    def _drift(self, state: BeamState, row: int, brightest: float, air: float) -> Look[BeamState]:
+        score = -math.expm1(-brightest)
+        if math.isnan(air):
             if state.covered:
                 return Look(replace(state, drifting=0))
             advice = (
@@ -115,15 +162,26 @@ class BeamCheck:
                 "it, or the beam is weaker than in the flats. Its drift against the flats cannot be told."
             )
             return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
-        away = abs(score) > (GONE * self.drift if state.said else self.drift)
-        drifting = 0 if away is state.said else state.drifting + 1
-        if drifting < LASTS:
-            return Look(replace(state, drifting=drifting))
-        state = replace(state, drifting=0, said=not state.said)
-        if not state.said:
-            return Look(state)
-        advice = f"{_size(score)} light than in the flats, where there is air. Take flats more often."
-        return Look(state, Flag(self.name, Level.WARN, row, score, self.drift, advice))
+        gone = state.told != 0 and abs(score) < GONE * self.drift
+        if not gone and abs(score) <= max(GROWN * abs(state.told), self.drift):
+            return Look(replace(state, drifting=0))
+        if state.drifting + 1 < LASTS:
+            return Look(replace(state, drifting=state.drifting + 1))
+        if gone:
+            return Look(replace(state, drifting=0, told=0.0))
+        level = Level.INFO if state.told else Level.WARN  # a view is no worse for a drift that goes on
+        advice = f"{_size(score)} light than in the flats, where there is air. {REMEDY}"
+        flag = Flag(self.name, level, row, score, self.drift, advice)
+        return Look(replace(state, drifting=0, told=score), flag)
+
+
+def in_air(context: ScanContext) -> float:
+    """Line integral of the brightest place of a view, as logarithm of the light lost since the flats; NaN where it may
+    be matter: more than COVERED, and not what air has shown so far."""
+    if context.view is None or context.grid is None or not context.grid.flats:
+        return math.nan
+    brightest = brightest_place(context.view, context.grid)
+    return brightest if brightest <= COVERED or abs(brightest - context.dimmer) <= DRIFT_STEP else math.nan
 
 
 def _size(score: float) -> str:
@@ -134,18 +192,3 @@ def _whole(view: CellView, grid: CellGrid) -> float:
     """Logarithm of the mean transmission of the lit cells; NaN where none is."""
     lit = grid.lit > 0
     return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan
-
-
-def _air(view: CellView, grid: CellGrid) -> float:
-    """Mean line integral of the brightest place of the lit field: 0 in air."""
-    depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
-    down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
-    sums, cells = (_places(part, down, across) for part in (depth, lit))
-    means = sums[cells > 0] / cells[cells > 0]
-    return float(means.min()) if means.size else 0.0
-
-
-def _places(image: CellValues, down: int, across: int) -> CellValues:
-    """Sums over a grid of places."""
-    rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
-    return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)

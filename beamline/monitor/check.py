@@ -109,6 +109,8 @@ class ScanContext:
             projection.
         view: the frame on this grid; None where it is no projection, or has no light.
         truncated: the sample is wider than the field, in this view or earlier ones; or flats are missing.
+        dimmer: logarithm of the light that the beam has lost since the flats, as air beside the sample shows it; NaN
+            where none has shown it yet.
         change: the part that turning since the views before does not explain; None where these are too few, or at
             uneven steps.
     """
@@ -130,12 +132,21 @@ class ScanContext:
     light_left: float = 1.0
     view: CellView | None = None
     truncated: bool = False
+    dimmer: float = math.nan
     change: SampleChange | None = None
 
 
 def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:
     """Counts above the dark [preview row, preview col]; the raw counts where no dark was seen."""
     return preview if context.dark is None else preview - context.dark
+
+
+def at_edges(context: ScanContext) -> tuple[float, float]:
+    """Line integrals of matter at the left and the right edge of the field: a beam that weakens is none."""
+    assert context.view is not None
+    left, right = context.view.edges
+    dimmer = 0.0 if math.isnan(context.dimmer) else context.dimmer
+    return left - dimmer, right - dimmer
 
 
 def more_light(context: ScanContext, exposure: float) -> float:

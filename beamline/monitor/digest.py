@@ -9,7 +9,7 @@ ignored: they never spread into a mean or into a neighbour's preview block.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from beamline.core.jit import njit
 
 ENTROPY_BINS = 256
 ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
+SMALL, LARGE = 4, 8  # pixels a side of the blocks that the checks see; large ones where ENOUGH of them remain
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
 
 
@@ -52,6 +53,11 @@ class FrameDigest:
     checksum: int
     preview: NDArray[np.float32]
     peaks: NDArray[np.float32]
+
+
+def check_block(shape: tuple[int, ...]) -> int:
+    """Pixels a side of the blocks that the checks see of a frame of `shape`, whatever preview its file holds."""
+    return LARGE if shape[1] >= ENOUGH * LARGE else SMALL
 
 
 def preview_shape(shape: tuple[int, int], preview_bin: int) -> tuple[int, int]:
@@ -99,6 +105,28 @@ def digest(
             image.flags.writeable = False
         numbers = _from_reals(image, saturation, preview_bin, no_data, preview, peaks)
     return FrameDigest(*numbers, checksum, preview, peaks)
+
+
+def digests(image: NDArray[np.uint16], saturation: float | None, preview_bin: int) -> tuple[FrameDigest, FrameDigest]:
+    """The digest of a frame for the checks, with blocks of `check_block`, and that for a file, with blocks of
+    `preview_bin`: each to the bit as `digest` makes it.
+
+    So what the checks find depends on the frames alone, and their file gives the same findings later. Blocks are joined
+    where one side is a multiple of the other; else the pixels are read a second time.
+    """
+    block = check_block(image.shape)
+    if max(block, preview_bin) % min(block, preview_bin):
+        return digest(image, saturation, block), digest(image, saturation, preview_bin)
+    fine = digest(image, saturation, min(block, preview_bin))
+    if block == preview_bin:
+        return fine, fine
+    shape = image.shape[0], image.shape[1]
+    preview = np.empty(preview_shape(shape, max(block, preview_bin)), np.float32)
+    peaks = np.empty_like(preview)
+    side = min(block, preview_bin)
+    _join(fine.preview, fine.peaks, shape, side, max(block, preview_bin) // side, preview, peaks)
+    coarse = replace(fine, preview=preview, peaks=peaks)
+    return (fine, coarse) if block < preview_bin else (coarse, fine)
 
 
 def block_means(image: NDArray[np.uint16], side: int) -> NDArray[np.float32]:
@@ -235,6 +263,26 @@ def _count_greys(image, full, every, preview_bin, preview, peaks):
                 for col in range(cols):
                     saturated += image[row, col] >= full
     return least, int(high), total, squares, saturated, histogram
+
+
+@njit(nogil=True, cache=True)
+def _join(means, tops, shape, side, times, preview, peaks):
+    """Fills the preview and peaks of `times` x `times` blocks of `side` pixels; sums of counts, whole numbers, are
+    exact."""
+    for row in range(preview.shape[0]):
+        top, bottom = row * times, min((row + 1) * times, means.shape[0])
+        high = min(bottom * side, shape[0]) - top * side
+        for col in range(preview.shape[1]):
+            left, right = col * times, min((col + 1) * times, means.shape[1])
+            wide = min(right * side, shape[1]) - left * side
+            total, most = 0.0, np.float32(0)
+            for r in range(top, bottom):
+                lines = min((r + 1) * side, shape[0]) - r * side
+                for c in range(left, right):
+                    pixels = lines * (min((c + 1) * side, shape[1]) - c * side)
+                    total += np.rint(np.float64(means[r, c]) * pixels)
+                    most = max(most, tops[r, c])
+            preview[row, col], peaks[row, col] = total / (high * wide), most
 
 
 @njit(nogil=True, cache=True)

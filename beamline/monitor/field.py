@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_edges
 from beamline.monitor.digest import FrameDigest
-from beamline.monitor.view import BRIGHT, UNLIT, CellGrid, CellView
+from beamline.monitor.view import BRIGHT, UNLIT, CellGrid
 from drivers.base.frame import Frame, FrameKind
 
 LASTS = 5  # views in a row with matter at an edge
@@ -56,10 +56,11 @@ class FieldOfViewCheck:
             return Look(replace(state, unlit=flag is not None), flag)
         if context.view is None or context.grid is None or not context.grid.flats or state.said:
             return Look(state)
-        cut = state.cut + 1 if max(context.view.edges) > self.edge else 0
+        edges = at_edges(context)
+        cut = state.cut + 1 if max(edges) > self.edge else 0
         if cut < LASTS:
             return Look(replace(state, cut=cut))
-        return Look(replace(state, said=True), self._cut(frame.index, context.view, context.grid))
+        return Look(replace(state, said=True), self._cut(frame.index, edges, context.grid))
 
     def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
         bright = float(np.percentile(light[::2, ::2], BRIGHT))
@@ -86,8 +87,8 @@ class FieldOfViewCheck:
         )
         return Flag(self.name, Level.WARN, frame.index, share, self.unlit, advice, region)
 
-    def _cut(self, row: int, view: CellView, grid: CellGrid) -> Flag:
-        left, right = view.edges
+    def _cut(self, row: int, edges: tuple[float, float], grid: CellGrid) -> Flag:
+        left, right = edges
         sides = " and ".join(side for side, depth in (("left", left), ("right", right)) if depth > self.edge)
         advice = (
             f"The sample goes on beyond the {sides} edge of the field (line integral {max(left, right):.2f} there). "

@@ -11,8 +11,9 @@ from typing import Annotated, ClassVar
 import numpy as np
 from pydantic import Field
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext, at_edges
 from beamline.monitor.digest import FrameDigest
+from beamline.monitor.view import brightest_place
 from drivers.base.frame import Frame
 
 CALIBRATION = 10  # projections
@@ -50,12 +51,13 @@ class MassCheck:
         view, grid = context.view, context.grid
         if view is None or grid is None or not grid.flats:
             return Look(state)
-        if max(view.edges) > AIR:
+        if max(at_edges(context)) > AIR:
             return Look(replace(state, running=0))
         lit = float(grid.lit.mean())
         if not lit:
             return Look(state)
-        mass = float(view.depth.mean()) / lit - sum(view.edges) / 2  # the beam's changes are not the sample's
+        # A beam that weakens is no sample that enters; matter at an edge is no beam that weakens.
+        mass = float(view.depth.mean()) / lit - brightest_place(view, grid)
         if state.usual is None:
             return Look(_calibrate(state, mass))
         if state.usual < EMPTY:

@@ -21,6 +21,10 @@ UNLIT = 0.05  # share of the flats' bright part: a cell with less counts as unli
 HOT = 0.1  # share of the flats' bright part: a cell with a higher dark than others by more is not used, either
 EDGE = 2  # cells at either edge that say whether the sample ends within the field
 SEEN = 0.02  # least transmission of a place that shows the beam
+PLACES = (4, 16)  # parts of the field, down and across; the brightest one is air
+COVERED = 0.1  # line integral at the brightest place: with more there is no air, or the beam fell earlier
+DRIFT_STEP = 0.02  # logarithm of the light by which a beam may drift from a view to the next that shows it
+EVEN, EVEN_NOISE = 0.2, 0.01  # share of a loss of light by which both edges and the brightest place may differ; noise
 BRIGHT = 90.0  # percentile of the flats' cells that stands for the bright part
 
 CellValues = NDArray[np.float32]
@@ -128,6 +132,40 @@ def light_left(view: CellView, last: CellView | None, grid: CellGrid) -> float:
     if not seen.any():
         return 1.0
     return math.exp(float(np.percentile((last.depth - view.depth)[seen][::3], BRIGHT)))
+
+
+def brightest_place(view: CellView, grid: CellGrid) -> float:
+    """Mean line integral of the brightest place of the lit field: 0 in air."""
+    depth, lit = view.depth[:, grid.left : grid.right + 1], grid.lit[:, grid.left : grid.right + 1]
+    down, across = (min(parts, n) for parts, n in zip(PLACES, depth.shape, strict=True))
+    sums, cells = (_places(part, down, across) for part in (depth, lit))
+    means = sums[cells > 0] / cells[cells > 0]
+    return float(means.min()) if means.size else 0.0
+
+
+def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
+    """Logarithm of the light that the beam has lost since the flats, as air shows it; NaN where none has shown it yet.
+
+    A beam that weakens takes the same share of the light everywhere, from flats that were the same: both edges and the
+    brightest place are then equally dark, and hardly darker than in the views before. A sample that enters is not.
+
+    Args:
+        before: the figure of the view before.
+    """
+    if not grid.flats:
+        return math.nan
+    now = brightest_place(view, grid)
+    places = (*view.edges, now)
+    even = max(places) - min(places) <= EVEN * abs(now) + EVEN_NOISE
+    if even and (abs(now) <= COVERED or abs(now - before) <= DRIFT_STEP or 0 < now < before):
+        return now
+    return min(before, max(now, 0.0)) if before > 0 else before
+
+
+def _places(image: CellValues, down: int, across: int) -> CellValues:
+    """Sums over a grid of places."""
+    rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
+    return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)
 
 
 def cell_noise(depth: CellValues, weight: CellValues) -> float:

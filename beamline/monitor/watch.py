@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.monitor.beam import BeamCheck, LightOverScan, in_air
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of
-from beamline.monitor.check import Check, Flag, Look, ScanContext, more_light
+from beamline.monitor.check import Check, Flag, Look, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.scatter import running_mean
 from beamline.monitor.spots import spots_of
-from beamline.monitor.view import CellView, grid_of, light_left, view_of
+from beamline.monitor.view import CellView, dimmer_than_flats, grid_of, light_left, view_of
 from drivers.base.frame import Frame, FrameKind
 
 AIR = 0.1  # line integral at the field's edges up to which the whole sample is in the field, as for the check `field`
@@ -40,6 +41,7 @@ class Monitor:
         recent: the last projections with light, oldest first, each a neighbour of the one before in angle.
         kept: a projection with light every few degrees.
         cut: usual line integral at the worse edge of the field, over the views so far.
+        light: of the beam, over the views so far.
     """
 
     context: ScanContext
@@ -51,6 +53,12 @@ class Monitor:
     recent: tuple[CellView, ...] = ()
     kept: tuple[CellView, ...] = ()
     cut: float = 0.0
+    light: LightOverScan = field(default_factory=LightOverScan)
+
+    def drift(self) -> str:
+        """What became of the beam's light over the scan, in words; "" where it stayed within the limit of `beam`."""
+        limits = [check.drift for check in self.checks if isinstance(check, BeamCheck)]
+        return self.light.said(limits[0]) if limits else ""
 
 
 def usual_step(angles: NDArray[np.float64]) -> float:
@@ -133,10 +141,11 @@ def _with_view(monitor: Monitor, frame: Frame, digest: FrameDigest) -> Monitor:
     kept = monitor.kept
     if len(kept) < MOST and math.isfinite(view.angle) and _nearest(view.angle, kept) is None:
         kept = (*kept, view)
-    cut = max(max(view.edges), FORGET * monitor.cut)
-    wider = not grid.flats or cut > AIR
-    context = replace(context, view=view, change=change, truncated=wider)
-    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut)
+    context = replace(context, view=view, change=change, dimmer=dimmer_than_flats(view, grid, context.dimmer))
+    cut = max(*at_edges(context), FORGET * monitor.cut)
+    context = replace(context, truncated=not grid.flats or cut > AIR)
+    light = monitor.light.with_view(frame.index, in_air(context))
+    return replace(monitor, context=context, recent=recent, kept=kept, cut=cut, light=light)
 
 
 def _nearest(angle: float, kept: Sequence[CellView]) -> CellView | None:

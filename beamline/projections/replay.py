@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.monitor.aside import Aside
 from beamline.monitor.check import Check, Flag, Level, ScanContext
 from beamline.monitor.checks import CHECKS, flagged_frames
-from beamline.monitor.digest import digest
+from beamline.monitor.digest import check_block, digest
 from beamline.monitor.references import ReferenceLimits, full_scale
 from beamline.monitor.watch import look, start, usual_step
 from beamline.storage.flag_legend import FrameFlags
@@ -23,7 +23,6 @@ from beamline.storage.rules.validate import altered_said
 from drivers.base.clock import Clock
 from drivers.base.frame import Frame, FrameKind
 
-PREVIEW_BIN = 4
 BEAM = 50_000.0  # counts that a transmission of 1 is, where a file holds line integrals
 SAMPLES = 4  # frames of a kind that tell where the detector saturates
 PILED_UP = 1e-3  # fraction of the pixels at the largest count from which it is the end of the detector's range
@@ -41,6 +40,7 @@ class Judged:
         flags: what the checks found.
         n: frames in the file so far.
         aside: which checks left out views so far.
+        drift: of the light so far, in words; "" where it is within its limit.
     """
 
     row: int
@@ -48,6 +48,7 @@ class Judged:
     flags: tuple[Flag, ...]
     n: int
     aside: Aside
+    drift: str = ""
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,7 @@ class ScanVerdict:
         references: what is wrong with darks and flats, a text for each group.
         altered: what of the file is not as it was written; "" where all is.
         aside: which checks could not look at which views.
+        drift: of the light over the scan, in words; "" where it is within its limit.
     """
 
     n_frames: int
@@ -86,6 +88,7 @@ class ScanVerdict:
     references: tuple[str, ...]
     altered: str
     aside: tuple[str, ...]
+    drift: str = ""
 
     @property
     def flags(self) -> Mapping[str, Mapping[str, int]]:
@@ -121,10 +124,10 @@ def replay(
     """
     monitor, aside = start(replace(context_of(source), model=model), checks), Aside()
     for frame, n in frames_of(source, follow=follow, should_stop=should_stop):
-        seen = digest(frame.counts, monitor.context.saturation, PREVIEW_BIN)
+        seen = digest(frame.counts, monitor.context.saturation, check_block(source.shape))
         monitor, flags = look(monitor, frame, seen)
         aside = aside.with_frame(monitor.context)
-        yield Judged(frame.index, frame.kind, flags, n, aside)
+        yield Judged(frame.index, frame.kind, flags, n, aside, monitor.drift())
 
 
 def frames_of(
@@ -175,6 +178,7 @@ def verdict(source: ScanSource, judged: Sequence[Judged], limits: ReferenceLimit
         references=tuple(group.described() for group in groups if group.faults),
         altered=altered_said(source) if source.altered else "",
         aside=tuple(judged[-1].aside.said()) if judged else (),
+        drift=judged[-1].drift if judged else "",
     )
 
 
@@ -217,7 +221,7 @@ def context_of(source: ScanSource) -> ScanContext:
     )
     if source.quantity != "line_integrals":
         return context
-    preview = digest(np.zeros(source.shape, np.uint16), preview_bin=PREVIEW_BIN).preview
+    preview = digest(np.zeros(source.shape, np.uint16), preview_bin=check_block(source.shape)).preview
     return replace(context, dark=preview, flat=preview + np.float32(BEAM), flat_exposure=1.0)
 
 
@@ -230,9 +234,13 @@ def _step(source: ScanSource) -> float:
 
 
 def _saturation(source: ScanSource) -> float:
-    """The end of the pixels' type, or of fewer bits where pixels pile up there; inf where pixels are real numbers."""
+    """As the file states it; else the end of the pixels' type, or of fewer bits where pixels pile up there. Inf where
+    pixels are real numbers."""
     if source.quantity == "line_integrals" or source.dtype.kind not in "ui":
         return np.inf
+    stated = float(source.attributes.get("saturation", 0))
+    if 0 < stated <= np.iinfo(source.dtype).max:
+        return stated
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         rows = np.flatnonzero(source.image_key == kind)
         for row in rows[np.unique(np.linspace(0, rows.size - 1, SAMPLES).astype(int))] if rows.size else ():

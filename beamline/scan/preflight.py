@@ -21,7 +21,7 @@ from beamline.core.text import size
 from beamline.instrument import connect
 from beamline.instrument.connect import ConnectedDevices
 from beamline.monitor.check import ScanContext
-from beamline.monitor.digest import digest
+from beamline.monitor.digest import digests
 from beamline.monitor.watch import Monitor, usual_step
 from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
@@ -223,7 +223,7 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
     info = _info(config, instrument, plan, timeline)
     monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
-    digest(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
+    digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     if instrument.simulated is not None:
         instrument.simulated.rehearse()
     return ReadyScan(plan, timeline, settings, timing, monitor, info)
@@ -231,14 +231,19 @@ def preflight(config: Config, instrument: ConnectedDevices, runs: Path, remainin
 
 def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: ScanInfo) -> ScanContext:
     return ScanContext(
-        saturation=2**timing.bits - 1,
+        saturation=_saturation(timing),
         pixels=math.prod(timing.shape),
         period=timeline.views.period if plan.mode is Mode.FLY else None,
-        step=usual_step(plan.angles),
+        step=usual_step(np.radians(np.degrees(plan.angles))),  # as the file states them
         stored=plan.stored,
         cone=info.source_distance_mm is not None,
         axis_col=info.axis_col,
     )
+
+
+def _saturation(timing: CameraTiming) -> int:
+    """The count from which a pixel is saturated."""
+    return int(2**timing.bits - 1)
 
 
 def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline: Timeline) -> ScanInfo:
@@ -257,6 +262,7 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
     known = scan_info(config, instrument)
     return replace(
         known,
+        saturation=_saturation(instrument.devices.camera.timing),
         exposure=plan.exposure,
         period=timeline.views.period,
         plan=json.dumps(asked),

@@ -1,7 +1,8 @@
 """Recorder: digests, checks and writes every frame beside the scan, so that taking frames never waits for the disk.
 
 Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
-frame before. Both spend nearly all their time in code that lets the other run.
+frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader
+of the file will, in blocks that do not depend on the file's preview: `beamline monitor FILE` finds the same.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from beamline.core.events import FrameFlagged, FrameStored, Sink, Warned
 from beamline.core.stop import PauseRequest
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import flagged_frames
-from beamline.monitor.digest import FrameDigest, digest
+from beamline.monitor.digest import FrameDigest, digests
 from beamline.monitor.watch import CheckError, Monitor, look, without
 from beamline.plan.plan import Timeline
 from beamline.plan.retake import Retake
@@ -65,7 +66,8 @@ def frames_in_memory(timeline: Timeline) -> int:
     return min(room(timeline) + CHECKED_FRAMES + 4, timeline.n_frames)
 
 
-_Checked = tuple[Frame, FrameDigest, tuple[Flag, ...]]
+_Checked = tuple[Frame, FrameDigest, FrameDigest, tuple[Flag, ...]]
+"""A frame, its digests for the checks and for the file, and the flags."""
 
 
 class Recorder:
@@ -108,7 +110,7 @@ class Recorder:
         self._triggers: dict[int, int] = {}  # of the views, by row
         self._replaced: set[int] = set()
         self.retaken, self._retaking = 0, False
-        self.references = ReferenceLog(preview_bin)
+        self.references = ReferenceLog()
         self._failure: Exception | None = None
         self._work = Workload()
         most = room(timeline)
@@ -163,6 +165,11 @@ class Recorder:
         for (check, level), frames in sorted(flagged_frames(self._found).items()):
             found.setdefault(check, {})[str(level)] = len(frames)
         return found
+
+    @property
+    def drift(self) -> str:
+        """What became of the light over the frames so far, in words; "" where it stayed within its limit."""
+        return self._monitor.drift()
 
     @property
     def alarmed_frames(self) -> int:
@@ -230,8 +237,8 @@ class Recorder:
             else:
                 begun, cpu = time.monotonic(), time.thread_time()
                 try:
-                    found = digest(item.counts, self._monitor.context.saturation, self._preview_bin)
-                    checked = item, found, self._look(item, found)
+                    seen, stored = digests(item.counts, self._monitor.context.saturation, self._preview_bin)
+                    checked = item, seen, stored, self._look(_as_stored(item), seen)
                 except Exception as error:
                     checked = error
                 self._work.checking += time.monotonic() - begun
@@ -285,27 +292,27 @@ class Recorder:
         if self._backlog is not None:
             self._backlog(self._waiting.qsize() if self._flying else 0)  # other frames wait in `put`
 
-    def _write(self, frame: Frame, found: FrameDigest, flags: tuple[Flag, ...]) -> None:
-        self._writer.append(frame, found, flags)
-        self.references.add(frame, found)
+    def _write(self, frame: Frame, seen: FrameDigest, stored: FrameDigest, flags: tuple[Flag, ...]) -> None:
+        self._writer.append(frame, stored, flags)
+        self.references.add(frame, seen)
         self.n_frames += 1
         if frame.kind is FrameKind.INVALID or (frame.replaces >= 0 and not self._retaking):
             self._progress.expect_more(self.n_frames - 1, 1, frame.exposure)  # beside the plan, and unannounced
         self._report(frame, flags)
-        if (stored := self._progress.update(frame, self.n_frames, found.mean)) is not None:
-            self._sink(stored)
+        if (event := self._progress.update(frame, self.n_frames, seen.mean)) is not None:
+            self._sink(event)
 
-    def _look(self, frame: Frame, found: FrameDigest) -> tuple[Flag, ...]:
+    def _look(self, frame: Frame, seen: FrameDigest) -> tuple[Flag, ...]:
         """The monitor's flags. An error costs no frame: a check that raises is switched off, with a warning."""
         if self._monitor_off:
             return ()
         try:
-            self._monitor, flags = look(self._monitor, frame, found)
+            self._monitor, flags = look(self._monitor, frame, seen)
         except CheckError as failed:
             self._monitor = without(self._monitor, failed.name)
             message = f"{failed} at frame {frame.index} and is off, the other checks go on: {failed.__cause__!r}"
             self._sink(Warned(message))
-            return self._look(frame, found)
+            return self._look(frame, seen)
         except Exception as error:
             self._monitor_off = True
             self._sink(Warned(f"the monitor failed at frame {frame.index} and is off: {error!r}"))
@@ -326,6 +333,12 @@ class Recorder:
                 self._sink(FrameFlagged(**vars(flag)))
         self._active = active
         self._react(flags)
+
+
+def _as_stored(frame: Frame) -> Frame:
+    """The frame as a reader gives it: a file holds degrees, whose radians differ in the last bit. A check that keeps
+    "a view every 5°" must choose the same views now and later."""
+    return replace(frame, angle=math.radians(math.degrees(frame.angle)))
 
 
 class _Progress:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from beamline.config.monitor import ReferencesSection, reference_limits
 from beamline.core.events import Sink, Warned
 from beamline.core.text import spans
-from beamline.monitor.digest import FrameDigest
+from beamline.monitor.digest import FrameDigest, check_block
 from beamline.monitor.references import ReferenceFrame, ReferenceLimits, judge, photons
 from beamline.plan.plan import Block
 from drivers.base.frame import Frame, FrameKind
@@ -18,27 +18,24 @@ VIEWS = 4  # enough for a median
 
 
 class ReferenceLog:
-    """Statistics of the darks and flats of a scan, to judge them group by group.
+    """Statistics of the darks and flats of a scan, to judge them group by group."""
 
-    Args:
-        preview_bin: of the digests' previews.
-    """
-
-    def __init__(self, preview_bin: int) -> None:
-        self._preview_bin = preview_bin
+    def __init__(self) -> None:
         self._groups: list[list[ReferenceFrame]] = []
         self._views: list[ReferenceFrame] = []
         self._before = FrameKind.INVALID
 
     def add(self, frame: Frame, digest: FrameDigest) -> None:
-        """Record a frame, in the order of the file; also the first views, whose light the flats must have."""
+        """Record a frame, in the order of the file; also the first views, whose light the flats must have.
+        `digest`: that of the checks."""
+        block = check_block(frame.counts.shape)
         if frame.kind in REFERENCES:
             if frame.kind is not self._before:
                 self._groups.append([])
-            found = ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin)
+            found = ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block)
             self._groups[-1].append(found)
         elif frame.kind is FrameKind.PROJECTION and len(self._views) < VIEWS:
-            self._views.append(ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, self._preview_bin))
+            self._views.append(ReferenceFrame.of(frame.index, frame.kind, frame.exposure, digest, block))
         self._before = frame.kind if frame.kind is not FrameKind.INVALID else self._before
         if frame.replaces >= 0:
             for known in (*self._groups, self._views):

@@ -288,7 +288,7 @@ class _Run:
         if self.instrument.simulated is not None and not recorder.hangs:
             n = writer.committed
             error = self._worse(error, _failure_of(lambda: write_labels(labels_path(writer.path), labels.runs(n), n)))
-        for remark in writer.remarks:
+        for remark in (*writer.remarks, *([drift] if (drift := recorder.drift) else [])):
             self.sink(Warned(remark))
         error = self._worse(error, _failure_of(release))
         path, n_frames = writer.path, writer.committed

@@ -139,6 +139,7 @@ def _info(scene: SceneFile, scan: Scan) -> ScanInfo:
         axis_col=scan.detector.axis_col,
         plan=json.dumps(plan),
         config=scene.text,
+        saturation=2**BITS - 1,
         devices={
             "simulator": {
                 "seed": scan.seed,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import spans
-from beamline.monitor.digest import block_means, digest
+from beamline.monitor.digest import block_means, check_block, digest
 from beamline.monitor.odd_references import flats_like_views, without_odd
 from beamline.monitor.references import Group, JudgedGroup, ReferenceFrame, ReferenceLimits, full_scale, judge
 from beamline.storage.readers.base import ScanSource, read_known
@@ -21,7 +21,6 @@ from drivers.base.frame import FrameKind
 
 SAMPLES = 4  # views beside whose light flats are judged
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-BLOCK = 4  # pixels a side
 CELLS = 48  # across the frame, about, by which flats are compared with views
 
 Frames = NDArray[np.int64]
@@ -166,14 +165,15 @@ def reference_frame(source: ScanSource, row: int) -> ReferenceFrame:
 def look_at(image: NDArray[Any], row: int) -> ReferenceFrame:
     """Statistics of an image, with its cells."""
     saturation = full_scale(float(image.max())) if image.dtype.kind in "ui" else None
-    side = max(BLOCK, image.shape[1] // CELLS)
+    block = check_block(image.shape)
+    side = max(block, image.shape[1] // CELLS)
     about = row, FrameKind.INVALID, np.nan
     if image.dtype == np.uint16:
         saturated = 0.0 if saturation is None else float(np.mean(image >= saturation))
-        frame = ReferenceFrame.seen(*about, saturated, block_means(image, BLOCK), BLOCK)
+        frame = ReferenceFrame.seen(*about, saturated, block_means(image, block), block)
         return replace(frame, cells=block_means(image, side))
-    known = digest(image, saturation, BLOCK)
-    frame = ReferenceFrame.of(*about, known, BLOCK)
-    cells = known.preview if side == BLOCK else digest(image, None, side).preview
+    known = digest(image, saturation, block)
+    frame = ReferenceFrame.of(*about, known, block)
+    cells = known.preview if side == block else digest(image, None, side).preview
     frame = replace(frame, invalid=known.invalid_fraction, cells=np.array(cells))
     return frame if image.dtype.kind in "ui" else replace(frame, rounding=0.0)  # transmission: flats of 1, darks of 0

@@ -135,6 +135,7 @@ class ScanInfo:
         filter: its place, by name.
         monochromator_kev: at which it stands; `energy_kev` is the same then. None: there is none, or it is not known.
         beam_unit: of the beam monitor's readings; None: there is none.
+        saturation: the count from which a pixel is saturated.
     """
 
     sample: str
@@ -152,6 +153,7 @@ class ScanInfo:
     beam_unit: str | None = None
     filter: str | None = None
     monochromator_kev: float | None = None
+    saturation: float | None = None
 
 
 def iso_time(seconds: float) -> str:
@@ -238,6 +240,8 @@ def _facts(file: h5py.File, info: ScanInfo) -> None:
         if value is not None:
             file[path] = np.float64(value)
             file[path].attrs["units"] = unit
+    if info.saturation is not None:
+        file[f"{DETECTOR}/saturation_value"] = np.float64(info.saturation)
     for name, text in (("plan", info.plan), ("config", info.config), ("program", f"splatline {version()}")):
         file[f"/entry/record/{name}"] = text
     if info.filter is not None:

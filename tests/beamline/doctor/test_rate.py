@@ -47,7 +47,7 @@ def test_a_frame_that_is_not_in_its_row_counts_as_lost(tmp_path: Path) -> None:
     frames[6] = replace(frames[6], counts=frames[7].counts)
     with rate._writer(LOAD, tmp_path, SystemClock()) as writer:
         for frame in frames:
-            writer.append(frame, rate.digest(frame.counts, preview_bin=4))
+            writer.append(frame, rate.digests(frame.counts, None, 4)[1])
     assert rate._lost(LOAD, writer.path, 9) == 1
     assert rate._lost(LOAD, writer.path, 12) == 1 + 3
 

@@ -11,10 +11,12 @@ import pytest
 from beamline.monitor.beam import PATIENCE, BeamCheck
 from beamline.monitor.change import SampleChange
 from beamline.monitor.check import Flag, Level, ScanContext
+from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest as frame_digest
 from beamline.monitor.view import grid_of, view_of
+from beamline.monitor.watch import look, start
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.monitor.blobs import STEP, Blobs
+from tests.beamline.monitor.blobs import BLOCK, STEP, Blobs
 
 
 def only(flags: list[Flag]) -> list[Flag]:
@@ -26,12 +28,42 @@ def drifting(light: Any, views: int = 120, **more: Any) -> list[Flag]:
 
 
 @pytest.mark.parametrize("rate", [-5e-4, 5e-4])
-def test_a_drift_against_the_flats_is_said_once_when_it_reaches_the_limit(rate: float) -> None:
+def test_a_drift_against_the_flats_is_said_when_it_reaches_the_limit_and_twice_the_limit(rate: float) -> None:
     flags = drifting(lambda view: 1 + rate * view)
-    assert [(f.level, f.limit) for f in flags] == [(Level.WARN, 0.02)]
+    assert [(f.level, f.limit) for f in flags] == [(Level.WARN, 0.02), (Level.INFO, 0.02)]
+    assert abs(flags[1].score) > 2 * abs(flags[0].score)
     assert flags[0].frame - 10 == pytest.approx(0.02 / abs(rate), abs=10)
     assert flags[0].score == pytest.approx(-rate * (flags[0].frame - 10), abs=0.003)
     assert f"{'less' if rate < 0 else 'more'} light than in the flats" in flags[0].advice
+
+
+def over_scan(views: int, **more: Any) -> tuple[list[Flag], str]:
+    """All flags, and what is said of the light over the scan."""
+    monitor, found = start(ScanContext(65535, 2048 * BLOCK**2, 0.1), CHECKS), list[Flag]()
+    for frame, digest in Blobs(views, **more).frames():
+        monitor, flags = look(monitor, frame, digest)
+        found += flags
+    return found, monitor.drift()
+
+
+@pytest.mark.parametrize("percent", [-30.0, -9.0, -3.0, 3.0, 9.0])
+def test_the_drift_over_the_scan_is_stated_and_no_other_check_takes_it_for_the_sample(percent: float) -> None:
+    flags, said = over_scan(200, counts=lambda view, image: image * (1 + percent / 100 * view / 199))
+    assert f"The light {'fell' if percent < 0 else 'rose'} by" in said
+    assert float(said.split("by ")[1].split("%")[0]) == pytest.approx(abs(percent), rel=0.1)
+    assert {flag.check for flag in flags} - {"pixels"} == {"beam"}  # the scan has previews and no pixels
+    assert not [flag for flag in flags if "covers all of it" in flag.advice]
+
+
+def test_a_beam_that_is_topped_up_within_the_scan_is_stated_with_its_least_and_most() -> None:
+    _, said = over_scan(200, counts=lambda view, image: image * (1 - 0.06 * (view % 90) / 89))
+    assert "lie between its least and its most" in said
+    assert float(said.split("); ")[1].split("%")[0]) == pytest.approx(6, abs=0.6)
+
+
+def test_light_that_stays_is_not_stated() -> None:
+    assert over_scan(120)[1] == ""
+    assert over_scan(120, depth=lambda view, image: image + 0.5)[1] == ""  # nor where there is no air
 
 
 def test_a_drift_that_went_and_comes_again_is_said_again() -> None:
@@ -70,7 +102,7 @@ def test_a_sample_that_covers_the_edges_does_not_hide_air_above_it() -> None:
     tall = np.zeros((32, 1))
     tall[16:] = 0.5
     flags = drifting(lambda view: 1 - 5e-4 * view, depth=lambda view, image: image * (tall > 0) + tall)
-    assert [f.level for f in flags] == [Level.WARN]
+    assert [f.level for f in flags] == [Level.WARN, Level.INFO]
 
 
 def test_flats_are_compared_with_the_flats_before(fake: Any) -> None:
@@ -98,8 +130,8 @@ def told(gains: Iterable[float], light: Iterable[float]) -> list[int]:
         view = view_of(flat * np.float32(0.5 * left), grid, row, row * STEP, 1.0)
         change = SampleChange(gain, 0.0, 0.0, 0.0, 0 * flat, 0.01) if row else None
         frame = Frame(np.ones((32, 64), np.uint16), FrameKind.PROJECTION, row, row, row, row * STEP, row, 0.05)
-        look = check.look(state, frame, digest, ScanContext(65535, 2048, grid=grid, view=view, change=change))
-        state, rows = look.state, rows + ([row] if look.flag and look.flag.level is Level.ALARM else [])
+        seen = check.look(state, frame, digest, ScanContext(65535, 2048, grid=grid, view=view, change=change))
+        state, rows = seen.state, rows + ([row] if seen.flag and seen.flag.level is Level.ALARM else [])
     return rows
 
 

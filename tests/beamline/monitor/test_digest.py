@@ -12,7 +12,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.stats import entropy as scipy_entropy
 
-from beamline.monitor.digest import ENOUGH, ENTROPY_BINS, _count_greys, block_means, digest, preview_shape, thinned
+from beamline.monitor.digest import (
+    ENOUGH,
+    ENTROPY_BINS,
+    _count_greys,
+    block_means,
+    check_block,
+    digest,
+    digests,
+    preview_shape,
+    thinned,
+)
 
 shapes = st.tuples(st.integers(1, 17), st.integers(1, 17))
 counts = hnp.arrays(np.uint16, shapes)
@@ -34,6 +44,17 @@ def naive_peaks(image: np.ndarray, valid: np.ndarray, bin_: int) -> np.ndarray:
     blocks = ones.reshape(ones.shape[0] // bin_, bin_, -1, bin_)
     low = np.where(np.isnan(blocks), -np.inf, blocks).max(axis=(1, 3))
     return np.where(np.isinf(low), np.nan, low)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    image=hnp.arrays(np.uint16, st.tuples(st.integers(1, 17), st.sampled_from([1, 7, 16, 17, 1024, 1027]))),
+    preview_bin=st.sampled_from([1, 3, 4, 8, 12, 20]),
+)
+def test_the_checks_see_the_same_blocks_whatever_the_preview_of_the_file(image: np.ndarray, preview_bin: int) -> None:
+    for found, side in zip(digests(image, 65535, preview_bin), (check_block(image.shape), preview_bin), strict=True):
+        for name, value in vars(digest(image, 65535, side)).items():
+            np.testing.assert_array_equal(getattr(found, name), value, err_msg=name)
 
 
 def naive_entropy(values: np.ndarray) -> float:

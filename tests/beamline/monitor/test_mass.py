@@ -50,6 +50,23 @@ def test_a_beam_that_loses_three_percent_is_not_mass(fake: Any) -> None:
     assert only(fake.flags(frames)) == []
 
 
+@pytest.mark.parametrize("lost", [0.0, 0.03, 0.09, 0.3])
+def test_thin_matter_that_passes_the_edges_is_no_mass_that_left_while_the_beam_weakens(fake: Any, lost: float) -> None:
+    beside = (*SAMPLE, (0.0, 41.0, 5.0, 0.006), (0.0, -41.0, 5.0, 0.006))  # in both edges at 90°
+    frames = fake.references()
+    frames += [fake.views(1, first=i, light=1 - lost * i / 180, discs=beside)[0] for i in range(180)]
+    assert only(fake.flags(frames)) == []
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_a_sample_that_falls_off_while_the_beam_weakens_is_mass(fake: Any, lost: float) -> None:
+    frames = fake.references()
+    frames += [fake.views(1, first=i, light=1 - lost * i / 90)[0] for i in range(90)]
+    frames += fake.views(4, first=90, discs=(), light=1 - lost)
+    flags = only(fake.flags(frames))
+    assert [f.frame for f in flags] == [102, 103] and "left" in flags[0].advice
+
+
 def test_a_truncated_sample_is_left_alone(fake: Any) -> None:
     off_centre = ((40.0, 0.0, 30.0, 0.03),)
     assert only(fake.flags(fake.references() + fake.views(180, discs=off_centre))) == []

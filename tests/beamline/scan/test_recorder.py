@@ -123,13 +123,13 @@ def test_a_disk_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch
 def test_a_frame_is_digested_while_the_one_before_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
     second, together = threading.Event(), list[bool]()
 
-    def spy(counts: np.ndarray, *rest: object) -> FrameDigest:
+    def spy(counts: np.ndarray, *rest: object) -> tuple[FrameDigest, FrameDigest]:
         if counts[0, 0] == 1:
             second.set()
         return real(counts, *rest)
 
-    real = module.digest
-    monkeypatch.setattr(module, "digest", spy)
+    real = module.digests
+    monkeypatch.setattr(module, "digests", spy)
     recorder = record(writer := Writer(lambda row: together.append(second.wait(30)) if row == 0 else None))
     recorder.put(frame(0))
     recorder.put(frame(1))

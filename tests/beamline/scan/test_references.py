@@ -128,7 +128,7 @@ def test_limits_are_typed_and_have_the_defaults_of_the_judge() -> None:
 
 
 def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:
-    log, counts = ReferenceLog(8), np.full((16, 16), 200, np.uint16)
+    log, counts = ReferenceLog(), np.full((16, 16), 200, np.uint16)
 
     def add(row: int, kind: FrameKind, level: int, replaces: int = -1) -> None:
         pixels = counts + np.uint16(level)
@@ -146,7 +146,7 @@ def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:
 
 def _log(photons: float, exposure: float = 0.1, *, moving: float = 0.0, n_flats: int = 10) -> ReferenceLog:
     """Darks and flats with so many photons a pixel in the middle of a round beam, which moves from flat to flat."""
-    rng, log, place = np.random.default_rng(5), ReferenceLog(4), np.linspace(-1, 1, 128)
+    rng, log, place = np.random.default_rng(5), ReferenceLog(), np.linspace(-1, 1, 128)
     for i in range(10 + n_flats):
         beam = np.exp(-0.5 * (place + moving * rng.normal()) ** 2) * np.ones((96, 1)) * (i >= 10)
         counts = 120 + 4.0 * rng.poisson(photons / np.median(np.exp(-0.5 * place**2)) * beam)
