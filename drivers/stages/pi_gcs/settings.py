@@ -73,4 +73,5 @@ class PiGcsSettings:
         if min(math.degrees(figures.max_speed), math.degrees(figures.acceleration)) < SLOWEST:
             raise ValueError(f"speed and acceleration must be {SLOWEST:g} deg/s, deg/s² or more")
         run_up = 1 if self.first_pulse is PiFirstPulse.STEP_AFTER else 0
-        return figures.limits(figures.acceleration, 2 * self.firmware_pulse, run_up=run_up)
+        spacing = 2 * self.firmware_pulse
+        return figures.limits(figures.acceleration, spacing, run_up=run_up, tolerance=self.tolerance)
