@@ -33,8 +33,8 @@ SILENT_EXPOSURES = 3  # triggers in a row without a frame, after which the camer
 TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
 STANDS_WITHIN = 10.0  # s that a stage which somebody else moves may take to stand, before it is sent to a view again
 ASTRAY_ADVICE = (
-    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for another "
-    "program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early that a "
+    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
+    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early that a "
     "move is done"
 )
 NOT_BRAKING = Braking(math.inf, math.inf, math.inf)
@@ -383,8 +383,8 @@ class Exposures:
         if not moving and all(abs(self._stage.to_counts(place) - wanted) <= most for place in (before, after)):
             return (before + after) / 2, ""
         return after, (
-            f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: it "
-            f"was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
+            f"its frame was exposed while the stage was not at its {math.degrees(angle):.4f}°, where it had arrived: "
+            f"it was at {math.degrees(before):.4f}° before and {'is moving ' if moving else ''}at "
             f"{math.degrees(after):.4f}° after. {ASTRAY_ADVICE}"
         )
 
